@@ -97,7 +97,7 @@ class Connection:
         self.num_delivered = 0  # messages
         self.num_checks = 0
         self.topics: set[bytes] = set()
-        self.is_cut = False
+        self.is_disconnected = False
         self.undelivered = 0  # bytes since the last delivered message
         self.incomplete = 0  # bytes of them that belong to an incomplete message, at least
         self.unread = 0  # messages that may wait for the peer, at most
@@ -121,7 +121,7 @@ class Connection:
 
     def spend(self, cost: float) -> None:
         """Charge the peer for work that it caused; disconnect it when its budget is used up."""
-        if not self.is_cut:
+        if not self.is_disconnected:
             self.budget.spend(cost)
             if self.budget.left < 0:
                 self.disconnect("it sends too many useless messages", PENALTY_S)
@@ -160,9 +160,9 @@ class Connection:
         The peer's key or address cannot connect again for ``penalty_s``. ``end`` is by default
         ``kernel_sockets.reset``.
         """
-        if self.is_cut:
+        if self.is_disconnected:
             return
-        self.is_cut = True
+        self.is_disconnected = True
         if penalty_s:
             self.budget.block(penalty_s)
             self.socket.limiter.save_budget(self)
@@ -295,7 +295,7 @@ class ConnectionLimiter:
     def connections_to(self, socket: LimitedSocket) -> list[Connection]:
         """Return the connections to one socket."""
         connections = list(self._connections.values())
-        return [c for c in connections if c.socket is socket and not c.is_cut]
+        return [c for c in connections if c.socket is socket and not c.is_disconnected]
 
     def restore_budget(self, connection: Connection) -> None:
         """Start a connection with the rest of its owner's budget."""
@@ -357,7 +357,7 @@ class ConnectionLimiter:
         self._tarpit.release(now_s)
         connections = []
         for connection in list(self._connections.values()):
-            if connection.is_cut:  # its peer keeps sending, or does not let libzmq read
+            if connection.is_disconnected:  # its peer keeps sending, or does not let libzmq read
                 kernel_sockets.reset(connection.descriptor, connection.inode)
             else:
                 connections.append(connection)
@@ -390,7 +390,11 @@ class ConnectionLimiter:
             del self._connections[connection.inode]
             connection.socket.ended.append(connection.inode)
             self._num_ended += 1
-            if connection.is_cut or connection.unread or self._num_ended >= NUM_ENDED_BEFORE_TRIM:
+            if (
+                connection.is_disconnected
+                or connection.unread
+                or self._num_ended >= NUM_ENDED_BEFORE_TRIM
+            ):
                 self._trims_s = [now_s + delay_s for delay_s in TRIMS_S]
             self.save_budget(connection)
         for owner in [owner for owner, saved in self._budgets.items() if saved.left >= BUDGET]:
@@ -409,7 +413,7 @@ def _disconnect_heaviest(
 
     The owner with the largest sum loses its largest connection first.
     """
-    sizes = {c: size for c in connections if not c.is_cut and (size := measure(c)) > 0}
+    sizes = {c: size for c in connections if not c.is_disconnected and (size := measure(c)) > 0}
     if sum(sizes.values()) <= limit:
         return sum(sizes.values())
     sums: Counter[str] = Counter()

@@ -1,8 +1,8 @@
 """Overload policy: how live sessions degrade under load.
 
 First, the block network runs less often for all sessions, so that phones are emitted and corrected
-later (:class:`NetworkPace`). Then a session uses the light acoustic model, and last it skips audio
-(:class:`Overload`).
+later (:class:`HopController`). Then a session uses the light acoustic model. Finally it skips audio
+(:class:`SkipPolicy`).
 
 A session is *behind* if late audio is queued. If it is slightly behind, it uses the light acoustic
 model until it has been on time for a while. A session that stays too far behind skips the queued
@@ -31,7 +31,7 @@ MAX_HOP = 4  # longest time between runs of the block network, in multiples of t
 MAX_LOAD = 0.6  # cores of a recognizer; above it, the network runs less often
 RESTORE_LOAD = 0.5  # expected load at which the network runs more often again
 RESTORE_AFTER_S = 5.0  # time for which the expected load must be that low
-PACE_PERIOD_S = 0.5  # the load is measured over this time
+HOP_PERIOD_S = 0.5  # the load is measured over this time
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class ProcessorTime:
         return ProcessorTime(self.network_s - other.network_s, self.others_s - other.others_s)
 
 
-class NetworkPace:
+class HopController:
     """Chooses the hop of the block network from the load of a recognizer.
 
     The network's time is proportional to 1 / hop. The hop is the shortest one whose expected load
@@ -74,7 +74,7 @@ class NetworkPace:
         """Return the hop, given the work on live sessions so far and if a session is behind."""
         self._is_behind |= is_behind
         passed_s = now_s - self._since_s
-        if passed_s < PACE_PERIOD_S:
+        if passed_s < HOP_PERIOD_S:
             return self.hop
         newest = work - self._before
         self._since_s, self._before = now_s, work
@@ -97,7 +97,7 @@ def _shortest_hop(network: float, others: float, max_load: float) -> int:
     return next((hop for hop in hops if network / hop + others <= max_load), MAX_HOP)
 
 
-class Overload:
+class SkipPolicy:
     """Decides when one live session skips audio. Times are in seconds, on any monotonic clock.
 
     Parameters

@@ -12,7 +12,7 @@ from itertools import islice
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.events import combine
+from kouxing.shared.wire.events import batch_messages
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 
@@ -52,7 +52,7 @@ class ReliableSender:
     def flush(self) -> None:
         """Send the messages that wait for others."""
         if self._waiting:
-            self._socket.send(combine(self._waiting))
+            self._socket.send(batch_messages(self._waiting))
             self._waiting.clear()
 
     def acknowledge(self, up_to: int, now_s: float) -> list[Message]:

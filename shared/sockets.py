@@ -152,7 +152,7 @@ class Socket:
                     if not self._has_unread_parts:
                         self.note_empty()
                     return
-                if self._connection is not None and self._connection.is_cut:
+                if self._connection is not None and self._connection.is_disconnected:
                     continue
                 grant = None if self._zap is None else self._zap.grants.get(key)
                 if self._zap is not None and grant is None:  # gone or revoked
@@ -267,7 +267,7 @@ class Socket:
                 self._limited.subscribe(self._connection, subscription)
             else:
                 self._connection.topics.discard(subscription)
-            if self._connection.is_cut:
+            if self._connection.is_disconnected:
                 return
         may = grant is None or may_follow(grant, subscription)  # everyone may without keys
         if verb == b"\x00":

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.evaluation.system.network import Link, Network
+from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.shared.errors import UserError
 from tests.system import ROOT
 
@@ -48,7 +48,7 @@ mount -o remount,bind,ro /run
 
 
 @contextlib.contextmanager
-def network_or_skip(hosts: Sequence[str], link: Link) -> Iterator[Network]:
+def network_or_skip(hosts: Sequence[str], link: NetworkLink) -> Iterator[Network]:
     """Enter a network of virtual hosts; skip the test where namespaces are forbidden."""
     with contextlib.ExitStack() as stack:
         try:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST, NUM_POSITIONS
 from kouxing.services.recognizer.front_end.features import HOP_S
-from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.decoder import PathSegment
 from kouxing.shared.phones.inventory import PhoneInventory
 
 _PRIOR_COUNT = 10.0  # n0
@@ -52,7 +52,7 @@ class PhoneDurations:
         # weighted sums of 1, frames and frames^2
         self._sums = np.zeros((3, NUM_POSITIONS, len(inventory)))
 
-    def add(self, aligned: Sequence[Segment], weight: float) -> None:
+    def add(self, aligned: Sequence[PathSegment], weight: float) -> None:
         """Add the phones of one recording in order, including pauses."""
         phones = [segment.phone for segment in aligned]
         if sum(phone != self._silence for phone in phones) < _MIN_CONNECTED_PHONES:

@@ -32,7 +32,7 @@ from kouxing.corpora.emotions import FEELINGS, read_emotions, speakers_of
 from kouxing.corpora.feature_cache import as_floats, read_audio
 from kouxing.corpora.sounds import read_sounds
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.encoder import EncoderOutput, Voice, load_encoder
+from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import MIN_VOICE, VoiceReadout
 from kouxing.training.model_card import write_card
@@ -88,7 +88,7 @@ def train_traits(
     arousal, valence = _test_speakers(voice, feelings, speakers)
     write_card(
         output,
-        title="Voice traits",
+        title="VoiceKind traits",
         details=f"a linear readout of the audio encoder's state, seed {seed}",
         recordings=speech,
         notes=(
@@ -108,14 +108,14 @@ def _encoder_outputs(samples: Floats, rng: np.random.Generator) -> Iterator[list
         frames = WhisperMel().accept_waveform(sound)
         encoder = load_encoder().create_stream()
         yield [
-            encoder.accept_position(frames[start : start + FRAMES_PER_POSITION])
+            encoder.process_position(frames[start : start + FRAMES_PER_POSITION])
             for start in range(0, len(frames) - FRAMES_PER_POSITION + 1, FRAMES_PER_POSITION)
         ]
 
 
 def _mean_state(positions: Sequence[EncoderOutput], states: Floats) -> Floats:
     voice = np.stack([position.voice for position in positions])
-    is_voiced = voice[:, Voice.SPEECH] + voice[:, Voice.SUNG] > MIN_VOICE
+    is_voiced = voice[:, VoiceKind.SPEECH] + voice[:, VoiceKind.SUNG] > MIN_VOICE
     if is_voiced.sum() >= _MIN_VOICED:
         states = states[is_voiced]
     mean: Floats = states.mean(axis=0)

@@ -26,7 +26,7 @@ from rich.console import Console
 
 from kouxing.evaluation.system.continuity import Continuity, compare, worst
 from kouxing.evaluation.system.live import ReceivedResults, speak, speak_undisturbed
-from kouxing.evaluation.system.network import Link, Network
+from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -72,7 +72,7 @@ class Fault:
     actions: Actions  # by system and session name
     spare: str = ""  # kind of which a second worker runs; then services do not restart
     num_sessions: int = 1
-    link: Link | None = None  # between virtual hosts; None: everything runs on this host
+    link: NetworkLink | None = None  # between virtual hosts; None: everything runs on this host
     is_sudden: bool = True  # the effect depends on the instant
 
 
@@ -176,15 +176,15 @@ FAULTS = {
     f"{NUM_SESSIONS} sessions": Fault(_nothing, num_sessions=NUM_SESSIONS, is_sudden=False),
     **{
         f"hosts, {delay_ms} ms, {loss:.0%} lost": Fault(
-            _nothing, link=Link(delay_ms, loss), is_sudden=False
+            _nothing, link=NetworkLink(delay_ms, loss), is_sudden=False
         )
         for delay_ms in (0, 20, 50)
         for loss in (0.0, 0.01, 0.03)
     },
-    "hosts, client cut off for 2 s": Fault(_cut(CLIENT, is_mended=True), link=Link()),
+    "hosts, client cut off for 2 s": Fault(_cut(CLIENT, is_mended=True), link=NetworkLink()),
     **{
         f"hosts, {worker} gone for good, one more": Fault(
-            _cut(worker, is_mended=False), worker, link=Link()
+            _cut(worker, is_mended=False), worker, link=NetworkLink()
         )
         for worker in _WORKERS
     },

@@ -27,7 +27,7 @@ _READY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class NetworkLink:
     """Properties of the connection between two hosts; packets keep their order."""
 
     delay_ms: float = 0.0
@@ -45,7 +45,7 @@ class Network:
     Raises UserError if this process is not root, a tool is missing, or namespaces are forbidden.
     """
 
-    def __init__(self, hosts: Sequence[str], link: Link) -> None:
+    def __init__(self, hosts: Sequence[str], link: NetworkLink) -> None:
         missing = [tool for tool in TOOLS if shutil.which(tool) is None]
         if missing or os.geteuid() != 0:
             need = f"install {' and '.join(missing)}" if missing else "run it as root"

@@ -42,7 +42,7 @@ _MAX_IMAGE_RATE_HZ = 240.0
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class FaceMotion:
     """A face over time."""
 
     frames: list[film.Frame]
@@ -55,7 +55,7 @@ class Motion:
     language: str = DEFAULT_LANGUAGE  # of the phones
 
 
-def slow_down(motion: Motion, speed: float) -> Motion:
+def slow_down(motion: FaceMotion, speed: float) -> FaceMotion:
     """Return a motion at a speed of 0.25 to 1, with its sound at the same pitch."""
     if speed == 1.0:
         return motion
@@ -77,10 +77,10 @@ def has_motion(source: Path) -> bool:
     return source.suffix.lower() in (".fap", *TABLE_SUFFIXES)
 
 
-def read_motion(source: Path, sound: Path | None) -> Motion:
+def read_motion(source: Path, sound: Path | None) -> FaceMotion:
     """Read a ``.fap`` file or a table, with the sound that goes with it, if any."""
     animation = read_fap(source) if source.suffix.lower() == ".fap" else read_table(source)
-    return Motion(
+    return FaceMotion(
         film.expand_frames(animation),
         animation.frame_rate_hz,
         min(animation.frame_rate_hz, _MAX_IMAGE_RATE_HZ),
@@ -101,7 +101,7 @@ def animate(
     expressiveness: float | None,
     track: int | None = None,
     language: str,
-) -> Motion:
+) -> FaceMotion:
     """Animate a face from a sound file.
 
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
@@ -165,7 +165,7 @@ def animate(
         ]
         events = recording.events
     spoken = [event for event in events if isinstance(event, Phone) and event.is_spoken]
-    return Motion(
+    return FaceMotion(
         faces[0] if len(faces) == 1 else film.stack_faces(faces),
         settings[0].frame_rate_hz,
         _IMAGE_RATE_HZ,

@@ -18,7 +18,7 @@ from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 from kouxing.shared.records import replace
 
 if TYPE_CHECKING:
-    from kouxing.services.cli.animation import Motion
+    from kouxing.services.cli.animation import FaceMotion
 
 
 def write_syllables(
@@ -45,7 +45,7 @@ def _syllable_of(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyll
 
 
 def make_captions(
-    kind: CaptionKind | None, motion: Motion, size_px: tuple[int, int]
+    kind: CaptionKind | None, motion: FaceMotion, size_px: tuple[int, int]
 ) -> Captions | None:
     """Return the captions of a video of this size, if any.
 

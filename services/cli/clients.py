@@ -11,7 +11,7 @@ from rich.console import Console
 
 from kouxing.services.cli.options import (
     AudioTrack,
-    CurveForm,
+    CurveFormat,
     Language,
     ListenOutput,
     MouthFile,
@@ -167,7 +167,7 @@ def listen(
         ),
     ] = None,
     form: Annotated[
-        CurveForm | None,
+        CurveFormat | None,
         typer.Option(
             "--as",
             help="Values of the frames. Shapes are printed as JSON lines, and the drawn mouths of"

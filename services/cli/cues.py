@@ -17,7 +17,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.cli.options import CurveForm
+from kouxing.services.cli.options import CurveFormat
 from kouxing.shared.face.mouth_shapes import CLOSED, REST, SILENCE, Cue, mouth_cues, oculus_cues
 
 Frames: TypeAlias = Iterable[tuple[float, NDArray[np.float32]]]  # times in seconds, FAPs (68,)
@@ -33,8 +33,8 @@ class CueKind:
 
 
 CUE_KINDS = {
-    CurveForm.RHUBARB: CueKind(mouth_cues, REST),
-    CurveForm.OCULUS: CueKind(oculus_cues, SILENCE),
+    CurveFormat.RHUBARB: CueKind(mouth_cues, REST),
+    CurveFormat.OCULUS: CueKind(oculus_cues, SILENCE),
 }
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.cli.cues import CUE_FORMATS, CUE_KINDS, write_cues
-from kouxing.services.cli.options import CurveForm, ExportOptions
+from kouxing.services.cli.options import CurveFormat, ExportOptions
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -34,11 +34,11 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.terminal import write_text
 
 if TYPE_CHECKING:
-    from kouxing.services.cli.animation import Motion
+    from kouxing.services.cli.animation import FaceMotion
 
 Values = NDArray[np.float32]
 Row = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
-_SHAPE_FORMS = (CurveForm.ARKIT, CurveForm.OCULUS, CurveForm.VRM)
+_SHAPE_FORMS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
 _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
 
 
@@ -62,7 +62,7 @@ class CurveExporter(ABC):
 
     unit: ClassVar[str] = "frame"
     options: ClassVar[frozenset[str]] = frozenset({"lips", "form"})
-    forms: ClassVar[tuple[CurveForm, ...]]  # the first one is the default
+    forms: ClassVar[tuple[CurveFormat, ...]]  # the first one is the default
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
         form = options.form or self.forms[0]
@@ -80,7 +80,7 @@ class CurveExporter(ABC):
         self._form = form
         self._head = options.head
 
-    def export(self, motion: Motion, progress: Progress) -> int:
+    def export(self, motion: FaceMotion, progress: Progress) -> int:
         """Write all frames of a motion and return their number."""
         rows = ((time_s, number, faps) for number, (time_s, faps) in enumerate(motion.frames))
         duration_s = None if motion.samples is None else len(motion.samples) / MEDIA_RATE_HZ
@@ -99,11 +99,11 @@ class CurveExporter(ABC):
 class CsvExporter(CurveExporter):
     """Writes comma-separated values, with a column for each FAP or shape."""
 
-    forms = tuple(form for form in CurveForm if form is not CurveForm.RHUBARB)
+    forms = tuple(form for form in CurveFormat if form is not CurveFormat.RHUBARB)
 
     def write(self, curves: Curves) -> int:
         """Write each frame when it arrives."""
-        if self._form is CurveForm.LIVELINK:
+        if self._form is CurveFormat.LIVELINK:
             columns = _LIVE_LINK_COLUMNS
             cells = (_live_link_cells(row) for row in curves.rows)
         else:
@@ -116,7 +116,7 @@ class CsvExporter(CurveExporter):
 class JsonLinesExporter(CurveExporter):
     """Writes a JSON object for each frame."""
 
-    forms = (CurveForm.FAPS, *_SHAPE_FORMS)
+    forms = (CurveFormat.FAPS, *_SHAPE_FORMS)
 
     def write(self, curves: Curves) -> int:
         """Write each frame when it arrives."""
@@ -127,7 +127,7 @@ class JsonLinesExporter(CurveExporter):
 class FapExporter(CurveExporter):
     """Writes an MPEG-4 ``.fap`` file."""
 
-    forms = (CurveForm.FAPS,)
+    forms = (CurveFormat.FAPS,)
 
     def write(self, curves: Curves) -> int:
         """Write the frames when the last one has arrived."""
@@ -145,7 +145,7 @@ class GlbExporter(CurveExporter):
     """Writes the head as a GLB with the motion as an animation."""
 
     options = CurveExporter.options | {"head"}
-    forms = (CurveForm.FAPS, CurveForm.ARKIT)
+    forms = (CurveFormat.FAPS, CurveFormat.ARKIT)
 
     def write(self, curves: Curves) -> int:
         """Write the frames when the last one has arrived."""
@@ -153,7 +153,7 @@ class GlbExporter(CurveExporter):
         from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
 
         frames = [(time_s, faps) for time_s, _, faps in curves.rows]
-        is_arkit = self._form is CurveForm.ARKIT
+        is_arkit = self._form is CurveFormat.ARKIT
         export_glb(load_head(self._head), self._output, frames, as_arkit=is_arkit)
         return len(frames)
 
@@ -184,10 +184,10 @@ CURVE_EXPORTERS: dict[str, type[CurveExporter]] = {
 }
 
 
-def json_line(row: Row, form: CurveForm, phones: Sequence[Phone] | None = None) -> str:
+def json_line(row: Row, form: CurveFormat, phones: Sequence[Phone] | None = None) -> str:
     """Return a JSON object for a frame: FAPs in the order of their numbers, or named shapes."""
     time_s, number, faps = row
-    is_faps = form is CurveForm.FAPS
+    is_faps = form is CurveFormat.FAPS
     rounded = [round(float(value), 2 if is_faps else 4) for value in _values(faps, form)]
     values = rounded if is_faps else dict(zip(_value_names(form), rounded, strict=True))
     fields = {"time_s": time_s, "sequence": number, form.value: values}
@@ -202,7 +202,7 @@ def phone_at(phones: Sequence[Phone], time_s: float) -> str:
     return phones[index].symbol
 
 
-def _cells(row: Row, form: CurveForm, phones: Sequence[Phone] | None) -> list[str]:
+def _cells(row: Row, form: CurveFormat, phones: Sequence[Phone] | None) -> list[str]:
     time_s, _, faps = row
     cells = [f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, form))]
     return cells if phones is None else [*cells, phone_at(phones, time_s)]
@@ -211,7 +211,7 @@ def _cells(row: Row, form: CurveForm, phones: Sequence[Phone] | None) -> list[st
 def _live_link_cells(row: Row) -> list[str]:
     time_s, _, faps = row
     face = FaceFrame(faps, time_s)
-    weights = face.weights(CurveForm.ARKIT)
+    weights = face.weights(CurveFormat.ARKIT)
     milliframes = round(time_s * _LIVE_LINK_RATE_HZ * 1000)
     seconds, frame = divmod(milliframes, _LIVE_LINK_RATE_HZ * 1000)
     time_code = (
@@ -247,11 +247,11 @@ def _write_lines(output: Path, lines: Iterable[str], curves: Curves) -> int:
     return count
 
 
-def _value_names(form: CurveForm) -> tuple[str, ...]:
+def _value_names(form: CurveFormat) -> tuple[str, ...]:
     shapes = SHAPE_SETS.get(form)
     return shapes.names if shapes else tuple(fap.name for fap in FAPS)
 
 
-def _values(faps: Values, form: CurveForm) -> Values:
+def _values(faps: Values, form: CurveFormat) -> Values:
     shapes = SHAPE_SETS.get(form)
     return shapes.weights(faps) if shapes else faps

@@ -7,7 +7,7 @@ from typing import ClassVar, Protocol
 
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import Motion, slow_down
+from kouxing.services.cli.animation import FaceMotion, slow_down
 from kouxing.services.cli.captions import make_captions
 from kouxing.services.cli.curves import CURVE_EXPORTERS
 from kouxing.services.cli.options import ExportOptions
@@ -38,7 +38,7 @@ class Exporter(Protocol):
     def __init__(self, output: Path, options: ExportOptions) -> None:
         """Check output and options. This comes before long work."""
 
-    def export(self, motion: Motion, progress: Progress) -> int:
+    def export(self, motion: FaceMotion, progress: Progress) -> int:
         """Write the motion and return the number of frames or images."""
 
 
@@ -57,7 +57,7 @@ class PictureExporter:
         self._size_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
         self._renderer = _make_renderer(output, options, self._size_px)
 
-    def export(self, motion: Motion, progress: Progress) -> int:
+    def export(self, motion: FaceMotion, progress: Progress) -> int:
         """Draw a motion and return the number of images.
 
         Raises ``UserError`` if a file cannot be written.
@@ -65,7 +65,7 @@ class PictureExporter:
         with contextlib.closing(self._renderer):
             return self._draw(motion, progress)
 
-    def _draw(self, motion: Motion, progress: Progress) -> int:
+    def _draw(self, motion: FaceMotion, progress: Progress) -> int:
         captions = make_captions(self._options.captions, motion, self._size_px)
         at_s = self._options.at_s or 0.0
         film.render_picture(motion.frames, self._output, self._renderer, at_s, captions)
@@ -81,7 +81,7 @@ class VideoExporter(PictureExporter):
         check_name(output)
         super().__init__(output, options)
 
-    def _draw(self, motion: Motion, progress: Progress) -> int:
+    def _draw(self, motion: FaceMotion, progress: Progress) -> int:
         task = progress.add_task("drawing", total=1.0)
         motion = slow_down(motion, self._options.speed)
         return film.render_video(

@@ -9,7 +9,7 @@ import numpy as np
 from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 
 from kouxing.services.cli.curves import CURVE_EXPORTERS, CurveExporter, Curves, Row, json_line
-from kouxing.services.cli.options import CurveForm, ExportOptions, ListenOutput
+from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenOutput
 from kouxing.services.cli.streaming import missed_warning
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.control_client import connect
@@ -34,7 +34,7 @@ def follow(
     session: str,
     output: Path | None,
     shown: ListenOutput,
-    form: CurveForm | None,
+    form: CurveFormat | None,
     control: str,
     alphabet: Alphabet | None = None,
 ) -> None:
@@ -48,7 +48,7 @@ def follow(
         raise UserError("--alphabet applies to phones; add --show phones")
     if shown is not ListenOutput.FAPS and (output is not None or form is not None):
         raise UserError(f"--show {shown} cannot be combined with --output or --as; leave these out")
-    if form is CurveForm.LIVELINK and output is None:
+    if form is CurveFormat.LIVELINK and output is None:
         raise UserError("--as livelink is a table; add --output face.csv")
     exporter = None if output is None else _open_exporter(output, form)
     with connect(control) as client:
@@ -68,7 +68,7 @@ def follow(
             live = Curves(rows, is_live=True)
             count = _print_frames(rows, form) if exporter is None else exporter.write(live)
     unit = "frame" if shows_faps else shown.value.removesuffix("s")
-    if form is CurveForm.RHUBARB and output is None:
+    if form is CurveFormat.RHUBARB and output is None:
         unit = "mouth shape"
     print_message(f"session {followed.name} ended: {plural(count, unit)}")
     if results.num_missed:
@@ -77,7 +77,7 @@ def follow(
         print_message(f"wrote {output}")
 
 
-def _open_exporter(output: Path, form: CurveForm | None) -> CurveExporter:
+def _open_exporter(output: Path, form: CurveFormat | None) -> CurveExporter:
     exporter = CURVE_EXPORTERS.get(output.suffix.lower())
     if exporter is None:
         raise UserError(
@@ -145,12 +145,12 @@ def _row(frame: FapFrame) -> Row:
     return frame.time_s, frame.sequence, np.array(frame.values, np.float32)
 
 
-def _print_frames(rows: Iterable[Row], form: CurveForm | None) -> int:
+def _print_frames(rows: Iterable[Row], form: CurveFormat | None) -> int:
     """Print frames, a line for each, and return their number; drawn mouths when they change."""
-    if form is CurveForm.RHUBARB:
+    if form is CurveFormat.RHUBARB:
         cues = mouth_cues((time_s, faps) for time_s, _, faps in rows)
         return _print(f"{time_s:.2f}\t{mouth}" for time_s, mouth in cues)
-    if form not in (None, CurveForm.FAPS):
+    if form not in (None, CurveFormat.FAPS):
         return _print(json_line(row, form) for row in rows)
     CONSOLE.print(LEGEND, markup=False, highlight=False)
     return _print(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.cli.captions import write_syllables
-from kouxing.services.cli.options import DrawnLips, Timing
+from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_mismatch
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
@@ -105,8 +105,8 @@ def draw_mouth(
     text: str | None,
     output: Path,
     *,
-    lips: DrawnLips = DrawnLips.VISEMES,
-    timing: Timing | None = None,
+    lips: WidthSource = WidthSource.VISEMES,
+    timing: TimingMethod | None = None,
     smooth: bool = False,
     num_points: int | None = None,
     speech_to_text: Path | None = None,
@@ -166,14 +166,14 @@ def _time_phones(
     source: Path,
     samples: NDArray[np.float32],
     transcript: Transcript | None,
-    timing: Timing | None,
+    timing: TimingMethod | None,
     inventory: PhoneInventory,
     with_progress: WithProgress,
 ) -> list[Phone]:
     if transcript is not None and timing is None:
         is_long = len(transcript.syllables) > MAX_SYLLABLES
-        timing = Timing.ALIGN if is_long else Timing.ENDPOINTS
-    if transcript is not None and timing is Timing.ENDPOINTS:
+        timing = TimingMethod.ALIGN if is_long else TimingMethod.ENDPOINTS
+    if transcript is not None and timing is TimingMethod.ENDPOINTS:
         recording = measure_slices(samples, with_progress), transcript.phones, load_table(inventory)
         phones = time_text(*recording)
         ratio = speech_ratio(*recording)
@@ -189,16 +189,16 @@ def _time_phones(
 
 
 def _widths(
-    lips: DrawnLips,
+    lips: WidthSource,
     samples: NDArray[np.float32],
     timed: Sequence[Phone],
     inventory: PhoneInventory,
     with_progress: WithProgress,
 ) -> tuple[Array, Array]:
     """Return times, and the distance of the corners at each, relative to the mouth at rest."""
-    if lips is DrawnLips.FERGUSON:
+    if lips is WidthSource.FERGUSON:
         return np.zeros(1), np.ones(1)
-    predictor = load_lip_predictor() if lips is DrawnLips.LEARNT else None
+    predictor = load_lip_predictor() if lips is WidthSource.LEARNT else None
     recording = analyze_recording(samples, timed, predictor, with_progress=with_progress)
     lip_model = load_lip_model(inventory.language, lips)
     frames = animate_recording(

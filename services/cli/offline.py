@@ -12,15 +12,15 @@ from kouxing.services.cli.options import (
     DEFAULT_HEAD,
     AudioTrack,
     CaptionKind,
-    CurveForm,
-    DrawnLips,
+    CurveFormat,
     ExportOptions,
     HeadName,
     Language,
     MouthFile,
     Output,
     PhoneAlphabet,
-    Timing,
+    TimingMethod,
+    WidthSource,
 )
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
@@ -107,7 +107,7 @@ def render(
     ] = None,
     language: Language = None,
     form: Annotated[
-        CurveForm | None,
+        CurveFormat | None,
         typer.Option(
             "--as",
             help="Values to write to a curve file. Default: faps; drawn mouths (rhubarb) in .tsv,"
@@ -316,15 +316,15 @@ def lips(
         ),
     ],
     lips: Annotated[
-        DrawnLips,
+        WidthSource,
         typer.Option(
             help="Lip model that gives the width of the mouth, which is round for u, ü and o."
             " ferguson: always the same width."
         ),
-    ] = DrawnLips.VISEMES,
+    ] = WidthSource.VISEMES,
     language: Language = None,
     timing: Annotated[
-        Timing | None,
+        TimingMethod | None,
         typer.Option(help="Times of the text by energy and zero crossings, or forced alignment."),
     ] = None,
     smooth: Annotated[

@@ -70,7 +70,7 @@ ServiceAssignments = Annotated[
 ]
 
 
-class CurveForm(StrEnum):
+class CurveFormat(StrEnum):
     """Values of a face's curves."""
 
     FAPS = "faps"
@@ -97,7 +97,7 @@ class CaptionKind(StrEnum):
     PHONES = "phones"
 
 
-class DrawnLips(StrEnum):
+class WidthSource(StrEnum):
     """Source of the width of a mouth that is drawn in two dimensions."""
 
     VISEMES = "dynamic-visemes"
@@ -105,7 +105,7 @@ class DrawnLips(StrEnum):
     FERGUSON = "ferguson"  # always the same width, as in the paper
 
 
-class Timing(StrEnum):
+class TimingMethod(StrEnum):
     """Method that times the phones of a text."""
 
     ENDPOINTS = "endpoints"  # energy and zero crossings
@@ -117,7 +117,7 @@ class ExportOptions:
     """How ``kouxing render`` shows and writes a face. The defaults match its options."""
 
     lips: tuple[str, ...] = (DEFAULT_LIP_MODEL,)
-    form: CurveForm | None = None  # None: the first one of the format
+    form: CurveFormat | None = None  # None: the first one of the format
     head: str = DEFAULT_HEAD
     size: str = "1280x720"
     background: str = "studio"

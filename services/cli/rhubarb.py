@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import Motion, animate
+from kouxing.services.cli.animation import FaceMotion, animate
 from kouxing.services.cli.cues import write_cues
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _animate(options: argparse.Namespace) -> Motion:
+def _animate(options: argparse.Namespace) -> FaceMotion:
     """Animate the recording; report messages about its text as Rhubarb reports warnings."""
     text = "" if options.dialogFile is None else read_text(options.dialogFile, _MAX_TEXT_BYTES)
     language = find_language(options.language)
@@ -98,7 +98,7 @@ def _animate(options: argparse.Namespace) -> Motion:
     return motion
 
 
-def _format(motion: Motion, options: argparse.Namespace) -> str:
+def _format(motion: FaceMotion, options: argparse.Namespace) -> str:
     """Return the mouths of a recording in the format of the options."""
     instead = {letter: _BASIC[letter] for letter in _BASIC if letter not in options.extendedShapes}
     samples = motion.samples if motion.samples is not None else ()

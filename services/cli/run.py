@@ -76,9 +76,9 @@ def run(
     driver = settings.load(DriverConfig)
     out = Path(driver.out)
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
-    reservation = _entered(reserve(out))
+    reservation = _enter(reserve(out))
     arguments = ["--config", str(config)] if config else []
-    startup = _entered(starting(lambda: print_message("waiting until another kouxing has started")))
+    startup = _enter(starting(lambda: print_message("waiting until another kouxing has started")))
     with naming_option("--port", "gateway.port", is_given=port is not None):
         addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
@@ -168,7 +168,7 @@ def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
     return environment
 
 
-def _entered(context: contextlib.AbstractContextManager[None]) -> contextlib.ExitStack:
+def _enter(context: contextlib.AbstractContextManager[None]) -> contextlib.ExitStack:
     """Enter a context; return a stack whose ``close`` leaves it."""
     stack = contextlib.ExitStack()
     stack.enter_context(context)

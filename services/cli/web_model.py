@@ -157,7 +157,7 @@ def web_model() -> dict[str, bytes]:
     header = {
         "format": FORMAT,
         "stateWidth": audio_encoder.state_width,
-        "voices": {voice.name: int(voice) for voice in encoder.Voice},
+        "voices": {voice.name: int(voice) for voice in encoder.VoiceKind},
         "numFaps": NUM_FAPS,
         "mouthFaps": MOUTH_FAPS,
         "closureRule": asdict(closures.ClosureRule()),

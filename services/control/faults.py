@@ -15,7 +15,7 @@ class _Fault:
     is_reported: bool = False
 
 
-class Faults:
+class FaultLog:
     """Services that are lost. A warning also reaches the supervisor's console."""
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from kouxing.services.control.config import ControlConfig
-from kouxing.services.control.faults import Faults
+from kouxing.services.control.faults import FaultLog
 from kouxing.services.control.kind import KIND
 from kouxing.services.control.lifecycle import Lifecycle
 from kouxing.services.control.placement import Placement
@@ -21,7 +21,7 @@ from kouxing.services.control.registry import Registry
 from kouxing.services.control.requests import Requests
 from kouxing.services.control.sessions import Sessions
 from kouxing.services.control.status import Status
-from kouxing.services.control.takeover import Takeover
+from kouxing.services.control.takeover import RestartRecovery
 from kouxing.shared.bus import COMMANDS
 from kouxing.shared.clock import StallDetector, now_ns
 from kouxing.shared.endpoints import with_key
@@ -69,9 +69,9 @@ class ControlService(Service):
         self._sessions = Sessions(self._registry, placement, config.max_sessions)
         self._status = Status(self._registry, self._sessions)
         self._process_id = secrets.token_hex(8)  # the instance may be a setting
-        self._faults = Faults()
+        self._faults = FaultLog()
         self._resting_face = CurrentFace(FaceSettings(), now_s)
-        self._takeover = Takeover(self._registry, now_s)
+        self._takeover = RestartRecovery(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
         self._keys_version = (0, 0)  # version of the list whose revoked keys have no sessions
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
@@ -270,19 +270,19 @@ class ControlService(Service):
         )
         if replaced is not None:
             self._on_service_lost(replaced, f"{heartbeat.instance} took its place")
-        uninformed = []
+        missed_start = []
         if was_lost:
             self._registry.adapt_timeout(lasted_s, now_s)
-            uninformed = self._sessions.reinstate_worker(heartbeat.instance)
+            missed_start = self._sessions.reinstate_worker(heartbeat.instance)
         self._restore_sessions()
         for record in self._sessions.pending():
             if record.lost:
                 self._lifecycle.move(record)
         if heartbeat.role == "observer":
-            uninformed = [
+            missed_start = [
                 record for record in self._sessions if record.name not in heartbeat.sessions
             ]
-        for record in uninformed:
+        for record in missed_start:
             self._commands.send(record.start_message(time.monotonic()), to=sender)
 
     def _check_sessions(self, heartbeat: Heartbeat, sender: Peer) -> None:
@@ -372,8 +372,8 @@ class ControlService(Service):
                 continue
             record = self._sessions.restore(start, time.monotonic())
             LOG.info("session restored", extra={"session": record.name})
-            uninformed = self._takeover.uninformed_observers(record.name)
-            self._lifecycle.send_start(record, record.waiting_for | uninformed)
+            missed_start = self._takeover.observers_without_start(record.name)
+            self._lifecycle.send_start(record, record.waiting_for | missed_start)
             if record.lost:
                 self._lifecycle.move(record)
         self._lifecycle.end_revoked()

@@ -252,10 +252,10 @@ class Sessions:
         ]
         for record in records:
             record.lost.remove(instance)
-        uninformed = [record for record in records if record.moved or not record.announced]
-        for record in uninformed:
+        missed_start = [record for record in records if record.moved or not record.announced]
+        for record in missed_start:
             record.waiting_for.add(instance)
-        return uninformed
+        return missed_start
 
     def move(self, record: SessionRecord, now_s: float) -> bool:
         """Place a session again after it lost workers; return whether that succeeded.

@@ -8,7 +8,7 @@ from kouxing.shared.wire.control import Heartbeat, StartSession
 TAKEOVER_S = 5.0
 
 
-class Takeover:
+class RestartRecovery:
     """The sessions that services report after control has restarted, until ``end_s``."""
 
     def __init__(self, registry: Registry, now_s: float) -> None:
@@ -43,7 +43,7 @@ class Takeover:
             del self._reported[start.session]
         return complete
 
-    def uninformed_observers(self, session: str) -> set[str]:
+    def observers_without_start(self, session: str) -> set[str]:
         """Return the observers that do not take part in a session yet."""
         return {
             instance

@@ -21,7 +21,7 @@ class _Pose:
     has_ended: bool = False
 
 
-class Poses:
+class PoseStore:
     """The newest FAPs of each session; shows the newest session, a named one, or the user's choice.
 
     The user's choice is valid until that session closes, or until the user returns to the default.

@@ -16,7 +16,7 @@ import numpy as np
 
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.kind import KIND
-from kouxing.services.driver.poses import Poses
+from kouxing.services.driver.poses import PoseStore
 from kouxing.services.driver.recordings import Recordings
 from kouxing.services.driver.video.writer import remove_unfinished
 from kouxing.services.driver.view import View
@@ -57,7 +57,7 @@ class DriverService(Service):
         self._sessions: dict[str, _FollowedSession] = {}
         self._was_stalled = False
         self._drain_until_s = math.inf
-        self.poses = Poses(config.session, config.idle_motion_seed)
+        self.poses = PoseStore(config.session, config.idle_motion_seed)
         self.view = View(config, self.poses.switch)
         self.recordings = Recordings(
             config,

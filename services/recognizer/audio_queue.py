@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
-from kouxing.shared.overload import Overload
+from kouxing.shared.overload import SkipPolicy
 
 _MIN_CHUNK_S = 0.001  # a shorter chunk counts as this long: decoding it takes as much time
 
@@ -13,7 +13,7 @@ _MIN_CHUNK_S = 0.001  # a shorter chunk counts as this long: decoding it takes a
 class AudioQueue:
     """A queue of chunks that drops old audio. Times are in seconds, on any monotonic clock."""
 
-    def __init__(self, sample_rate_hz: int, overload: Overload) -> None:
+    def __init__(self, sample_rate_hz: int, overload: SkipPolicy) -> None:
         self.overload = overload
         self._rate_hz = sample_rate_hz
         self._chunks: deque[Chunk] = deque()

@@ -11,7 +11,7 @@ h        state of the recurrent layers                            (state width,)
 f        features for a lip predictor                             (features,)
 q        log posteriors of the phones of the default language,    (phones,)
          for the frames ``PHONES_LAG_FRAMES`` earlier
-v        probabilities of the kinds of voice (:class:`Voice`),    (4,)
+v        probabilities of the kinds of voice (:class:`VoiceKind`),    (4,)
          for the audio 40 ms earlier
 ======== ======================================================== ==================
 
@@ -49,7 +49,7 @@ _OUTPUTS = ["features", "phones", "voice", "new_state"]
 _MAX_WIDTH = 4096
 
 
-class Voice(IntEnum):
+class VoiceKind(IntEnum):
     """Kinds of voice."""
 
     NONE = 0
@@ -86,7 +86,7 @@ class AudioEncoder:
             np.zeros((1, FRAMES_PER_POSITION, NUM_MELS), np.float32),
             np.zeros((1, self.state_width), np.float32),
         )
-        sizes = (self.num_features, self.num_phones, len(Voice), self.state_width)
+        sizes = (self.num_features, self.num_phones, len(VoiceKind), self.state_width)
         check_outputs(values, [(1, size) for size in sizes])
 
     def run(self, frames: Floats, states: Floats) -> list[Floats]:
@@ -110,7 +110,7 @@ class EncoderStream:
         self.encoder = encoder
         self.state = np.zeros(encoder.state_width, np.float32)
 
-    def accept_position(self, frames: Floats) -> EncoderOutput:
+    def process_position(self, frames: Floats) -> EncoderOutput:
         """Take the next position's frames, (2, 80)."""
         return process_positions([self], [frames])[0]
 

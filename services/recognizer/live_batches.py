@@ -8,7 +8,7 @@ from kouxing.services.recognizer.network_thread import NetworkThread
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.shared.metrics import LoadMeter
-from kouxing.shared.overload import MAX_HOP, NetworkPace, ProcessorTime
+from kouxing.shared.overload import MAX_HOP, HopController, ProcessorTime
 
 MAX_BATCH_S = 0.3  # of audio that is decoded together
 MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
@@ -53,7 +53,7 @@ class LiveBatches:
         self._on_early, self._on_decoded, self._on_batch = on_early, on_decoded, on_batch
         self._network = NetworkThread(recognizer, wake)
         self.unpaced_work = ProcessorTime()  # part of ``work`` that is not for live audio
-        self._pace = NetworkPace(self.work, time.monotonic())
+        self._pace = HopController(self.work, time.monotonic())
 
     @property
     def hop(self) -> int:

@@ -23,7 +23,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     empty_scores,
 )
 from kouxing.services.recognizer.front_end.features import HOP_S, frame_time_s
-from kouxing.services.recognizer.search.decoder import Decoder, Segment
+from kouxing.services.recognizer.search.decoder import Decoder, PathSegment
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import (
     FrameScores,
@@ -159,7 +159,7 @@ class LiveDecoder:
         self._open.append(new)
         return [*revised, new]
 
-    def _revise(self, segments: list[Segment], num_following: int) -> list[Phone]:
+    def _revise(self, segments: list[PathSegment], num_following: int) -> list[Phone]:
         """Replace the open phones by the best string; return those that are new or changed.
 
         ``num_following`` phones follow the segments: one, or none if speech has ended.

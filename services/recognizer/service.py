@@ -170,7 +170,7 @@ class RecognizerService(Service):
             socket = self._synthesizers.connect(start.endpoints["phone_input"])
             session.link.connect(socket, start.session, start.epoch, time.monotonic())
             if not is_new:  # the new synthesizer must receive the stalled state
-                session.without_audio_s = 0.0
+                session.silent_s = 0.0
             used = {one.start.endpoints["phone_input"] for one in self._sessions.values()}
             self._synthesizers.close_unused(used)
         return True
@@ -189,7 +189,7 @@ class RecognizerService(Service):
                 self._live.decode_all([flushed])
             flushed.audio.clear()
             flushed.link.forget()
-            flushed.without_audio_s = 0.0  # so that a stalled client is reported again
+            flushed.silent_s = 0.0  # so that a stalled client is reported again
             flushed.stream.flush()
             self._send_results(flushed)
             if flushed.end is not None:

@@ -16,7 +16,7 @@ from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
-from kouxing.shared.overload import CATCH_UP_S, Overload
+from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange
 from kouxing.shared.records import replace
 from kouxing.shared.replay import Replay
@@ -94,7 +94,7 @@ class RecognizerSession:
         if start.media_time:
             silence = recognizer.model.inventory.silence
             self.resumption = Resumption(to_seconds(start.media_time), silence)
-        overload = Overload(
+        overload = SkipPolicy(
             max_behind_s if start.paced else math.inf,
             now_s + CATCH_UP_S if start.epoch > 1 else now_s,
         )
@@ -111,16 +111,16 @@ class RecognizerSession:
         self.is_finished = False  # all audio up to the end is decoded
         self.last_audio_s = now_s
         # time in which this process could have received audio but did not
-        self.without_audio_s = -MOVE_GRACE_S if start.epoch > 1 else 0.0
+        self.silent_s = -MOVE_GRACE_S if start.epoch > 1 else 0.0
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
         self.is_laughing = False  # the speaker
         self._published_acoustic = AcousticModelName.FULL
         self._sound = SoundPackets(face_delay_s)
-        self.sequence_out = 0
+        self.last_sequence = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
-        self._lead = _AheadLimit(now_s, may_catch_up=start.epoch > 1)
+        self._lead_limit = _AheadLimit(now_s, may_catch_up=start.epoch > 1)
 
     @property
     def name(self) -> str:
@@ -186,7 +186,9 @@ class RecognizerSession:
         except BadAudio as error:
             raise AudioRejected(ErrorCode.BAD_AUDIO, str(error)) from None
         duration_s = len(samples) / rate_hz
-        if self.start.paced and not self._lead.allows(to_seconds(media_time), duration_s, now_s):
+        if self.start.paced and not self._lead_limit.allows(
+            to_seconds(media_time), duration_s, now_s
+        ):
             text = (
                 f"the audio is more than {MAX_LEAD_S:g} s ahead of the clock; to send faster than "
                 "real time, open the session with paced = false"
@@ -217,17 +219,17 @@ class RecognizerSession:
 
     def check_stalled(self, tick_s: float, now_s: float) -> None:
         """Count time in which no audio arrived; report a live client that has now stalled."""
-        before_s, self.without_audio_s = self.without_audio_s, self.without_audio_s + tick_s
+        before_s, self.silent_s = self.silent_s, self.silent_s + tick_s
         is_live = self.start.paced and not self.is_finished
-        if is_live and before_s <= STALLED_AFTER_S < self.without_audio_s:
+        if is_live and before_s <= STALLED_AFTER_S < self.silent_s:
             self._report(AudioState.STALLED, now_s)
 
     def on_new_audio(self, now_s: float) -> None:
         """Record that audio arrived; the face must not return to rest until it is processed."""
-        if self.start.paced and self.without_audio_s > STALLED_AFTER_S:
+        if self.start.paced and self.silent_s > STALLED_AFTER_S:
             self._report(AudioState.RESUMED, now_s)
             self.audio.overload.resume()
-        self.last_audio_s, self.without_audio_s = now_s, 0.0
+        self.last_audio_s, self.silent_s = now_s, 0.0
 
     def _report(self, state: AudioState, now_s: float) -> None:
         media_time = max(self.stream.media_time, self.start.media_time)
@@ -271,9 +273,9 @@ class RecognizerSession:
         return self._numbered(Acoustic(model=model, media_time=self.stream.media_time))
 
     def _numbered(self, message: M) -> M:
-        self.sequence_out += 1
+        self.last_sequence += 1
         return replace(
-            message, session=self.name, epoch=self.start.epoch, sequence=self.sequence_out
+            message, session=self.name, epoch=self.start.epoch, sequence=self.last_sequence
         )
 
     def on_acknowledge(self, ack: Acknowledge, now_s: float) -> None:

@@ -106,7 +106,7 @@ class SpeechSegmenter:
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
         """Take samples, 16 kHz mono, shape (n,); yield what follows from them."""
         for position in self.positions(samples):
-            yield from self.process(position, self.encoder.accept_position(position.mels))
+            yield from self.process(position, self.encoder.process_position(position.mels))
 
     def positions(self, samples: Floats) -> Iterator[Position]:
         """Take samples, 16 kHz mono, shape (n,); yield the new positions, to be processed."""
@@ -135,7 +135,7 @@ class SpeechSegmenter:
         else:
             self._recent.append((features, output))
         self._detector.update(output.voice)
-        self._traits.accept_position(output)
+        self._traits.process_position(output)
         if self._is_speaking and not self._detector.is_speech:
             yield self._end_speech()
         elif self._is_speaking:

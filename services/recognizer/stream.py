@@ -163,7 +163,7 @@ class SpeechStream:
         results, self._results = self._results, []
         return results
 
-    def _renumber(self, phone: Phone, segment: _Segment) -> Phone:
+    def _renumber(self, phone: Phone, segment: _AudioSegment) -> Phone:
         """Continue the phone indices of the previous segments."""
         if segment.first_index is None:
             segment.first_index = self._next_index
@@ -177,7 +177,7 @@ class SpeechStream:
         segment = self._new_segment(media_time)
         self._segments = [segment] if is_first else [*self._segments, segment]
 
-    def _new_segment(self, media_time: int) -> _Segment:
+    def _new_segment(self, media_time: int) -> _AudioSegment:
         lip_stream = start_frame = None
         if self._lip_predictor is not None:
             lip_stream = self._lip_predictor.create_stream(
@@ -189,7 +189,7 @@ class SpeechStream:
         scorer = SpeechScorer(self._model, lip_stream, start_frame)
         scorer.set_light(self._needs_light_model)
         scorer.set_hop(self._hop)
-        return _Segment(
+        return _AudioSegment(
             media_time,
             Resampler(self._rate_hz, self._num_channels),
             scorer,
@@ -197,7 +197,7 @@ class SpeechStream:
         )
 
 
-class _Segment:
+class _AudioSegment:
     """Audio without a gap."""
 
     def __init__(

@@ -11,7 +11,7 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.message_loop import Handler, MessageLoop
 from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.events import is_report
+from kouxing.shared.wire.events import is_state_report
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
 
@@ -47,7 +47,7 @@ class SynthesizerLink:
         if self._speech is not None:
             self._sender.send(self._speech, now_s)
         for message in messages:
-            if not is_report(message):
+            if not is_state_report(message):
                 self._sender.send(message, now_s)
         self._sender.flush()
 
@@ -80,7 +80,7 @@ class SynthesizerLink:
             return []
         self._newest_frame = ack.newest_frame or self._newest_frame
         acknowledged = self._sender.acknowledge(ack.sequence, now_s)
-        messages = [message for message in acknowledged if not is_report(message)]
+        messages = [message for message in acknowledged if not is_state_report(message)]
         self._kept.extend(messages)
         while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:
             oldest = self._kept.popleft()

@@ -30,7 +30,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_part, write_archive
-from kouxing.services.recognizer.encoder import EncoderOutput, Voice, load_encoder
+from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 
 TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
 FORMAT = "traits 1"
@@ -86,13 +86,13 @@ class VoiceTraitsStream:
         self._evidence = [0.0] * (NUM_TRAITS - 2)  # evidence of laughter and of breath
         self._since_laugh = _LAUGH_POSITIONS  # positions since a laugh
 
-    def accept_position(self, position: EncoderOutput) -> None:
+    def process_position(self, position: EncoderOutput) -> None:
         """Take the next position of the encoder."""
         # Few numbers: lists take less time than arrays.
         outputs: list[float] = (
             position.state @ self._readout.weights + self._readout.bias
         ).tolist()
-        if position.voice[Voice.SPEECH] + position.voice[Voice.SUNG] > MIN_VOICE:
+        if position.voice[VoiceKind.SPEECH] + position.voice[VoiceKind.SUNG] > MIN_VOICE:
             self._num_voiced += 1
             feeling = outputs[_FEELING]
             num_known = min(self._num_voiced + _PRIOR_POSITIONS, _MAX_POSITIONS)
@@ -105,7 +105,7 @@ class VoiceTraitsStream:
             old + _EVIDENCE_FRACTION * (new - old)
             for old, new in zip(self._evidence, outputs[2:], strict=True)
         ]
-        is_laugh = position.voice[Voice.LAUGHTER] > _MIN_LAUGHTER
+        is_laugh = position.voice[VoiceKind.LAUGHTER] > _MIN_LAUGHTER
         self._since_laugh = 0 if is_laugh else self._since_laugh + 1
         arousal, valence = (
             round(min(max(value - mean, -1.0), 1.0), _DIGITS)

@@ -47,8 +47,8 @@ from kouxing.shared.wire.events import (
     SPEECH_MESSAGES,
     SpeechMessage,
     event_of,
-    is_report,
-    separate,
+    is_state_report,
+    split_batch,
 )
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
@@ -256,11 +256,11 @@ class SynthesizerService(Service):
     # --- from the recognizer ---------------------------------------------------------------------
 
     def _on_results(self, results: Results, sender: Peer) -> None:
-        for message in separate(results):
+        for message in split_batch(results):
             self._on_input(message, sender)
 
     def _on_input(self, message: SpeechMessage, sender: Peer) -> None:
-        session = self._admit(message, sender)
+        session = self._accept(message, sender)
         if session is None:
             return
         now_s = time.monotonic()
@@ -268,19 +268,19 @@ class SynthesizerService(Service):
         if isinstance(message, Progress):
             state, newest_frame = message.state, message.newest_frame
         has_stalled = state == AudioState.STALLED
-        if is_report(message):
+        if is_state_report(message):
             session.overload.resume()
         session.relax_at_s = now_s if has_stalled else now_s + RECOGNIZER_TIMEOUT_S
-        if message.epoch != session.epoch_in:
+        if message.epoch != session.input_epoch:
             self._enter_epoch(session, message, newest_frame)
-        if not is_report(message):
+        if not is_state_report(message):
             self._queue_event(session, message)
 
     def _enter_epoch(
         self, session: SynthesizerSession, message: SpeechMessage, newest_frame: NewestFrame | None
     ) -> None:
         """Continue a face with another recognizer, or after another synthesizer's frames."""
-        if session.epoch_in:
+        if session.input_epoch:
             session.face.change_recognizer()
         elif newest_frame is not None:
             faps = np.frombuffer(newest_frame.values, "<f4")
@@ -290,9 +290,9 @@ class SynthesizerService(Service):
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
         if message.epoch > 1:
             session.overload.restart(time.monotonic() + CATCH_UP_S)
-        session.epoch_in = message.epoch
+        session.input_epoch = message.epoch
 
-    def _admit(self, message: SpeechMessage, sender: Peer) -> SynthesizerSession | None:
+    def _accept(self, message: SpeechMessage, sender: Peer) -> SynthesizerSession | None:
         """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:
@@ -360,11 +360,11 @@ class SynthesizerService(Service):
 
     def _end(self, session: SynthesizerSession) -> None:
         session.finished = True
-        session.sequence_out += 1
+        session.last_sequence += 1
         end = EndOfFaps(
             session=session.start.session,
             epoch=session.start.epoch,
-            sequence=session.sequence_out,
+            sequence=session.last_sequence,
             media_time=session.media_time,
         )
         session.replay.send(end, time.monotonic())
@@ -373,11 +373,11 @@ class SynthesizerService(Service):
     def _publish(self, session: SynthesizerSession, frames: Sequence[Frame]) -> None:
         self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
-            session.sequence_out += 1
+            session.last_sequence += 1
             session.newest = FapFrame(
                 session=session.start.session,
                 epoch=session.start.epoch,
-                sequence=session.sequence_out,
+                sequence=session.last_sequence,
                 media_time=to_samples(time_s),
                 values=faps.astype("<f4").tobytes(),
                 mask=MASK,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import to_seconds
-from kouxing.shared.overload import Overload
+from kouxing.shared.overload import SkipPolicy
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, SoundEvent
 from kouxing.shared.phones.final_time import FinalTime
@@ -40,14 +40,14 @@ class SynthesizerSession:
         self.replay = Replay(publisher, time.monotonic())
         self.face = face
         self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledgement)
-        self.epoch_in = 0  # epoch of the newest message from the recognizer; 0 before the first
+        self.input_epoch = 0  # epoch of the newest message from the recognizer; 0 before the first
         self.relax_at_s = time.monotonic() + RECOGNIZER_TIMEOUT_S  # start of frames without sound
-        self.sequence_out = 0
+        self.last_sequence = 0
         self.newest: FapFrame | None = None
         self.final = FinalTime()
         self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
         self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
-        self.overload = Overload(max_behind_s)
+        self.overload = SkipPolicy(max_behind_s)
         self.newest_s = 0.0  # media time of the newest received event
         self.finished = False
         self.lateness = LatenessMeter()
@@ -66,7 +66,7 @@ class SynthesizerSession:
 
     def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
         """Continue after the newest frame of another synthesizer."""
-        self.sequence_out = num_frames
+        self.last_sequence = num_frames
         self.face.resume(to_seconds(media_time), num_frames, faps)
 
     @property

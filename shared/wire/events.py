@@ -16,7 +16,7 @@ SpeechMessage: TypeAlias = Phone | LipPositions | Speech | Progress
 SPEECH_MESSAGES: tuple[type[SpeechMessage], ...] = get_args(SpeechMessage)
 
 
-def is_report(message: Message) -> bool:
+def is_state_report(message: Message) -> bool:
     """Return whether a message only reports the state of the client or another synthesizer."""
     return isinstance(message, Progress) and (
         message.newest_frame is not None
@@ -24,7 +24,7 @@ def is_report(message: Message) -> bool:
     )
 
 
-def combine(messages: Sequence[Message]) -> Message:
+def batch_messages(messages: Sequence[Message]) -> Message:
     """Return one message with these messages of a session, at most ``MAX_TOGETHER``."""
     first = messages[0]
     if len(messages) == 1:
@@ -39,7 +39,7 @@ def combine(messages: Sequence[Message]) -> Message:
     )
 
 
-def separate(results: Results) -> list[SpeechMessage]:
+def split_batch(results: Results) -> list[SpeechMessage]:
     """Return the messages of a combined message in order."""
     messages: list[SpeechMessage] = [*results.phones, *results.lip_positions]
     messages += [*results.speech, *results.progress]

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from kouxing_client import Client
 
-from kouxing.evaluation.system.network import Link, Network
+from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.shared.keys import control_endpoint
 from tests.containers import READ, USER, Containers, network_or_skip
 from tests.system import ROOT, VOWELS_FILE
@@ -31,7 +31,7 @@ HOSTS = {  # containers by name, and their services
 
 @pytest.fixture(scope="module")
 def network() -> Iterator[Network]:
-    with network_or_skip([*HOSTS], Link()) as made:
+    with network_or_skip([*HOSTS], NetworkLink()) as made:
         yield made
 
 

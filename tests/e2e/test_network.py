@@ -12,7 +12,7 @@ import pytest
 from kouxing_client import Client
 
 from kouxing.evaluation.system.live import ReceivedResults, speak, speak_undisturbed
-from kouxing.evaluation.system.network import Link
+from kouxing.evaluation.system.network import NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
 from kouxing.shared.keys import CLIENT
 from tests.containers import network_or_skip
@@ -38,7 +38,9 @@ def system(_complete: None, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     states = folder / "states"
     states.mkdir()
     with (
-        network_or_skip([*ON_HOSTS, CLIENT, SPARE], Link(delay_ms=10.0, loss=0.02)) as network,
+        network_or_skip(
+            [*ON_HOSTS, CLIENT, SPARE], NetworkLink(delay_ms=10.0, loss=0.02)
+        ) as network,
         HostsSystem(folder, states, network, "recognizer") as system,
         system.on_client(),
     ):

@@ -12,7 +12,7 @@ from PIL import Image
 from kouxing.services.cli import heads as page_heads
 from kouxing.services.cli.heads import import_mesh
 from kouxing.services.cli.offline import render as render_files
-from kouxing.services.cli.options import CurveForm
+from kouxing.services.cli.options import CurveFormat
 from kouxing.services.cli.run import head_environment
 from kouxing.services.driver.config import DriverConfig, Framing
 from kouxing.services.driver.head.glb_export import export_glb
@@ -111,7 +111,7 @@ def test_renders_a_sound_as_curves_and_converts_them(tmp_path: Path) -> None:
     faps = read_fap(fap)
     assert faps.frame_rate_hz == 50
     assert np.ptp(faps.faps[:, 2]) > 100
-    render(fap, lines, form=CurveForm.ARKIT)
+    render(fap, lines, form=CurveFormat.ARKIT)
     frames = [json.loads(line) for line in lines.read_text().splitlines()]
     jaw = [frame["arkit"]["jawOpen"] for frame in frames]
     assert np.corrcoef(jaw, faps.faps[:, 2])[0, 1] > 0.8

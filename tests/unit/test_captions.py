@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kouxing.services.cli.animation import Motion, slow_down
+from kouxing.services.cli.animation import FaceMotion, slow_down
 from kouxing.services.cli.captions import make_captions, write_syllables
 from kouxing.services.cli.options import CaptionKind
 from kouxing.services.driver.render.captions import Caption, Captions, band_height_px
@@ -21,10 +21,10 @@ PHONES = [
 ]
 
 
-def motion_of(text: str | None = None) -> Motion:
+def motion_of(text: str | None = None) -> FaceMotion:
     transcript = None if text is None else MANDARIN.read(text)
     syllables = write_syllables(PHONES, transcript, MANDARIN)
-    return Motion([(0.0, np.zeros(68, np.float32))], 50.0, 25.0, None, PHONES, syllables)
+    return FaceMotion([(0.0, np.zeros(68, np.float32))], 50.0, 25.0, None, PHONES, syllables)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_highlights_only_the_current_caption_below_the_picture() -> None:
 
 def test_phones_of_other_languages_are_ipa() -> None:
     phones = [lips.phone(number, symbol, 0.2 * number, 0.2) for number, symbol in enumerate("vi")]
-    motion = Motion(motion_of().frames, 50.0, 25.0, None, phones, language="german")
+    motion = FaceMotion(motion_of().frames, 50.0, 25.0, None, phones, language="german")
     german = make_captions(CaptionKind.PHONES, motion, SIZE)
     assert german is not None
     assert [caption.text for line in german._lines for caption in line] == ["v", "i"]

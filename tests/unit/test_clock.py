@@ -6,7 +6,7 @@ import math
 import pytest
 
 from kouxing.services.cli.service_process import POLL_S, SilenceMeter
-from kouxing.services.control.faults import Faults
+from kouxing.services.control.faults import FaultLog
 from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import ClockOffset, StallDetector
 from kouxing.shared.logs import LOG
@@ -52,7 +52,7 @@ def test_time_without_a_processor_does_not_count_as_silence(waiting: float) -> N
 def test_only_long_faults_are_reported_with_their_end(
     caplog: pytest.LogCaptureFixture, lasts_s: float, level: int, is_back_logged: str
 ) -> None:
-    faults = Faults()
+    faults = FaultLog()
     with caplog.at_level(logging.INFO, LOG.name):
         LOG.addHandler(caplog.handler)
         faults.begin("recognizer-1", "no heartbeat", 10.0)

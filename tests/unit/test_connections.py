@@ -81,8 +81,8 @@ def test_disconnects_a_peer_whose_message_does_not_end(scene: Scene) -> None:
         scene.deliver(2)
         scene.traffic = dict.fromkeys((1, 2), Traffic(read=20_000 * look))
         scene.enforce_limits(float(look))
-    assert hostile.is_cut
-    assert not honest.is_cut
+    assert hostile.is_disconnected
+    assert not honest.is_disconnected
 
 
 def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
@@ -98,8 +98,8 @@ def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
     scene.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000, unsent=1))
     scene.enforce_limits(2.0)
     assert other.unread == MAX_QUEUED, "libzmq drops more"
-    assert sum(connection.is_cut for connection in silent) == 2
-    assert not other.is_cut
+    assert sum(connection.is_disconnected for connection in silent) == 2
+    assert not other.is_disconnected
 
 
 @pytest.mark.parametrize("key", ["key", ""])
@@ -108,7 +108,7 @@ def test_one_peer_cannot_take_all_connections(scene: Scene, key: str) -> None:
     for number in range(1, 10):
         made.append(scene.deliver(number, key))
         scene.enforce_limits(0.0)
-    assert [connection.is_cut for connection in made] == [False] * 7 + [True] * 2
+    assert [connection.is_disconnected for connection in made] == [False] * 7 + [True] * 2
 
 
 def test_clients_cannot_use_connections_of_services_or_other_keys(scene: Scene) -> None:
@@ -118,7 +118,7 @@ def test_clients_cannot_use_connections_of_services_or_other_keys(scene: Scene) 
         scene.enforce_limits(0.0)
     honest += [scene.deliver(3, "service"), scene.deliver(4, "laptop")]
     scene.enforce_limits(0.0)
-    assert not any(connection.is_cut for connection in honest)
+    assert not any(connection.is_disconnected for connection in honest)
     assert len(scene.limiter.connections_to(scene.socket)) == 10 + 2
 
 
@@ -153,8 +153,10 @@ def test_silent_connections_make_room(scene: Scene) -> None:
     silent = [scene.limiter.find(number, scene.socket) for number in range(10)]
     talker = scene.deliver(10, "talker")
     scene.enforce_limits(0.0)
-    assert [connection.is_cut for connection in silent if connection] == [True] + [False] * 9
-    assert not talker.is_cut
+    assert [connection.is_disconnected for connection in silent if connection] == [True] + [
+        False
+    ] * 9
+    assert not talker.is_disconnected
 
 
 def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(scene: Scene) -> None:
@@ -164,7 +166,7 @@ def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(scene: Scen
     assert not scene.limiter.is_blocked("other")
     assert list(scene.socket.ended) == [1]
     honest = scene.deliver(2, "key")
-    assert not honest.is_cut
+    assert not honest.is_disconnected
     assert honest.budget.left >= MIN_BUDGET
 
 

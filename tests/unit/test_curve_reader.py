@@ -9,7 +9,7 @@ import pytest
 
 from kouxing.services.cli.curve_reader import read_table
 from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
-from kouxing.services.cli.options import CurveForm, ExportOptions
+from kouxing.services.cli.options import CurveFormat, ExportOptions
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT
@@ -34,14 +34,14 @@ def face_curves() -> Curves:
 @pytest.mark.parametrize(
     ("name", "form", "has_head"),
     [
-        ("face.csv", CurveForm.FAPS, True),
-        ("face.jsonl", CurveForm.FAPS, True),
-        ("face.csv", CurveForm.ARKIT, False),
-        ("face.jsonl", CurveForm.ARKIT, False),
-        ("face.csv", CurveForm.LIVELINK, True),
+        ("face.csv", CurveFormat.FAPS, True),
+        ("face.jsonl", CurveFormat.FAPS, True),
+        ("face.csv", CurveFormat.ARKIT, False),
+        ("face.jsonl", CurveFormat.ARKIT, False),
+        ("face.csv", CurveFormat.LIVELINK, True),
     ],
 )
-def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveForm, has_head: bool) -> None:
+def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveFormat, has_head: bool) -> None:
     path, curves = tmp_path / name, face_curves()
     CURVE_EXPORTERS[path.suffix](path, ExportOptions(form=form)).write(curves)
     animation = read_table(path)
@@ -53,7 +53,7 @@ def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveForm, has_hea
 
 def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:
     path = tmp_path / "take.csv"
-    CURVE_EXPORTERS[".csv"](path, ExportOptions(form=CurveForm.LIVELINK)).write(face_curves())
+    CURVE_EXPORTERS[".csv"](path, ExportOptions(form=CurveFormat.LIVELINK)).write(face_curves())
     header, *rows = csv.reader(path.read_text().splitlines())
     assert header[:3] == ["Timecode", "BlendShapeCount", "EyeBlinkLeft"]
     assert header[16:20] == ["JawForward", "JawRight", "JawLeft", "JawOpen"]

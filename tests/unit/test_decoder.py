@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.search import decoder as search
-from kouxing.services.recognizer.search.decoder import Decoder, Segment
+from kouxing.services.recognizer.search.decoder import Decoder, PathSegment
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from tests.languages import MANDARIN, NUM_PHONES, SIL, Table, random_topology
 
@@ -19,7 +19,7 @@ class Path:
     """A path up to a frame."""
 
     score: float
-    ended: tuple[Segment, ...]
+    ended: tuple[PathSegment, ...]
     phone: int
     state: int  # state of the phone
     start: int  # start frame of the phone
@@ -42,7 +42,7 @@ def phone_penalties(model: Topology, scores: NDArray[np.float32]) -> list[float]
 
 def brute_force(
     model: Topology, table: Table, scores: NDArray[np.float32], phones: list[int]
-) -> list[Segment]:
+) -> list[PathSegment]:
     """Try every path that the loop allows."""
 
     penalties = phone_penalties(model, scores)
@@ -62,7 +62,7 @@ def brute_force(
             if at + 1 < model.first_state[path.phone + 1]:
                 longer.append(replace(path, score=left, state=path.state + 1))
                 continue
-            ended = (*path.ended, Segment(path.phone, path.start, frame + 1))
+            ended = (*path.ended, PathSegment(path.phone, path.start, frame + 1))
             before = (SIL, *(segment.phone for segment in ended))
             is_last = frame + 1 == len(scores)
             longer += [

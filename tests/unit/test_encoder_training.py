@@ -9,7 +9,7 @@ import soundfile
 import torch
 
 from kouxing.corpora.feature_cache import as_integers
-from kouxing.services.recognizer.encoder import LIP_DELAYS_S, Voice, load_encoder
+from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.services.recognizer.onnx_session import open_network
 from kouxing.shared.audio_file import read_audio
@@ -42,7 +42,7 @@ def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6, width=64))
 
 
-def piece(samples: np.ndarray, voice: Voice = Voice.SPEECH) -> Piece:
+def piece(samples: np.ndarray, voice: Voice = VoiceKind.SPEECH) -> Piece:
     """Make a piece whose pitch and lips are the number of the position."""
     num_positions = len(samples) // POSITION_SAMPLES
     rows = np.zeros((num_positions, COLUMNS.lips.start + NUM_OUTPUTS), np.float16)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import Motion
+from kouxing.services.cli.animation import FaceMotion
 from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves, Row
 from kouxing.services.cli.exporters import open_exporter
 from kouxing.services.cli.follow import follow
-from kouxing.services.cli.options import CurveForm, ExportOptions, ListenOutput
+from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenOutput
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import NUM_FAPS
@@ -28,16 +28,16 @@ def rows(number: int = 5) -> list[Row]:
     return [(index / RATE_HZ, index, faps[index]) for index in range(number)]
 
 
-def export(output: Path, form: CurveForm = CurveForm.FAPS) -> None:
+def export(output: Path, form: CurveFormat = CurveFormat.FAPS) -> None:
     frames = [(time_s, faps) for time_s, _, faps in rows()]
-    motion = Motion(frames, RATE_HZ, 25.0, samples=None)
+    motion = FaceMotion(frames, RATE_HZ, 25.0, samples=None)
     exporter = open_exporter(output, ExportOptions(form=form))
     assert exporter.export(motion, Progress(disable=True)) == len(frames)
 
 
 @pytest.mark.parametrize("name", ["face.CSV", "face.csv"])
 def test_csv_has_a_column_per_value(tmp_path: Path, name: str) -> None:
-    export(tmp_path / name, CurveForm.ARKIT)
+    export(tmp_path / name, CurveFormat.ARKIT)
     with (tmp_path / name).open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     assert tuple(table[0]) == ("time_s", *ARKIT.names)
@@ -51,7 +51,7 @@ def test_json_lines_have_an_object_per_frame(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [line["sequence"] for line in lines] == [0, 1, 2, 3, 4]
     assert [line["faps"][2] for line in lines] == [0, 100, 200, 300, 400]
-    export(path, CurveForm.ARKIT)
+    export(path, CurveFormat.ARKIT)
     assert tuple(json.loads(path.read_text().splitlines()[0])["arkit"]) == ARKIT.names
 
 
@@ -71,22 +71,22 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"unknown format; .*\.mp4, .*\.png, .*\.csv"):
             open_exporter(output, ExportOptions())
         with pytest.raises(UserError, match=r"unknown format; .*\.fap, \.csv, \.jsonl"):
-            follow("", output, ListenOutput.FAPS, CurveForm.FAPS, control="")
+            follow("", output, ListenOutput.FAPS, CurveFormat.FAPS, control="")
         assert not output.exists()
 
 
 @pytest.mark.parametrize(
     ("output", "options", "message"),
     [
-        ("a.fap", {"form": CurveForm.ARKIT}, "holds faps; for arkit, write .csv"),
-        ("a.glb", {"form": CurveForm.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
+        ("a.fap", {"form": CurveFormat.ARKIT}, "holds faps; for arkit, write .csv"),
+        ("a.glb", {"form": CurveFormat.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
         ("a.csv", {"lips": ["dynamic-visemes", "learnt"]}, "a curve file holds one face"),
         ("no/a.csv", {}, "cannot write"),
         ("no/a.mp4", {}, "cannot write"),
-        ("a.jsonl", {"form": CurveForm.LIVELINK}, "for livelink, write .csv"),
-        ("a.csv", {"form": CurveForm.RHUBARB}, "for rhubarb, write .tsv or .xml or .json"),
-        ("a.tsv", {"form": CurveForm.ARKIT}, "holds rhubarb or oculus; for arkit, write .csv"),
-        ("a.mp4", {"form": CurveForm.ARKIT}, "--as does not apply .* .fap, .csv"),
+        ("a.jsonl", {"form": CurveFormat.LIVELINK}, "for livelink, write .csv"),
+        ("a.csv", {"form": CurveFormat.RHUBARB}, "for rhubarb, write .tsv or .xml or .json"),
+        ("a.tsv", {"form": CurveFormat.ARKIT}, "holds rhubarb or oculus; for arkit, write .csv"),
+        ("a.mp4", {"form": CurveFormat.ARKIT}, "--as does not apply .* .fap, .csv"),
         ("a.csv", {"size": "640x360"}, "--size does not apply .* .mp4"),
         ("a.fap", {"rate_hz": 30.0}, "--rate does not apply .* .mp4"),
         ("a.png", {"rate_hz": 30.0}, "--rate does not apply"),

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.front_end.features import (
     NUM_BANDS,
     NUM_STATIC,
-    LiveMean,
+    RunningMean,
     with_differences,
 )
 from kouxing.services.recognizer.front_end.pcm import level_db, samples_of
@@ -95,7 +95,7 @@ def test_live_mean_adapts_from_the_prior_to_the_speaker() -> None:
     speaker = rng.normal(5, 1, NUM_STATIC)
     static = speaker + rng.normal(0, 1, (3000, NUM_STATIC))
     features = np.concatenate([static, rng.normal(size=(3000, 26))], axis=1).astype(np.float32)
-    mean = LiveMean(np.zeros(NUM_STATIC, np.float32))
+    mean = RunningMean(np.zeros(NUM_STATIC, np.float32))
     normalized = mean.normalize(features)
     assert normalized[0, 1:NUM_STATIC].mean() > 3  # the prior dominates
     assert np.abs(normalized[-1000:, :NUM_STATIC].mean(axis=0)).max() < 0.6

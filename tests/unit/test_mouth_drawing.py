@@ -10,7 +10,7 @@ import pytest
 
 from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
 from kouxing.services.cli.offline import lips
-from kouxing.services.cli.options import DrawnLips, Timing
+from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.driver import picture
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
 from kouxing.services.synthesizer.lips.ferguson.drawing import LabeledMouth, draw_strip
@@ -25,7 +25,7 @@ TEXT = "四是四，十是十，十四是十四，四十是四十。"
 
 def test_table_holds_the_contour_of_every_frame(tmp_path: Path) -> None:
     output = tmp_path / "mouth.csv"
-    draw_mouth(SOUND, TEXT, output, num_points=5, lips=DrawnLips.FERGUSON)
+    draw_mouth(SOUND, TEXT, output, num_points=5, lips=WidthSource.FERGUSON)
     with output.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == CSV_COLUMNS
@@ -84,7 +84,7 @@ def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:
 def test_reports_a_text_that_does_not_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, fits: bool
 ) -> None:
-    draw_mouth(SOUND, text, tmp_path / "mouth.csv", num_points=2, lips=DrawnLips.FERGUSON)
+    draw_mouth(SOUND, text, tmp_path / "mouth.csv", num_points=2, lips=WidthSource.FERGUSON)
     assert ("the text does not fit the sound" not in capsys.readouterr().err) == fits
 
 
@@ -92,12 +92,12 @@ def test_reports_a_text_that_does_not_fit(
     ("text", "output", "timing", "message"),
     [
         (TEXT, "mouth.gif", None, "ends in .svg, .png, .mp4, .csv"),
-        (None, "mouth.svg", Timing.ALIGN, "--timing needs a text"),
+        (None, "mouth.svg", TimingMethod.ALIGN, "--timing needs a text"),
         ("", "mouth.svg", None, "text is empty"),
     ],
 )
 def test_mistakes_are_named(
-    tmp_path: Path, text: str | None, output: str, timing: Timing | None, message: str
+    tmp_path: Path, text: str | None, output: str, timing: TimingMethod | None, message: str
 ) -> None:
     with pytest.raises(UserError, match=message):
         draw_mouth(SOUND, text, tmp_path / output, timing=timing)

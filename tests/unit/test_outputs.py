@@ -11,7 +11,7 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import plot_heads
-from kouxing.services.cli.animation import Motion
+from kouxing.services.cli.animation import FaceMotion
 from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
 from kouxing.services.cli.main import app
@@ -179,7 +179,7 @@ def interrupt_export(output: Path) -> None:
     exporter = CURVE_EXPORTERS[output.suffix](output, ExportOptions())
     with pytest.raises(KeyboardInterrupt):
         exporter.export(
-            Motion(cast(list[Frame], interrupted_frames()), 50.0, 25.0, None), Progress()
+            FaceMotion(cast(list[Frame], interrupted_frames()), 50.0, 25.0, None), Progress()
         )
 
 

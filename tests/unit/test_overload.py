@@ -8,14 +8,14 @@ import pytest
 from kouxing.services.recognizer.audio_queue import AudioQueue
 from kouxing.shared.overload import (
     CATCH_UP_S,
+    HOP_PERIOD_S,
     LIGHT_FOR_S,
     MAX_HOP,
     MAX_LATE_FOR_S,
-    PACE_PERIOD_S,
     RESTORE_AFTER_S,
-    NetworkPace,
-    Overload,
+    HopController,
     ProcessorTime,
+    SkipPolicy,
 )
 
 MAX_BEHIND_S = 0.2
@@ -27,7 +27,7 @@ class Session:
     """A session of a service that processes audio at a speed, in steps of 20 ms."""
 
     def __init__(self, **options: float) -> None:
-        self.overload = Overload(MAX_BEHIND_S, **options)
+        self.overload = SkipPolicy(MAX_BEHIND_S, **options)
         self.now_s = 100.0
         self.waiting_s = -CHUNK_S  # after the oldest chunk
 
@@ -141,7 +141,7 @@ def test_reports_skipped_audio_at_most_once_a_second() -> None:
 
 
 def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
-    audio = AudioQueue(2 * RATE_HZ, Overload(MAX_BEHIND_S))
+    audio = AudioQueue(2 * RATE_HZ, SkipPolicy(MAX_BEHIND_S))
     chunk = np.zeros((3200, 1), np.float32)  # 0.1 s
     audio.append((0, chunk), 0.0)
     audio.append((1600, chunk), 0.1)
@@ -159,7 +159,7 @@ def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
 
 
 def test_empty_chunks_fill_the_queue() -> None:
-    audio = AudioQueue(RATE_HZ, Overload(MAX_BEHIND_S))
+    audio = AudioQueue(RATE_HZ, SkipPolicy(MAX_BEHIND_S))
     for _ in range(100):
         audio.append((0, np.zeros((0, 1), np.float32)), 0.0)
     assert audio.duration_s == pytest.approx(0.1)
@@ -183,7 +183,7 @@ class Recognizer:
     def __init__(self) -> None:
         self.now_s = 100.0
         self._work = ProcessorTime(others_s=3.0)  # the start of the service
-        self.pace = NetworkPace(self._work, self.now_s)
+        self.pace = HopController(self._work, self.now_s)
 
     def run(
         self, duration_s: float, others: float, network: float, *, is_behind: bool = False
@@ -205,15 +205,15 @@ def test_one_session_keeps_the_shortest_hop() -> None:
 @pytest.mark.parametrize(("network", "hop"), [(0.25, 1), (0.5, 2), (0.8, 3), (1.1, 4), (9.0, 4)])
 def test_the_network_runs_less_often_under_load(network: float, hop: int) -> None:
     hops = Recognizer().run(20.0, others=0.3, network=network)
-    assert set(hops[round(2 * PACE_PERIOD_S / CHUNK_S) :]) == {hop}
+    assert set(hops[round(2 * HOP_PERIOD_S / CHUNK_S) :]) == {hop}
 
 
 def test_the_hop_falls_some_time_after_the_load() -> None:
     recognizer = Recognizer()
     recognizer.run(5.0, others=0.3, network=1.1)
     hops = recognizer.run(20.0, others=0.2, network=0.2)
-    late = round((RESTORE_AFTER_S + 2 * PACE_PERIOD_S) / CHUNK_S)
-    assert set(hops[: round((RESTORE_AFTER_S - PACE_PERIOD_S) / CHUNK_S)]) == {4}
+    late = round((RESTORE_AFTER_S + 2 * HOP_PERIOD_S) / CHUNK_S)
+    assert set(hops[: round((RESTORE_AFTER_S - HOP_PERIOD_S) / CHUNK_S)]) == {4}
     assert set(hops[late:]) == {1}
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kouxing.services.driver.poses import Poses
+from kouxing.services.driver.poses import PoseStore
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.idle_motion import FADE_S
 
@@ -12,9 +12,9 @@ def faps(value: float) -> np.ndarray:
     return np.full(NUM_FAPS, value, np.float32)
 
 
-def poses_of(*sessions: str, configured: str = "newest") -> Poses:
+def poses_of(*sessions: str, configured: str = "newest") -> PoseStore:
     """Return poses of sessions opened in order at 1 s, with FAPs 1, 2 and so on."""
-    poses = Poses(configured)
+    poses = PoseStore(configured)
     for number, session in enumerate(sessions, start=1):
         poses.add(session, 1.0)
         poses.update(session, faps(number), 1.0)
@@ -38,7 +38,7 @@ def test_waits_for_a_named_session() -> None:
 
 
 def test_an_expression_shows_at_rest_and_fades() -> None:
-    poses = Poses()
+    poses = PoseStore()
     corner = FAP_NUMBER["raise_l_cornerlip"] - 1
     assert poses.faps(0.0)[corner] == 0
     poses.express({"smile": 1.0, "unknown": 1.0}, hold_s=2.0)

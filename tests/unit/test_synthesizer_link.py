@@ -11,7 +11,7 @@ from kouxing.services.recognizer.synthesizer_link import (
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.events import separate
+from kouxing.shared.wire.events import split_batch
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results, Speech
 
@@ -33,7 +33,7 @@ class FakeSynthesizerLink(SynthesizerLink):
         return self.sent
 
     def _receive(self, message: Message) -> None:
-        self.sent += separate(message) if isinstance(message, Results) else [message]
+        self.sent += split_batch(message) if isinstance(message, Results) else [message]
 
     def send_all(self, *messages: Message) -> None:
         for message in messages:

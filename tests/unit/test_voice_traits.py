@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.model_file import write_archive
-from kouxing.services.recognizer.encoder import EncoderOutput, Voice, load_encoder
+from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.voice_traits import (
     NUM_TRAITS,
@@ -20,7 +20,7 @@ from kouxing.shared.errors import UserError
 PER_S = 50  # positions
 
 
-def speech(voices: list[tuple[Voice, float, int]]) -> np.ndarray:
+def speech(voices: list[tuple[VoiceKind, float, int]]) -> np.ndarray:
     """Return whether there is speech after each position.
 
     A voice has a probability for a number of positions; the rest is no voice.
@@ -28,8 +28,8 @@ def speech(voices: list[tuple[Voice, float, int]]) -> np.ndarray:
     detector = VoiceActivityDetector()
     seen = []
     for voice, probability, num_positions in voices:
-        row = np.zeros(len(Voice), np.float32)
-        row[Voice.NONE] = 1 - probability
+        row = np.zeros(len(VoiceKind), np.float32)
+        row[VoiceKind.NONE] = 1 - probability
         row[voice] += probability
         for _ in range(num_positions):
             detector.update(row)
@@ -38,23 +38,23 @@ def speech(voices: list[tuple[Voice, float, int]]) -> np.ndarray:
 
 
 def test_speech_starts_at_once_and_ends_after_half_a_second() -> None:
-    states = speech([(Voice.NONE, 0, 10), (Voice.SPEECH, 0.9, 10), (Voice.NONE, 0, 50)])
+    states = speech([(VoiceKind.NONE, 0, 10), (VoiceKind.SPEECH, 0.9, 10), (VoiceKind.NONE, 0, 50)])
     assert np.flatnonzero(states).tolist() == list(range(10, 20 + PER_S // 2 - 1))
 
 
 def test_a_weak_syllable_or_a_closure_does_not_end_the_speech() -> None:
-    weak, closure = (Voice.SPEECH, 0.4, 60), (Voice.NONE, 0, 20)
-    assert speech([(Voice.SPEECH, 0.9, 5), weak, closure, (Voice.SPEECH, 0.9, 5)]).all()
+    weak, closure = (VoiceKind.SPEECH, 0.4, 60), (VoiceKind.NONE, 0, 20)
+    assert speech([(VoiceKind.SPEECH, 0.9, 5), weak, closure, (VoiceKind.SPEECH, 0.9, 5)]).all()
     assert not speech([weak]).any()
 
 
 def test_a_sung_vowel_is_speech_until_it_ends() -> None:
-    assert speech([(Voice.SPEECH, 0.9, 5), (Voice.SUNG, 0.9, 500)]).all()
+    assert speech([(VoiceKind.SPEECH, 0.9, 5), (VoiceKind.SUNG, 0.9, 500)]).all()
 
 
 def test_laughter_in_bursts_is_not_speech() -> None:
-    burst, pause = (Voice.LAUGHTER, 0.9, 5), (Voice.NONE, 0, 3)
-    assert not speech([burst, pause, burst, pause, burst, (Voice.NONE, 0, 50)]).any()
+    burst, pause = (VoiceKind.LAUGHTER, 0.9, 5), (VoiceKind.NONE, 0, 3)
+    assert not speech([burst, pause, burst, pause, burst, (VoiceKind.NONE, 0, 50)]).any()
 
 
 # the first states are the traits themselves
@@ -63,23 +63,23 @@ READOUT = VoiceReadout(
 )
 
 
-def traits_of(*parts: tuple[float, Voice, Sequence[float]]) -> list[VoiceTraits]:
+def traits_of(*parts: tuple[float, VoiceKind, Sequence[float]]) -> list[VoiceTraits]:
     """Return the traits after each position of parts: duration in s, kind of voice, state."""
     stream = READOUT.create_stream()
     none = np.zeros(0, np.float32)
     seen = []
     for duration_s, kind, state in parts:
-        voice = np.eye(len(Voice), dtype=np.float32)[kind]
+        voice = np.eye(len(VoiceKind), dtype=np.float32)[kind]
         position = EncoderOutput(none, none, none, voice, np.array(state, np.float32))
         for _ in range(round(duration_s * PER_S)):
-            stream.accept_position(position)
+            stream.process_position(position)
             seen.append(stream.newest)
     return seen
 
 
 def test_feelings_are_relative_to_the_voice_so_far() -> None:
     excited, calm = [0.6, 0.3, 0, 0], [-0.2, 0.3, 0, 0]
-    seen = traits_of((60.0, Voice.SPEECH, calm), (3.0, Voice.SPEECH, excited))
+    seen = traits_of((60.0, VoiceKind.SPEECH, calm), (3.0, VoiceKind.SPEECH, excited))
     before, after = seen[60 * PER_S - 1], seen[-1]
     assert abs(before.arousal) < 0.05  # a calm voice is this speaker's usual voice
     assert after.arousal > 0.5
@@ -88,30 +88,30 @@ def test_feelings_are_relative_to_the_voice_so_far() -> None:
 
 
 def test_silence_does_not_change_the_feeling() -> None:
-    voiced = (2.0, Voice.SPEECH, [0.6, -0.3, 0, 0])
-    seen = traits_of(voiced, (5.0, Voice.NONE, [-1.0, 1.0, 0, 0]))
+    voiced = (2.0, VoiceKind.SPEECH, [0.6, -0.3, 0, 0])
+    seen = traits_of(voiced, (5.0, VoiceKind.NONE, [-1.0, 1.0, 0, 0]))
     assert seen[2 * PER_S - 1][:2] == seen[-1][:2]
     assert seen[-1].arousal > 0.2
 
 
 def test_laughter_and_breath_need_evidence_and_do_not_flicker() -> None:
     laughs, breathes, nothing = [0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 0]
-    bursts = [(0.1, Voice.LAUGHTER, laughs), (0.06, Voice.NONE, nothing)] * 6
-    seen = traits_of((1.0, Voice.NONE, nothing), *bursts, (1.0, Voice.NONE, nothing))
+    bursts = [(0.1, VoiceKind.LAUGHTER, laughs), (0.06, VoiceKind.NONE, nothing)] * 6
+    seen = traits_of((1.0, VoiceKind.NONE, nothing), *bursts, (1.0, VoiceKind.NONE, nothing))
     laughter = np.array([trait.is_laughter for trait in seen])
     assert not laughter[: PER_S + 2].any()
     assert np.count_nonzero(np.diff(laughter)) == 2  # it starts once and ends once
     assert not laughter[-PER_S // 2 :].any()
     assert not any(trait.is_breath for trait in seen)
-    breath = traits_of((0.5, Voice.NONE, breathes))
+    breath = traits_of((0.5, VoiceKind.NONE, breathes))
     assert breath[-1].is_breath
     assert not breath[-1].is_laughter
 
 
 def test_silence_and_speech_end_laughter() -> None:
     laughs = [0, 0, 0.8, 0]
-    for after in (Voice.NONE, Voice.SPEECH):
-        seen = traits_of((2.0, Voice.LAUGHTER, laughs), (3.0, after, laughs))
+    for after in (VoiceKind.NONE, VoiceKind.SPEECH):
+        seen = traits_of((2.0, VoiceKind.LAUGHTER, laughs), (3.0, after, laughs))
         assert seen[2 * PER_S].is_laughter
         assert not any(trait.is_laughter for trait in seen[3 * PER_S :])
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.mouth_profiles.positions import POSITION_S
-from kouxing.services.recognizer.encoder import LIP_DELAYS_S, Voice
+from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.encoder.network import NUM_INPUTS
@@ -83,7 +83,7 @@ def _excerpt(
     sound, speed = change_speed(samples, rng)
     if rng.random() < _ONLY_BACKGROUND_PROB:
         targets[:] = np.nan
-        targets[:, VOICE] = Voice.NONE
+        targets[:, VOICE] = VoiceKind.NONE
         sound = _add_background(sound, material, rng, 0.0, with_voices=False) - sound
     elif rng.random() >= _CLEAN_PROB:
         if rng.random() < _BACKGROUND_PROB:
@@ -128,7 +128,7 @@ def _speech(
         if rng.random() < _PAUSE_PROB:
             size = int(rng.integers(_MAX_PAUSE))
             pause = np.full((size, rows[0].shape[1]), np.nan, np.float32)
-            pause[:, VOICE] = Voice.NONE
+            pause[:, VOICE] = VoiceKind.NONE
             rows.append(pause)
             sounds.append(np.zeros(POSITION_SAMPLES * size, np.float32))
             missing -= size

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.model_file import write_archive
-from kouxing.services.recognizer.encoder import FORMAT, Voice
+from kouxing.services.recognizer.encoder import FORMAT, VoiceKind
 from kouxing.training.encoder.network import (
     MEAN_PITCH,
     NUM_FEATURES,
@@ -60,7 +60,7 @@ class _EncoderGraph(Graph):
         second = self._step(first, states[1], "second")
         self.node("Concat", [first, second], "new_state", axis=-1)
         rows = self.product(self.node("Add", [first, second]), self._parameters, "output")
-        sizes = (NUM_FEATURES, self._num_phones, len(Voice), 1, 3)
+        sizes = (NUM_FEATURES, self._num_phones, len(VoiceKind), 1, 3)
         names = ["features", "phone_logits", "voice_logits", "voicing_logit", "others"]
         _, phones, voice, voicing, others = self.split(rows, names, *sizes)
         self.node("LogSoftmax", [phones], "phones", axis=-1)
@@ -72,7 +72,7 @@ class _EncoderGraph(Graph):
         outputs = [
             floats("features", "sessions", NUM_FEATURES),
             floats("phones", "sessions", self._num_phones),
-            floats("voice", "sessions", len(Voice)),
+            floats("voice", "sessions", len(VoiceKind)),
             floats("scalars", "sessions", 4),
             floats("new_state", "sessions", 2 * width),
         ]

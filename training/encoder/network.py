@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, log_softmax
 
-from kouxing.services.recognizer.encoder import LIP_DELAYS_S, Voice
+from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.training.encoder.targets import (
@@ -84,7 +84,7 @@ class AudioEncoder(nn.Module):
         self.first = nn.GRU(width, width, batch_first=True)
         self.second = nn.GRU(width, width, batch_first=True)
         components = [NUM_COMPONENTS, NUM_COMPONENTS, NUM_LIPS]
-        self.sizes = [*components, num_phones, len(Voice), 1, 1, 1, 1]
+        self.sizes = [*components, num_phones, len(VoiceKind), 1, 1, 1, 1]
         self.output = nn.Linear(width, sum(self.sizes))
 
     def forward(self, inputs: Tensor) -> Tensor:

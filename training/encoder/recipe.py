@@ -28,7 +28,7 @@ from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.encoder import Voice
+from kouxing.services.recognizer.encoder import VoiceKind
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
@@ -44,7 +44,7 @@ from kouxing.training.networks.optimizer import optimize
 from kouxing.training.training_set import read_utterances, weights_of
 
 _RATE, _WARM_UP_STEPS, _FALLING = 2e-3, 200, 0.5
-_OTHER_VOICES = {"laughter": Voice.LAUGHTER, "breath": Voice.NONE}  # by the kind of a sound
+_OTHER_VOICES = {"laughter": VoiceKind.LAUGHTER, "breath": VoiceKind.NONE}  # by the kind of a sound
 _OTHER_VOICE_WEIGHT = 0.02  # per recording; the total weight of speech is 1
 
 

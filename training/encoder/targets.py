@@ -9,7 +9,7 @@ columns   meaning (:mod:`kouxing.training.encoder.teachers`)                    
 pitch     log2 of Hz, NaN without voice                                         1
 level     relative to the recording                                             1
 effort    balance of high and low frequencies                                   1
-voice     number of a :class:`Voice`                                            1
+voice     number of a :class:`VoiceKind`                                            1
 phones    posteriors                                                            phones
 whisper   principal components of Whisper's encoder                             128
 lips      outputs of the lip teacher, standardized                              17
@@ -32,7 +32,7 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import as_floats, as_integers, load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
-from kouxing.services.recognizer.encoder import Voice
+from kouxing.services.recognizer.encoder import VoiceKind
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import write_text
 from kouxing.training.encoder.lip_teacher import LipTeacher, TeacherFeatures
@@ -61,7 +61,7 @@ class Recording:
     name: str
     read: Callable[[], Samples]  # ValueError if it cannot be read
     weight: float  # relative sampling frequency
-    voice: Voice = Voice.SPEECH  # where it is audible
+    voice: VoiceKind = VoiceKind.SPEECH  # where it is audible
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ class TargetStore:
 
     def _compute_basis(self) -> dict[str, Floats]:
         """Compute the bases of components and lips from the first recordings."""
-        speech = [one for one in self._recordings if one.voice == Voice.SPEECH][:_NUM_FITTED]
+        speech = [one for one in self._recordings if one.voice == VoiceKind.SPEECH][:_NUM_FITTED]
         sounds = [sound for one in speech for sound in _cut(one)]
         computed = process_in_order(self._teachers.compute_targets, sounds)
         features = [TeacherFeatures(outputs.whisper, outputs.phones) for outputs in computed]
@@ -195,7 +195,7 @@ class TargetStore:
                 continue
             for piece in of_recording:
                 pieces.append(piece)
-                if recording.voice == Voice.SPEECH and rng.random() < _SUNG_PROB:
+                if recording.voice == VoiceKind.SPEECH and rng.random() < _SUNG_PROB:
                     pieces += _sung_copy(piece, rng)
         if pieces:
             for name in ("samples", "targets"):
@@ -213,7 +213,7 @@ class TargetStore:
         for samples in _cut(recording):
             outputs = self._teachers.compute_targets(samples)
             voice = np.full(len(outputs.level), recording.voice, np.float32)
-            voice[~self._is_audible(outputs, recording.voice)] = Voice.NONE
+            voice[~self._is_audible(outputs, recording.voice)] = VoiceKind.NONE
             scalars = [outputs.pitch, outputs.level, outputs.effort, voice]
             whisper = (outputs.whisper - self._basis["whisper_mean"]) @ self._basis["whisper"]
             lips = self._lip_teacher.lips_of(TeacherFeatures(outputs.whisper, outputs.phones))
@@ -224,8 +224,8 @@ class TargetStore:
             pieces.append(Piece(trimmed, targets, recording.weight))
         return pieces
 
-    def _is_audible(self, outputs: TeacherOutputs, voice: Voice) -> NDArray[np.bool_]:
-        if voice == Voice.SPEECH:
+    def _is_audible(self, outputs: TeacherOutputs, voice: VoiceKind) -> NDArray[np.bool_]:
+        if voice == VoiceKind.SPEECH:
             return np.asarray(outputs.phones[:, self._teachers.silence] < _SILENT)
         return np.asarray(outputs.level > _LAUGHING_LEVEL)
 
@@ -257,7 +257,7 @@ def _sung_copy(piece: Piece, rng: np.random.Generator) -> list[Piece]:
         return []
     targets = np.array(piece.targets[sung.source])
     targets[:, PITCH] = sung.pitch
-    targets[sung.is_sung & (targets[:, VOICE] == Voice.SPEECH), VOICE] = Voice.SUNG
+    targets[sung.is_sung & (targets[:, VOICE] == VoiceKind.SPEECH), VOICE] = VoiceKind.SUNG
     num_positions = min(len(targets), len(sung.samples) // POSITION_SAMPLES)
     samples = as_integers(sung.samples[: POSITION_SAMPLES * num_positions])
     return [Piece(samples, targets[:num_positions], piece.weight)]

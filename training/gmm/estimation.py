@@ -33,7 +33,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, mixture_scores
 from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
-    LiveMean,
+    RunningMean,
     cepstra_of_all,
     with_differences,
 )
@@ -107,7 +107,7 @@ def features_of(
 ) -> NDArray[np.float32]:
     """Compute the normalized features of a copy as a new session does, (frames, 39)."""
     features = with_differences(cepstra_of_all(copy.log_mel.astype(np.float32)), half_width)
-    return LiveMean(prior_mean).normalize(features)
+    return RunningMean(prior_mean).normalize(features)
 
 
 @dataclass(slots=True)

@@ -22,7 +22,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     score_segment,
 )
 from kouxing.services.recognizer.acoustic.network import NetworkModel
-from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.decoder import PathSegment
 from kouxing.services.recognizer.search.forced_path import (
     segments_of_path,
     utterance_graph,
@@ -56,7 +56,7 @@ class Alignment:
     """The state of each frame of a recording."""
 
     states: NDArray[np.int64]  # (frames,) STATES_PER_PHONE for each phone
-    phones: list[Segment]
+    phones: list[PathSegment]
     weight: float  # of the phones in statistics of durations
 
 

@@ -17,7 +17,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.universal import save_universal
-from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.decoder import PathSegment
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
 from kouxing.shared.terminal import print_message
@@ -136,14 +136,14 @@ def _statistics(
     return statistics_of(aligned, list(np.array(weights) / sum(weights)), phone_lm)
 
 
-def _phones_of(states: NDArray[np.int64]) -> list[Segment]:
+def _phones_of(states: NDArray[np.int64]) -> list[PathSegment]:
     """Return the phones of aligned frames. Equal neighbors differ in their states' order."""
     starts = np.flatnonzero(
         np.diff(states // STATES_PER_PHONE, prepend=-1) | (np.diff(states, prepend=0) < 0)
     )
     ends = np.append(starts[1:], len(states))
     return [
-        Segment(int(states[start]) // STATES_PER_PHONE, int(start), int(end))
+        PathSegment(int(states[start]) // STATES_PER_PHONE, int(start), int(end))
         for start, end in zip(starts, ends, strict=True)
     ]
 

@@ -33,7 +33,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.config import HEAD_NAMES
-from kouxing.services.driver.head.shading import Shading
+from kouxing.services.driver.head.shading import NormalUpdater
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS, RADIANS_PER_ANGLE_UNIT
@@ -78,7 +78,7 @@ class Head:
     feature_points: dict[str, int]  # vertex by point name, such as "2.1"
     eye_centers: Float32  # (2, 3), left and right, m
     textures: dict[str, bytes]  # encoded JPEG or PNG by name
-    shading: Shading
+    shading: NormalUpdater
     cel: bool = False  # cartoon shading with one light and one dark tone
 
     @property
@@ -197,7 +197,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
     vertices = arrays["vertices"].astype(np.float32)[used]
     basis = _basis(arrays, new_index, len(used))
     welds = new_index[arrays["welds"].astype(np.int64)[used]] if "welds" in arrays else None
-    shading = Shading.of(vertices, faces, basis, welds)
+    shading = NormalUpdater.of(vertices, faces, basis, welds)
     return Head(
         name=name,
         parts=tuple(parts),

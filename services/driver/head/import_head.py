@@ -26,7 +26,7 @@ from kouxing.services.driver.head.import_fields import (
 )
 from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
 from kouxing.services.driver.head.pieces import Fields, Primitive, pack, weld
-from kouxing.services.driver.head.points_file import Points, read_points
+from kouxing.services.driver.head.points_file import FeaturePoints, read_points
 from kouxing.services.driver.head.surface import Geodesics
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
@@ -64,7 +64,7 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
 
 
 def _positions(
-    mesh: Path, path: Path, pieces: list[Primitive], points: Points
+    mesh: Path, path: Path, pieces: list[Primitive], points: FeaturePoints
 ) -> dict[str, Float64]:
     """Return the coordinates of every point in the mesh's own axes."""
     vertices, named = numbered_vertices(mesh, pieces)
@@ -93,7 +93,7 @@ class _Import:
         path: Path,
         pieces: list[Primitive],
         positions: dict[str, Float64],
-        feature_points: Points,
+        feature_points: FeaturePoints,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
         self._warnings: list[str] = []

@@ -28,7 +28,7 @@ Position = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class FeaturePoints:
     """The contents of a file."""
 
     positions: dict[str, Position | tuple[str, int]]
@@ -36,7 +36,7 @@ class Points:
     fapu: dict[str, float] = field(default_factory=dict)  # lengths in the mesh's own unit
 
 
-def read_points(path: Path) -> Points:
+def read_points(path: Path) -> FeaturePoints:
     """Read a file of feature points.
 
     Raises ``UserError`` if the file cannot be read or is invalid; the text names the line if
@@ -49,7 +49,7 @@ def read_points(path: Path) -> Points:
     return points
 
 
-def _from_lines(path: Path, text: str) -> Points:
+def _from_lines(path: Path, text: str) -> FeaturePoints:
     positions: dict[str, Position | tuple[str, int]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.partition("#")[0].split()
@@ -69,10 +69,10 @@ def _from_lines(path: Path, text: str) -> Points:
             positions[name] = ("", int(values[0]))
         else:
             raise UserError(f"{where}: expected 'point x y z' or 'point vertex'")
-    return Points(positions)
+    return FeaturePoints(positions)
 
 
-def _from_xml(path: Path, text: str) -> Points:
+def _from_xml(path: Path, text: str) -> FeaturePoints:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"{path}: .fdp files must not have a document type; remove it")
     try:
@@ -103,7 +103,7 @@ def _from_xml(path: Path, text: str) -> Points:
                 length = math.nan
             if 0 < length < math.inf:
                 fapu[name] = length
-    return Points(positions, fapu)
+    return FeaturePoints(positions, fapu)
 
 
 def _known(name: str, where: str, positions: dict[str, Position | tuple[str, int]]) -> str:

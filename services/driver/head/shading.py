@@ -13,7 +13,7 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
-class Shading:
+class NormalUpdater:
     """Normals of a deformable surface."""
 
     rest: Float32  # (V, 3), normals of the neutral face
@@ -28,7 +28,7 @@ class Shading:
         triangles: NDArray[np.uint32],
         basis: sparse.csr_array,
         welds: NDArray[np.int64] | None = None,
-    ) -> Shading:
+    ) -> NormalUpdater:
         """Find the parts of a ``Head`` that deform.
 
         ``welds`` (V,) is the vertex that shares its normal with each vertex, because several

@@ -42,8 +42,8 @@ from kouxing.services.recognizer.acoustic.model_file import Archive, topology_fr
 from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
     NUM_STATIC,
-    Differences,
-    LiveMean,
+    DeltaFeatures,
+    RunningMean,
     cepstra,
 )
 from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
@@ -142,8 +142,8 @@ class GmmStream(AcousticStream):
     def __init__(self, model: GmmModel) -> None:
         super().__init__(model)
         self._vtln = VocalTractNormalizer()
-        self._mean = LiveMean(model.prior_mean)
-        self._differences = Differences(model.half_width)
+        self._mean = RunningMean(model.prior_mean)
+        self._differences = DeltaFeatures(model.half_width)
         self.look_ahead_frames = self._differences.look_ahead_frames
 
     def score(self, frames: Floats | None) -> Floats:
@@ -153,7 +153,7 @@ class GmmStream(AcousticStream):
         """
         if frames is None:
             features = self._differences.finish()
-            self._differences = Differences(self.model.half_width)
+            self._differences = DeltaFeatures(self.model.half_width)
         else:
             log_mel = self._vtln.warp(frames[:, :-2], frames[:, -2], frames[:, -1])
             features = self._differences.append(cepstra(log_mel))
@@ -167,7 +167,7 @@ class GmmStream(AcousticStream):
 
     def reset(self) -> None:
         """Forget the segment and the speaker."""
-        self._differences = Differences(self.model.half_width)
+        self._differences = DeltaFeatures(self.model.half_width)
         self._vtln.reset()
         self._mean.reset()
 

@@ -54,7 +54,7 @@ class EncoderPhones:
         self._frames = np.concatenate([self._frames, self._mel.accept_waveform(samples)])
         rows = [self._rows[:0]]
         while len(self._frames) >= FRAMES_PER_POSITION:
-            position = self._encoder.accept_position(self._frames[:FRAMES_PER_POSITION])
+            position = self._encoder.process_position(self._frames[:FRAMES_PER_POSITION])
             rows.append(position.phones[np.newaxis].repeat(FRAMES_PER_POSITION, axis=0))
             self._frames = self._frames[FRAMES_PER_POSITION:]
         return np.concatenate(rows)

@@ -140,7 +140,7 @@ def cepstra(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
     return static
 
 
-class Differences:
+class DeltaFeatures:
     """Streaming first and second differences, from ``half_width`` frames on each side."""
 
     def __init__(self, half_width: int) -> None:
@@ -205,7 +205,7 @@ def _with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[n
     return out
 
 
-class LiveMean:
+class RunningMean:
     """Subtracts a running mean of speech from features, starting from a prior, (k,)."""
 
     def __init__(self, prior: NDArray[np.float32]) -> None:

@@ -18,7 +18,7 @@ the detection of speech (see :mod:`kouxing.services.recognizer.speech_segmenter`
 """
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.encoder import Voice
+from kouxing.services.recognizer.encoder import VoiceKind
 
 _NO_EVIDENCE, _ENOUGH = 0.75, 0.12
 _IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such positions do
@@ -34,8 +34,8 @@ class VoiceActivityDetector:
         self._num_improbable = 0  # positions in a row
 
     def update(self, voice: Floats) -> None:
-        """Take the probabilities of a position, (4,), by ``Voice``."""
-        probability = float(voice[Voice.SPEECH] + voice[Voice.SUNG])
+        """Take the probabilities of a position, (4,), by ``VoiceKind``."""
+        probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SUNG])
         self._num_improbable = 0 if probability >= _IMPROBABLE else self._num_improbable + 1
         if self.is_speech:
             self.is_speech = self._num_improbable < _STOP_POSITIONS

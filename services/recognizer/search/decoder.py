@@ -64,7 +64,7 @@ _MAX_CHAIN = MAX_ORDER + 1  # contexts from the longest to the empty one
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
+class PathSegment:
     """One phone of the best string, in feature frames of the decoder."""
 
     phone: int  # index into the inventory's phones
@@ -121,7 +121,7 @@ class Decoder:
     def reset(self) -> None:
         """Start a new stretch of speech at frame 0."""
         self.num_frames = 0
-        self._shared: list[Segment] = []  # phones that no later frame can change; the latest
+        self._shared: list[PathSegment] = []  # phones that no later frame can change; the latest
         self._last_shared = NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
         self._confidence = 0.0  # confidence in the phone
@@ -191,7 +191,7 @@ class Decoder:
         phone = int(self._graph.last_phone[self._tokens.context[token]])
         return LastPhone(phone, self._end(self._tokens.link[self._best]), self._confidence)
 
-    def path_since(self, frame: int) -> list[Segment]:
+    def path_since(self, frame: int) -> list[PathSegment]:
         """Return the phones of the best string that start at a frame or later, without the last.
 
         Those that end after ``shared_end`` may still change.
@@ -208,7 +208,7 @@ class Decoder:
         """Forget the phones before a frame; ``shared_end`` is not before it."""
         self._shared = [segment for segment in self._shared if segment.start >= frame]
 
-    def final_path(self) -> list[Segment]:
+    def final_path(self) -> list[PathSegment]:
         """Return the best string at the end of the speech, without phones that were forgotten."""
         if self.num_frames == 0:
             return []
@@ -222,7 +222,7 @@ class Decoder:
         if ends[best] <= IMPOSSIBLE:  # no phone has reached its last state
             best, state = self._best
         link = int(self._tokens.link[best, state])
-        last = Segment(int(phones[best]), self._end(link), self.num_frames)
+        last = PathSegment(int(phones[best]), self._end(link), self.num_frames)
         return [*self._shared, *self._trace(link), last]
 
     def drop_records(self) -> None:
@@ -239,12 +239,12 @@ class Decoder:
             self._records[:num_kept] = records[:num_kept]
         self._num_records = num_kept
 
-    def _trace(self, record: int) -> list[Segment]:
+    def _trace(self, record: int) -> list[PathSegment]:
         """Return the phones after the shared ones, up to the one of a record."""
-        segments: list[Segment] = []
+        segments: list[PathSegment] = []
         while record not in (NO_RECORD, self._last_shared):
             end, phone, before = self._records[record].tolist()
-            segments.append(Segment(phone, self._end(before), end))
+            segments.append(PathSegment(phone, self._end(before), end))
             record = before
         return segments[::-1]
 

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.decoder import PathSegment
 
 # scores of its frames, and columns, stay, leave and skip of its nodes
 _Block: TypeAlias = tuple[
@@ -235,12 +235,12 @@ def _backtrace(back: NDArray[np.int8], low: int, num_skipped: int, path: NDArray
         path[frame - 1] = path[frame] - (0, 1, num_skipped)[origin]
 
 
-def segments_of_path(path: NDArray[np.int64], graph: UtteranceGraph) -> list[Segment]:
+def segments_of_path(path: NDArray[np.int64], graph: UtteranceGraph) -> list[PathSegment]:
     """Return the phones with their frames, given the node of every frame."""
     runs = graph.phone_number[path]
     starts = np.concatenate([[0], np.flatnonzero(np.diff(runs)) + 1])
     ends = np.concatenate([starts[1:], [len(path)]])
     return [
-        Segment(int(graph.phones[runs[start]]), int(start), int(end))
+        PathSegment(int(graph.phones[runs[start]]), int(start), int(end))
         for start, end in zip(starts, ends, strict=True)
     ]

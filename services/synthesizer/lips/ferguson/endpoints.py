@@ -52,7 +52,7 @@ _MAX_GAP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
+class EnergySegment:
     """A segment of speech about as long as a syllable."""
 
     start_s: float
@@ -84,7 +84,7 @@ class SyllableSegmenter:
         self._peak: _Loudness | None = None  # in the current segment
         self._dip: _Loudness | None = None  # after the peak; None until sonority falls
 
-    def add_slice(self, new: Progress) -> list[Segment]:
+    def add_slice(self, new: Progress) -> list[EnergySegment]:
         """Add the next slice; return completed segments. A time gap ends a segment."""
         segments = []
         if self._before is not None and new.time_s - self._before.time_s > _MAX_GAP_S:
@@ -105,7 +105,7 @@ class SyllableSegmenter:
             return segments + self._end()
         return segments + self._follow_sonority(now)
 
-    def finish(self) -> list[Segment]:
+    def finish(self) -> list[EnergySegment]:
         """End the sound; return the current segment, if any."""
         self._before = None
         self._recent.clear()
@@ -130,13 +130,13 @@ class SyllableSegmenter:
         self._loud_until_s = now.end_s
         self._peak, self._dip = now, None
 
-    def _end(self) -> list[Segment]:
+    def _end(self) -> list[EnergySegment]:
         start_s, self.start_s = self.start_s, None
         if start_s is None or self._loud_until_s - start_s < 0.5 * MIN_SEGMENT_S:
             return []
-        return [Segment(start_s, self._loud_until_s)]
+        return [EnergySegment(start_s, self._loud_until_s)]
 
-    def _follow_sonority(self, now: _Loudness) -> list[Segment]:
+    def _follow_sonority(self, now: _Loudness) -> list[EnergySegment]:
         """Track peak and dip; split between them when the sonority has risen again."""
         peak, dip = self._peak, self._dip
         if peak is None or (dip is None and now.sonority_db > peak.sonority_db):
@@ -151,7 +151,7 @@ class SyllableSegmenter:
             return self._split(peak, dip)
         return []
 
-    def _split(self, peak: _Loudness, dip: _Loudness) -> list[Segment]:
+    def _split(self, peak: _Loudness, dip: _Loudness) -> list[EnergySegment]:
         """Split on the way down from a peak to a dip."""
         edge_db = dip.sonority_db + _DESCENT * (peak.sonority_db - dip.sonority_db)
         descent = [slice_ for slice_ in self._recent if peak.end_s < slice_.end_s <= dip.end_s]
@@ -162,12 +162,12 @@ class SyllableSegmenter:
             split_s = slice_.end_s - SLICE_S
         if self.start_s is None or split_s - self.start_s < MIN_SEGMENT_S:
             return []
-        segment = Segment(self.start_s, split_s)
+        segment = EnergySegment(self.start_s, split_s)
         self.start_s = split_s
         return [segment]
 
 
-def segment_speech(slices: Iterable[Progress]) -> list[Segment]:
+def segment_speech(slices: Iterable[Progress]) -> list[EnergySegment]:
     """Divide a whole recording into segments."""
     segmenter = SyllableSegmenter()
     segments = [segment for slice_ in slices for segment in segmenter.add_slice(slice_)]

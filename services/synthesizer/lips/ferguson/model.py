@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.endpoints import Segment, SyllableSegmenter
+from kouxing.services.synthesizer.lips.ferguson.endpoints import EnergySegment, SyllableSegmenter
 from kouxing.services.synthesizer.lips.ferguson.key_frames import (
     OPENING_TIME_S,
     PAUSE_S,
@@ -106,7 +106,7 @@ class FergusonStream:
         self._delay_s = delay_s
         self._known = KnownPhones(model.inventory)
         self._segmenter = SyllableSegmenter()
-        self._segments: list[Segment] = []
+        self._segments: list[EnergySegment] = []
         self._known_s = start_s  # the audio is known up to here
         self._has_ended = True  # no speech
         self._has_expected = False  # the key frames end with an expected phone

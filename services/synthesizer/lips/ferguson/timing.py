@@ -18,7 +18,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.ferguson.endpoints import SLICE_S, Segment, segment_speech
+from kouxing.services.synthesizer.lips.ferguson.endpoints import (
+    SLICE_S,
+    EnergySegment,
+    segment_speech,
+)
 from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress
@@ -163,7 +167,7 @@ class OnsetCrossings:
 
 
 def _cheapest_assignment(
-    segments: Sequence[Segment], text: _Text, onset_crossings: OnsetCrossings
+    segments: Sequence[EnergySegment], text: _Text, onset_crossings: OnsetCrossings
 ) -> list[_Group]:
     """Assign every syllable; total_cost[n, s] is for the first n segments and s syllables."""
     num_segments, num_syllables = len(segments), len(text.duration_s)
@@ -208,7 +212,7 @@ def _cheapest_assignment(
     return _trace_back(best)
 
 
-def _speech_ratio(segments: Sequence[Segment], typical_s: float) -> float:
+def _speech_ratio(segments: Sequence[EnergySegment], typical_s: float) -> float:
     return sum(segment.end_s - segment.start_s for segment in segments) / typical_s
 
 
