@@ -42,7 +42,7 @@ def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6, width=64))
 
 
-def piece(samples: np.ndarray, voice: Voice = VoiceKind.SPEECH) -> Piece:
+def piece(samples: np.ndarray, voice: VoiceKind = VoiceKind.SPEECH) -> Piece:
     """Make a piece whose pitch and lips are the number of the position."""
     num_positions = len(samples) // POSITION_SAMPLES
     rows = np.zeros((num_positions, COLUMNS.lips.start + NUM_OUTPUTS), np.float16)
