@@ -41,12 +41,22 @@ class LipModelInfo:
     load: Callable[[PhoneInventory], Any]
 
 
-@lru_cache
 def lip_models() -> dict[str, LipModelInfo]:
     """Return the installed lip models by name.
 
     Raises ``UserError`` if an installed lip model cannot be imported.
     """
+    return {name: lip_model_info(name) for name in _packages()}
+
+
+def lip_model_names() -> list[str]:
+    """Return the names of the installed lip models, without importing them."""
+    return list(_packages())
+
+
+@lru_cache
+def _packages() -> dict[str, str]:
+    """Return the packages of the installed lip models by name, sorted."""
     folder = Path(__file__).parent.joinpath(*_BUILT_IN)
     packages = {
         module.name.replace("_", "-"): ".".join((__package__, *_BUILT_IN, module.name))
@@ -54,21 +64,19 @@ def lip_models() -> dict[str, LipModelInfo]:
         if module.ispkg
     }
     packages |= {entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)}
-    models = {}
-    for name, package in sorted(packages.items()):
-        try:
-            models[name] = importlib.import_module(package).LIP_MODEL
-        except (ImportError, AttributeError) as error:
-            text = f"cannot import the lip model {name} from {package}: {error}"
-            raise UserError(text) from error
-    return models
+    return dict(sorted(packages.items()))
 
 
 def lip_model_info(name: str) -> LipModelInfo:
     """Return the description of an installed lip model.
 
-    Raises ``UserError`` if the lip model is not installed.
+    Raises ``UserError`` if the lip model is not installed or cannot be imported.
     """
-    if name not in lip_models():
-        raise UserError(f"unknown lip model {name!r}; use one of {', '.join(lip_models())}")
-    return lip_models()[name]
+    package = _packages().get(name)
+    if package is None:
+        raise UserError(f"unknown lip model {name!r}; use one of {', '.join(_packages())}")
+    try:
+        info: LipModelInfo = importlib.import_module(package).LIP_MODEL
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"cannot import the lip model {name} from {package}: {error}") from error
+    return info

@@ -15,10 +15,11 @@ import ast
 import difflib
 import inspect
 import os
+import re
 import textwrap
 import tomllib
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from functools import cache
@@ -27,8 +28,17 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from annotated_types import Ge, Le, MultipleOf
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+)
 from pydantic.fields import FieldInfo
+from pydantic_core import core_schema
 
 from kouxing.shared.endpoints import (
     WILDCARDS,
@@ -62,16 +72,39 @@ class ValueHint:
 
 
 @dataclass(frozen=True, slots=True)
+class KnownNames:
+    """Restricts a text to names and texts that match ``pattern``; ``others`` describes these."""
+
+    names: Callable[[], Iterable[str]]
+    pattern: str = "(?!)"
+    others: str = ""
+
+    def __str__(self) -> str:
+        return f"one of {', '.join(self.names())}{self.others}"
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        """Add the check to pydantic's schema of the key."""
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
+
+    def _check(self, text: str) -> str:
+        if text not in self.names() and not re.fullmatch(self.pattern, text):
+            raise ValueError
+        return text
+
+
+@dataclass(frozen=True, slots=True)
 class DependentDefault:
     """Default factory of a key whose default depends on the value of an earlier key."""
 
     key: str
-    defaults: Mapping[str, Any]  # by the value of the earlier key
+    names: Callable[[], Iterable[str]]  # values of the earlier key whose default may differ
+    default_for: Callable[[str], Any]
     otherwise: Any
 
     def __call__(self, values: dict[str, Any]) -> Any:
         """Return the default for the values of earlier keys."""
-        return self.defaults.get(values.get(self.key, ""), self.otherwise)
+        name = values.get(self.key, "")
+        return self.default_for(name) if name in self.names() else self.otherwise
 
 
 def _check_endpoint(value: str) -> str:
@@ -301,9 +334,11 @@ class Settings:
 
     def _not_allowed(self, address: Address, value: _RawValue) -> UserError:
         table, key = address
+        field = self._keys(table)[key]
+        similar = difflib.get_close_matches(value.text, _names(field), n=1, cutoff=0.5)
+        hint = f"; did you mean {similar[0]}?" if similar else ""
         return UserError(
-            f"{table}.{key}: {value.text!r} (from {value.origin}) is not "
-            f"{allowed(self._keys(table)[key])}"
+            f"{table}.{key}: {value.text!r} (from {value.origin}) is not {allowed(field)}{hint}"
         )
 
 
@@ -318,10 +353,10 @@ def allowed(field: FieldInfo) -> str:
     marks: dict[type, Any] = {type(mark): mark for mark in field.metadata}
     if ValueHint in marks:
         return str(marks[ValueHint].text)
-    if typing.get_origin(kind) is Literal:
-        return f"one of {', '.join(typing.get_args(kind))}"
-    if isinstance(kind, type) and issubclass(kind, StrEnum):
-        return f"one of {', '.join(kind)}"
+    if KnownNames in marks:
+        return str(marks[KnownNames])
+    if names := _names(field):
+        return f"one of {', '.join(names)}"
     if kind is bool:
         return "true or false"
     if kind is str:
@@ -330,6 +365,17 @@ def allowed(field: FieldInfo) -> str:
     if MultipleOf in marks:
         number = f"a multiple of {marks[MultipleOf].multiple_of}"
     return f"{number} from {marks[Ge].ge} to {marks[Le].le}"
+
+
+def _names(field: FieldInfo) -> list[str]:
+    """Return the names that a key allows; empty if it is not restricted to names."""
+    kind = field.annotation
+    for mark in field.metadata:
+        if isinstance(mark, KnownNames):
+            return list(mark.names())
+    if typing.get_origin(kind) is Literal:
+        return list(typing.get_args(kind))
+    return list(kind) if isinstance(kind, type) and issubclass(kind, StrEnum) else []
 
 
 def bound_keys(config_type: type[ServiceConfig]) -> dict[str, BindAddress]:
@@ -383,7 +429,7 @@ def _default_origin(config: ServiceConfig, field: FieldInfo) -> str:
     factory = field.default_factory
     if isinstance(factory, DependentDefault):
         chosen = getattr(config, factory.key)
-        if factory.defaults.get(chosen, factory.otherwise) != factory.otherwise:
+        if factory({factory.key: chosen}) != factory.otherwise:
             return f"default with {factory.key} = {chosen}"
     return "default"
 
@@ -393,8 +439,8 @@ def _key_help(config_type: type[ServiceConfig], key: str) -> str:
     factory = config_type.model_fields[key].default_factory
     if isinstance(factory, DependentDefault):
         names: dict[float, list[str]] = {}
-        for name, value in factory.defaults.items():
-            if value != factory.otherwise:
+        for name in factory.names():
+            if (value := factory.default_for(name)) != factory.otherwise:
                 names.setdefault(value, []).append(name)
         others = [f"{v:g} with {factory.key} = {' or '.join(n)}" for v, n in names.items()]
         meaning += f" Other defaults: {', '.join(others)}."

@@ -120,7 +120,7 @@ def non_audio_kind(begin: bytes) -> str:
         if begin.startswith(mark):
             return kind
     text = _text_of(begin)
-    return f"text, not sound: {text[:60]!r}" if text else ""
+    return f"text, not sound: {text.splitlines()[0][:60]!r}" if text else ""
 
 
 def why_unreadable(begin: bytes, reason: str) -> str:

@@ -1,6 +1,7 @@
 """Fixtures for all tests."""
 
-from collections.abc import Iterator
+import os
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,15 @@ settings.load_profile("kouxing")
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Mark a test with the name of its folder: unit, property, e2e, …."""
     item.add_marker(item.path.parent.name)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Fail skipped tests in continuous integration, where everything that tests need exists."""
+    report = yield
+    if report.skipped and os.environ.get("FAIL_SKIPPED_TESTS"):
+        report.outcome = "failed"
+    return report
 
 
 @pytest.fixture(scope="session", autouse=True)

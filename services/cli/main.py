@@ -27,6 +27,7 @@ from kouxing.shared.terminal import CONSOLE
 SERVICES = "A single service (run starts all of them)"
 ENTRY_POINTS = "kouxing.commands"  # such as training and evaluation
 _VALUE_NAMES = {"bool": "", "str": "TEXT", "path": "PATH", "int": "NUMBER", "float": "NUMBER"}
+_UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 _PYTHON_TYPE = re.compile(r"<(?:list\[)?(\w+)(?: range)?\]?>")
 
 
@@ -155,17 +156,28 @@ def _run_command() -> None:
     try:
         if "" in sys.argv[1:]:
             raise UserError("an argument is empty; check the variables in your command")
-        typer.main.get_command(app)(prog_name="kouxing")  # app() would replace sys.excepthook
+        # app() would replace sys.excepthook
+        status = typer.main.get_command(app)(prog_name="kouxing", standalone_mode=False)
     except UserError as error:
         if is_interrupted():
             raise
         text = str(error)
+    except _UsageError as error:
+        text = _usage_text(error)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         text = f"cannot write {error.filename or 'the output'}: {error.strerror}"
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes the rest at exit
     else:
-        return
-    CONSOLE.print(f"kouxing: {text}", style="red", markup=False, soft_wrap=True)
+        sys.exit(status)
+    if text:
+        CONSOLE.print(f"kouxing: {text}", style="red", markup=False, soft_wrap=True)
     sys.exit(2)
+
+
+def _usage_text(error: Any) -> str:
+    """Return what is wrong with a command line; empty if the help was printed instead."""
+    problem = error.format_message().removesuffix(".")
+    command = error.ctx.command_path if error.ctx else "kouxing COMMAND"
+    return problem and f"{problem[0].lower()}{problem[1:]}; see {command} -h"

@@ -6,13 +6,19 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from kouxing.shared.config import Switch, ValueHint
+from kouxing.shared.config import KnownNames, Switch, ValueHint
 from kouxing.shared.face.config import FaceConfig
 from kouxing.shared.names import NAME
 
 HEAD_NAMES = tuple(
     sorted(path.stem for path in (Path(__file__).parent / "head" / "assets").glob("*.npz"))
 )
+
+
+COLORS = {
+    "black": "#000000", "white": "#ffffff", "grey": "#808080", "green": "#00b140",
+    "blue": "#0047bb",
+}  # fmt: skip
 
 
 class Framing(StrEnum):
@@ -39,10 +45,15 @@ class DriverConfig(FaceConfig):
     max_videos: Annotated[int, Field(ge=1, le=1000)] = 8
     """Maximum number of videos that are written at the same time. One key can use at most three
     quarters."""
-    head: str = "woman"
-    """Name of a built-in head, or an avatar (.glb, .gltf, .vrm, or an imported .npz)."""
-    background: str = "studio"
-    """Background: studio, #rrggbb, or a color name."""
+    head: Annotated[
+        str,
+        KnownNames(lambda: HEAD_NAMES, r".*\.\w+", ", or a file (.glb, .gltf, .vrm or .npz)"),
+    ] = "woman"
+    """Built-in head, or an avatar."""
+    background: Annotated[
+        str, KnownNames(lambda: ("studio", *COLORS), "#?[0-9a-fA-F]{6}", ", or #rrggbb")
+    ] = "studio"
+    """Background of windows and videos."""
     camera: Framing = Framing.FACE
     """The part of the head that fills the picture."""
     virtual_camera: Switch = False

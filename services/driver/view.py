@@ -29,10 +29,6 @@ class View:
     """
 
     def __init__(self, config: DriverConfig, on_switch: Callable[[int], None]) -> None:
-        if background(config.background) is None:
-            raise UserError(
-                "driver.background: windows and MP4 files cannot be transparent; use a color"
-            )
         self._window = _open_window(config, on_switch)
         self._is_window_open = self._window is not None
         self._virtual_camera: VirtualCamera | None = None

@@ -5,9 +5,10 @@ from typing import Annotated
 from pydantic import Field
 
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
-from kouxing.shared.config import BoundEndpoint, DependentDefault, ServiceConfig
+from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames, ServiceConfig
 
 _DEFAULT_RULE = OutputRuleConfig()
+MODEL_NAMES = ("blocks", "light", "gmm", "universal")
 
 
 class RecognizerConfig(ServiceConfig):
@@ -20,13 +21,16 @@ class RecognizerConfig(ServiceConfig):
     unpaced_audio: BoundEndpoint = "tcp://127.0.0.1:5562"
     """Endpoint to which clients send the audio of sessions that are not paced. Live audio takes
     precedence."""
-    acoustic: str = "blocks"
-    """Acoustic model: blocks (fewest errors), light (for weak machines), gmm, universal (phones of
-    all languages), or a file."""
+    acoustic: Annotated[
+        str, KnownNames(lambda: MODEL_NAMES, r".*\.\w+", ", or a file such as model.npz")
+    ] = "blocks"
+    """Acoustic model: blocks has the fewest errors, light suits weak machines, and universal knows
+    the phones of all languages."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
         default_factory=DependentDefault(
             "acoustic",
-            {name: rule.num_stable_frames for name, rule in MODEL_RULES.items()},
+            MODEL_RULES.keys,
+            lambda name: MODEL_RULES[name].num_stable_frames,
             _DEFAULT_RULE.num_stable_frames,
         )
     )
@@ -34,7 +38,8 @@ class RecognizerConfig(ServiceConfig):
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         default_factory=DependentDefault(
             "acoustic",
-            {name: rule.min_confidence for name, rule in MODEL_RULES.items()},
+            MODEL_RULES.keys,
+            lambda name: MODEL_RULES[name].min_confidence,
             _DEFAULT_RULE.min_confidence,
         )
     )

@@ -2,23 +2,22 @@
 
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
-from kouxing.services.lip_models import lip_model_info, lip_models
-from kouxing.shared.config import BoundEndpoint, DependentDefault, ValueHint
+from kouxing.services.lip_models import lip_model_info, lip_model_names
+from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 
-_DELAYS_MS = {name: info.delay_ms for name, info in lip_models().items()}
+_DEFAULT_DELAY_MS = lip_model_info(DEFAULT_LIP_MODEL).delay_ms
 
 
-def _check_lip_model(name: str) -> str:
+def _delay_ms(lip_model: str) -> float:
     try:
-        lip_model_info(name)
-    except UserError as error:
-        raise ValueError(str(error)) from None
-    return name
+        return lip_model_info(lip_model).delay_ms
+    except UserError:  # a broken package; the synthesizer reports it when it loads the lip model
+        return _DEFAULT_DELAY_MS
 
 
 class SynthesizerConfig(FaceConfig):
@@ -30,12 +29,15 @@ class SynthesizerConfig(FaceConfig):
     """Endpoint that publishes FAP frames."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 50.0
     """FAP frames per second."""
-    lips: Annotated[str, AfterValidator(_check_lip_model), ValueHint(" or ".join(lip_models()))] = (
-        DEFAULT_LIP_MODEL
-    )
+    lips: Annotated[str, KnownNames(lip_model_names)] = DEFAULT_LIP_MODEL
     """Default lip model. A client can choose another one for its session."""
     delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(
-        default_factory=DependentDefault("lips", _DELAYS_MS, _DELAYS_MS[DEFAULT_LIP_MODEL])
+        default_factory=DependentDefault(
+            "lips",
+            lip_model_names,
+            _delay_ms,
+            _DEFAULT_DELAY_MS,
+        )
     )
     """Time from a frame's audio until the frame is made, in steps of 20 ms."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4

@@ -19,7 +19,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from kouxing.services.lip_models import lip_models
+from kouxing.services.lip_models import lip_model_names
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
@@ -169,7 +169,7 @@ class SynthesizerService(Service):
 
     def _known_settings(self, session: str, settings: FaceSettings) -> FaceSettings:
         """Return the settings without unknown names; report unknown names."""
-        unknown = {settings.lip_model} - {None, *lip_models()}
+        unknown = {settings.lip_model} - {None, *lip_model_names()}
         unknown |= (settings.expressions or {}).keys() - EXPRESSIONS
         unknown |= {*(settings.shapes or ())} - SHAPE_SETS.keys()
         if not unknown:

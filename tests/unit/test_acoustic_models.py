@@ -10,8 +10,9 @@ from scipy.stats import norm
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel, mixture_scores
-from kouxing.services.recognizer.acoustic.load import SHIPPED, load_model, model_path
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
+from kouxing.services.recognizer.config import MODEL_NAMES
 from kouxing.services.recognizer.front_end.features import NUM_FEATURES, NUM_STATIC
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
@@ -21,7 +22,7 @@ from tests.system import DEMO
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 
 
-@pytest.fixture(scope="module", params=SHIPPED)
+@pytest.fixture(scope="module", params=MODEL_NAMES)
 def model(request: pytest.FixtureRequest) -> AcousticModel:
     return load_model(request.param)
 

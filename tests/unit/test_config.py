@@ -7,9 +7,10 @@ import pytest
 
 from kouxing.services.cli.configuration import TABLES, config, markdown_page
 from kouxing.services.control.config import ControlConfig
-from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.config import HEAD_NAMES, DriverConfig
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.kinds import KINDS, read_settings
+from kouxing.services.lip_models import lip_model_names
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.config import ServiceConfig, Settings
@@ -89,6 +90,32 @@ def test_a_default_may_depend_on_another_key() -> None:
         (RecognizerConfig, "insecure", "yes", "true or false"),
         (SynthesizerConfig, "frame_rate_hz", "nan", "a number from 10 to 240"),
         (DriverConfig, "view", "hologram", "one of auto, window, none"),
+        (
+            RecognizerConfig,
+            "acoustic",
+            "bloks",
+            "one of blocks, light, gmm, universal, or a file such as model.npz; did you mean"
+            " blocks?",
+        ),
+        (
+            DriverConfig,
+            "head",
+            "womam",
+            f"one of {', '.join(HEAD_NAMES)}, or a file (.glb, .gltf, .vrm or .npz); did you mean"
+            " woman?",
+        ),
+        (
+            DriverConfig,
+            "background",
+            "blurple",
+            "one of studio, black, white, grey, green, blue, or #rrggbb; did you mean blue?",
+        ),
+        (
+            SynthesizerConfig,
+            "lips",
+            "fergusen",
+            f"one of {', '.join(lip_model_names())}; did you mean ferguson?",
+        ),
         (DriverConfig, "width_px", "641", "a multiple of 2 from 16 to 7680"),
         *(
             (

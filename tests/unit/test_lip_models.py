@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.lip_models import lip_models
+from kouxing.services.cli.configuration import markdown_page
+from kouxing.services.lip_models import _packages, lip_models
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
@@ -24,10 +25,19 @@ LIP_MODEL = LipModelInfo(
 
 @pytest.fixture(autouse=True)
 def _fresh_registry() -> Iterator[None]:
-    lip_models.cache_clear()
+    _packages.cache_clear()
     yield
-    lip_models.cache_clear()
+    _packages.cache_clear()
     load_lip_model.cache_clear()
+
+
+def install(folder: Path, code: str) -> None:
+    """Write a distribution with the lip model ``toy`` to a folder."""
+    (folder / "toy_lips.py").write_text(code)
+    metadata = folder / "toy_lips-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-lips\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[kouxing.lip_models]\ntoy = toy_lips\n")
 
 
 def test_built_in_lip_models() -> None:
@@ -42,11 +52,7 @@ def test_built_in_lip_models() -> None:
 def test_a_package_adds_a_lip_model_by_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "toy_lips.py").write_text(PACKAGE)
-    metadata = tmp_path / "toy_lips-1.0.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-lips\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text("[kouxing.lip_models]\ntoy = toy_lips\n")
+    install(tmp_path, PACKAGE)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert lip_models()["toy"].delay_ms == 40.0
     toy: object = load_lip_model(name="toy")
@@ -56,3 +62,14 @@ def test_a_package_adds_a_lip_model_by_entry_point(
 def test_an_unknown_lip_model_is_an_error() -> None:
     with pytest.raises(UserError, match="unknown lip model 'muscles'; use one of dynamic-visemes"):
         load_lip_model(name="muscles")
+
+
+def test_a_broken_package_spoils_no_other_lip_model_nor_the_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, "raise ImportError('no muscles')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert SynthesizerConfig(lips="ferguson").delay_ms == 160.0
+    assert "| `lips` |" in markdown_page()
+    with pytest.raises(UserError, match=r"cannot import the lip model toy .* no muscles"):
+        load_lip_model(name="toy")

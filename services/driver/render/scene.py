@@ -6,16 +6,11 @@ from pathlib import Path
 import moderngl
 import numpy as np
 
-from kouxing.services.driver.config import DriverConfig, Framing
+from kouxing.services.driver.config import COLORS, DriverConfig, Framing
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import DEFAULT_HEAD, Detail, Head
 from kouxing.services.driver.render.renderer import BACKGROUND, Background, Camera, Renderer
 from kouxing.shared.errors import UserError
-
-COLORS = {
-    "black": "#000000", "white": "#ffffff", "grey": "#808080", "green": "#00b140",
-    "blue": "#0047bb",
-}  # fmt: skip
 
 # height of the picture's center above the eyes, and distance of the camera, in FAPU ES
 _FRAMINGS = {

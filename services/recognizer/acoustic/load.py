@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.acoustic import blocks, gmm, light, universal
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive
+from kouxing.services.recognizer.config import MODEL_NAMES
 from kouxing.shared.errors import UserError
 
 MODELS = Path(__file__).parents[1] / "models"
-SHIPPED = ("blocks", "light", "gmm", "universal")
 DEFAULT_MODEL = "blocks"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     gmm.FORMAT: gmm.gmm_model_from,
@@ -26,7 +26,7 @@ _loaded: WeakValueDictionary[str, AcousticModel] = WeakValueDictionary()  # ship
 def model_path(name: str) -> Path:
     """Return the file of a shipped model, by its name; any other name is a path."""
     file = "blocks" if name == "light" else name
-    return MODELS / f"{file}.npz" if name in SHIPPED else Path(name)
+    return MODELS / f"{file}.npz" if name in MODEL_NAMES else Path(name)
 
 
 def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
@@ -41,17 +41,14 @@ def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
     archive = read_archive(path)
     try:
         form = str(archive.array("format", ()))
+        if form not in _READERS:
+            raise ValueError(f"its format is {form!r}, not {' or '.join(_READERS)}")
         model = light.light_model_from(archive) if name == "light" else _READERS[form](archive)
-    except KeyError:
-        raise UserError(
-            f"acoustic model {path} has the format {form!r}, but this version reads "
-            f"{' and '.join(_READERS)}; train the model again"
-        ) from None
     except ValueError as error:
         raise UserError(f"acoustic model {path}: {error}; train the model again") from error
     except UserError as error:
         raise UserError(f"acoustic model {path}: {error}") from error
-    if name in SHIPPED:
+    if name in MODEL_NAMES:
         _loaded[str(name)] = model
     return model
 
