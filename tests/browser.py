@@ -52,12 +52,12 @@ class Browser(Chromium):
             "   recordDrawn.apply(this, times); this.ratio = 0.5; }; })"
         )
         for key in ("ArrowLeft", "Home"):  # each turns the head, which draws an image
-            num_before = self.evaluate("window.kouxing.state.drawing.numPictures")
+            num_before = self.evaluate("window.kouxing.state.drawing.numImages")
             self.evaluate(
                 "document.getElementById('head')"
                 f".dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))"
             )
-            self.wait_for(f"window.kouxing.state.drawing.numPictures > {num_before}")
+            self.wait_for(f"window.kouxing.state.drawing.numImages > {num_before}")
 
     def steady_image(self) -> NDArray[np.uint8]:
         """Return the canvas once every fade and redrawing is over."""

@@ -81,7 +81,7 @@ def _measure(browser: Chromium, url: str) -> dict[str, Drawing]:
     browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
     idle = _drawing(browser)
     browser.click("microphone")
-    browser.wait_for("window.kouxing.state.voiceToPictureMs !== null")
+    browser.wait_for("window.kouxing.state.voiceToImageMs !== null")
     return {"idle": idle, "microphone": _drawing(browser)}
 
 
@@ -94,7 +94,7 @@ def _drawing(browser: Chromium) -> Drawing:
         states.append(browser.evaluate("window.kouxing.state"))
     duration_s, cpu_s = time.monotonic() - start_s, browser.cpu_s() - start_cpu_s
     drawings = [state["drawing"] for state in states]
-    num_pictures = drawings[-1]["numPictures"] - drawings[0]["numPictures"]
+    num_pictures = drawings[-1]["numImages"] - drawings[0]["numImages"]
 
     def median(key: str) -> float | None:
         values = [state[key] for state in states if state[key] is not None]
@@ -103,9 +103,9 @@ def _drawing(browser: Chromium) -> Drawing:
     return Drawing(
         pictures_per_s=num_pictures / duration_s,
         size_px=(drawings[-1]["width"], drawings[-1]["height"]),
-        picture_ms=float(np.median([drawing["pictureMs"] for drawing in drawings])),
+        picture_ms=float(np.median([drawing["imageMs"] for drawing in drawings])),
         picture_cpu_ms=1e3 * cpu_s / max(1, num_pictures),
         voice_to_frame_ms=median("voiceToFrameMs"),
-        voice_to_picture_ms=median("voiceToPictureMs"),
+        voice_to_picture_ms=median("voiceToImageMs"),
         load=os.getloadavg()[0],
     )

@@ -170,7 +170,7 @@ def _run_command() -> None:
         text = f"cannot write {error.filename or 'the output'}: {error.strerror}"
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes the rest at exit
     else:
-        sys.exit(status)
+        sys.exit(status or 0)
     if text:
         CONSOLE.print(f"kouxing: {text}", style="red", markup=False, soft_wrap=True)
     sys.exit(2)

@@ -76,10 +76,9 @@ class Placement:
         if not load.has_room(min_room, now_s, self._max_load):
             needed = 100 * min_room * load.cost
             left = 100 * max(0.0, self._max_load - load.expected(now_s))
-            subject = "this session needs" if min_room == 1 else "this and another session need"
             text = (
-                f"every {kind or f'provider of {endpoint}'} is busy: {subject} {needed:.0f} % of "
-                f"its time, and {left:.0f} % is left; try again in {RETRY_AFTER_S:g} s"
+                f"every {kind or f'provider of {endpoint}'} is busy: {needed:.0f} % of its time "
+                f"must be free, and {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
             )
             raise Refusal(ErrorCode.BUSY, text, RETRY_AFTER_S)
         return best

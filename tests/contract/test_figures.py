@@ -55,13 +55,6 @@ CHINESE = "普通话 {zh}%，德语 {de}%，英语 {en}%，意大利语 {it}%，
     [
         ("README.md", ENGLISH, " to "),
         ("README.zh.md", CHINESE, "% 至 "),
-        ("services/gateway/page/texts.js", ENGLISH, " to "),
-        ("services/gateway/page/texts.js", CHINESE, "% 至 "),
-        (
-            "services/cli/options.py",
-            "zh {zh} %, de {de} %, en {en} %, it {it} %, ko {ko} %",
-            " to ",
-        ),
     ],
 )
 def test_the_errors_by_language_are_those_of_the_report(file: str, text: str, to: str) -> None:

@@ -20,6 +20,11 @@ SOURCES = (
     *("services/senders/vtube_studio.py", "clients/python/kouxing_client/base.py"),
     *("clients/python/kouxing_client/core.py", "clients/python/kouxing_client/session_core.py"),
 )
+ERROR_SOURCES = (  # the page also translates frequent errors of these
+    *("services/control/lifecycle.py", "services/control/placement.py"),
+    *("services/control/registry.py", "services/control/requests.py"),
+    *("services/control/sessions.py", "services/recognizer/service.py"),
+)
 # Texts of the command line, of other clients than the page, and of a broken page.
 OTHERS = re.compile(
     r"--rate|^this is \{\}$|--raw$|--raw if|a terminal|sound arrived|images and audio"
@@ -50,13 +55,14 @@ def sent_texts(source: str) -> Iterator[str]:
 
 
 def test_the_page_translates_all_texts_of_the_gateway() -> None:
-    keys = re.findall(r'^  "(.+?)":(?: "|$)', PAGE_TEXTS.read_text("utf-8"), re.MULTILINE)
+    texts, _ = PAGE_TEXTS.read_text("utf-8").split("const REASONS")
+    keys = re.findall(r'^  "(.+?)":(?: "|$)', texts, re.MULTILINE)
     translated = {re.sub(r"\{\w+\}", "{}", key) for key in keys}
     sent = {text for source in SOURCES for text in sent_texts(source) if " " in text}
     assert not {text for text in sent - translated if not OTHERS.search(text)}
     everything = "\n".join(
         template(node)
-        for source in SOURCES
+        for source in (*SOURCES, *ERROR_SOURCES)
         for node in ast.walk(ast.parse((ROOT / source).read_text("utf-8")))
         if isinstance(node, ast.Constant | ast.JoinedStr)
     )
@@ -67,5 +73,5 @@ def test_the_page_translates_all_texts_of_the_gateway() -> None:
 
 
 def test_the_page_has_a_text_for_each_error_of_control() -> None:
-    texts = (PAGE / "texts.js").read_text("utf-8")
-    assert {*re.findall(r'^  "error\.(.+?)": \{', texts, re.MULTILINE)} == {*ErrorCode}
+    _, reasons = PAGE_TEXTS.read_text("utf-8").split("const REASONS")
+    assert {*re.findall(r'^  "?([\w-]+)"?: "', reasons, re.MULTILINE)} == {*ErrorCode}

@@ -281,7 +281,7 @@ def test_sound_keeps_to_its_picture_while_the_page_is_hidden(
     control: PageControl, audible: Browser
 ) -> None:
     page = audible
-    page.wait_for(f"{STATE}.soundMinusPictureMs !== null")
+    page.wait_for(f"{STATE}.soundMinusImageMs !== null")
     before_ms = page.evaluate(f"{STATE}.playoutDelayMs")  # a busy page waits for longer
     page.evaluate(
         "window.ticks = []; window.tick = requestAnimationFrame;"
@@ -289,7 +289,7 @@ def test_sound_keeps_to_its_picture_while_the_page_is_hidden(
     )
     control.look_ahead_ms = round(before_ms) + 100
     page.wait_for(f"{STATE}.playoutDelayMs > {before_ms + 100}")  # nothing was drawn
-    page.wait_for(f"Math.abs({STATE}.soundMinusPictureMs) < 15")
+    page.wait_for(f"Math.abs({STATE}.soundMinusImageMs) < 15")
     control.look_ahead_ms = LOOK_AHEAD_MS
     page.evaluate("window.requestAnimationFrame = window.tick; window.ticks.forEach(tick)")
 

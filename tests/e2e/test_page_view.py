@@ -122,7 +122,7 @@ def test_the_bare_view_shows_only_the_face_on_a_transparent_background(
     browser.wait_for(READY)
     clear = {"r": 0, "g": 0, "b": 0, "a": 0}
     browser.command("Emulation.setDefaultBackgroundColorOverride", color=clear)
-    browser.wait_for("window.kouxing.state.drawing.numPictures > 0")
+    browser.wait_for("window.kouxing.state.drawing.numImages > 0")
     data = browser.command("Page.captureScreenshot", format="png")["data"]
     with Image.open(io.BytesIO(base64.b64decode(data))) as image:
         alpha = np.asarray(image.convert("RGBA"))[..., 3]

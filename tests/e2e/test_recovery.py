@@ -75,7 +75,7 @@ def test_a_wrong_configuration_ends_the_wait(tmp_path: Path) -> None:
 STATUS = "document.getElementById('status').textContent"
 WEBRTC_PAGE = ROOT / "docs" / "clients" / "webrtc.md"
 # On a busy machine, the face may be behind.
-IS_LIVE = f"/live|behind/.test({STATUS}) && window.kouxing.state.voiceToPictureMs !== null"
+IS_LIVE = f"/live|behind/.test({STATUS}) && window.kouxing.state.voiceToImageMs !== null"
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +103,13 @@ def live(browser: Browser) -> Browser:
 
 
 def test_shows_the_measured_delay(browser: Browser) -> None:
-    assert browser.evaluate("window.kouxing.state.voiceToPictureMs") is None
+    assert browser.evaluate("window.kouxing.state.voiceToImageMs") is None
     assert "ms" not in browser.evaluate(STATUS)
     browser.click("microphone")
     browser.wait_for(IS_LIVE)
     browser.wait_for(rf"/(live \d+ m|behind.* \d+\.\d )s/.test({STATUS})")
     # A frame is made 60 ms after its sound; the first number of the label is the delay.
-    assert browser.evaluate("window.kouxing.state.voiceToPictureMs") > 60
+    assert browser.evaluate("window.kouxing.state.voiceToImageMs") > 60
     assert browser.evaluate(rf"Number(({STATUS}.match(/live (\d+) ms/) ?? [0, 61])[1])") > 60
 
 

@@ -3,14 +3,13 @@ import test from "node:test";
 import { LevelMeter, SILENT_DB } from "../../services/gateway/page/level.js";
 import { PhoneTrack } from "../../services/gateway/page/caption.js";
 import { StreamActivity } from "../../services/gateway/page/stream-activity.js";
-import { toChinese } from "../../services/gateway/page/gateway-texts.js";
+import { errorToChinese, toChinese } from "../../services/gateway/page/gateway-texts.js";
 import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
 import {
   GatewayState,
   LastingFault,
   delayText,
   drawingText,
-  errorText,
   hintText,
   playoutDelaysText,
   secondsText,
@@ -114,8 +113,6 @@ test("hints say what does not work and what to do", () => {
     hintText({ ...well, missing: ["recognizer", "synthesizer"] }),
     /recognizer, synthesizer.*kouxing recognizer; kouxing synthesizer/,
   );
-  assert.equal(errorText({ code: "refused", text: "no" }), "no");
-  assert.match(errorText({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
 });
 
 test("a fault is shown after a second, and its end only if it was shown", () => {
@@ -136,6 +133,22 @@ test("texts of the gateway are translated with their values", () => {
     "a b.mp3：无法读取声音：这是文本，不是声音：'x'",
   );
   assert.equal(toChinese("a.wav: the file is empty\n1: unknown: why"), "a.wav：文件是空的\n1：unknown：why");
+  assert.equal(errorToChinese("busy", "the disk is full"), "系统繁忙，请稍后再试：the disk is full");
+  assert.equal(errorToChinese("new-code", "no"), "no");
+  assert.equal(
+    errorToChinese(
+      "no-service",
+      "no recognizer is running; start one with 'kouxing recognizer' (or everything with 'kouxing run')",
+    ),
+    "没有运行 recognizer，请运行 kouxing recognizer（或用 kouxing run 启动全部服务）",
+  );
+  assert.equal(
+    errorToChinese(
+      "busy",
+      "every recognizer is busy: 38 % of its time must be free, and 5 % is; try again in 2 s",
+    ),
+    "所有 recognizer 都忙：需要 38% 的空闲时间，只剩 5%；请 2 秒后重试",
+  );
   assert.equal(toChinese("ARKit shapes of the mouth"), "嘴部的ARKit 形状");
 });
 

@@ -31,13 +31,13 @@ def _fresh_registry() -> Iterator[None]:
     load_lip_model.cache_clear()
 
 
-def install(folder: Path, code: str) -> None:
+def install(folder: Path, package: str, code: str) -> None:
     """Write a distribution with the lip model ``toy`` to a folder."""
-    (folder / "toy_lips.py").write_text(code)
+    (folder / f"{package}.py").write_text(code)
     metadata = folder / "toy_lips-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-lips\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text("[kouxing.lip_models]\ntoy = toy_lips\n")
+    (metadata / "entry_points.txt").write_text(f"[kouxing.lip_models]\ntoy = {package}\n")
 
 
 def test_built_in_lip_models() -> None:
@@ -52,7 +52,7 @@ def test_built_in_lip_models() -> None:
 def test_a_package_adds_a_lip_model_by_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    install(tmp_path, PACKAGE)
+    install(tmp_path, "toy_lips", PACKAGE)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert lip_models()["toy"].delay_ms == 40.0
     toy: object = load_lip_model(name="toy")
@@ -67,7 +67,7 @@ def test_an_unknown_lip_model_is_an_error() -> None:
 def test_a_broken_package_spoils_no_other_lip_model_nor_the_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    install(tmp_path, "raise ImportError('no muscles')")
+    install(tmp_path, "broken_lips", "raise ImportError('no muscles')")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert SynthesizerConfig(lips="ferguson").delay_ms == 160.0
     assert "| `lips` |" in markdown_page()

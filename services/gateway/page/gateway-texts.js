@@ -55,6 +55,21 @@ const CHINESE = {
   "the session is closed": "会话已关闭",
   "another program opened this session; only that program can send audio": "另一个程序在使用此会话",
 
+  "session {name} is open; choose another name": "会话 {name} 已存在，请换一个名称",
+  "session {name} does not exist; open it first": "会话 {name} 不存在",
+  "the limit of control.max_sessions is reached: {count}": "会话数已达上限 control.max_sessions：{count}",
+  "your key has {count} open sessions, the maximum; close one first": "此密钥已有 {count} 个会话，达到上限，请先关闭一个",
+  "too many services are registered; stop some": "服务太多，请先停止一些",
+  "the key has no role {roles}; see 'kouxing keys list'": "网关的密钥没有权限（{roles}），见 kouxing keys list",
+  "no {kind} has the language {language}; choose another one": "没有 {kind} 能识别语言 {language}，请在“设置”中选择其他语言",
+  "{missing}; {start} (or everything with 'kouxing run')": "{missing}，{start}（或用 kouxing run 启动全部服务）",
+  "no {kind} is running": "没有运行 {kind}",
+  "start one with 'kouxing {kind}'": "请运行 kouxing {kind}",
+  "every {kind} is busy: {needed} % of its time must be free, and {left} % is; try again in {wait} s":
+    "所有 {kind} 都忙：需要 {needed}% 的空闲时间，只剩 {left}%；请 {wait} 秒后重试",
+  "{workers} did not start the session in time": "{workers} 没有及时启动会话，请重试",
+  "the synthesizer is too slow, so the face misses part of the speech": "合成器太慢，丢失了部分语音",
+
   // Learn my mouth
   "the gateway is stopping": "网关正在停止",
   "another mouth profile is being created; try again in a minute": "正在学习另一个口型，请一分钟后重试",
@@ -101,6 +116,27 @@ const CHINESE = {
   "the delay {delay} is not a number of milliseconds between 0 and {most}": "延迟 {delay} 不是 0 到 {most} 毫秒的数",
 };
 
+// Reasons of control's errors, for texts that are not translated above
+const REASONS = {
+  "bad-audio": "音频有误",
+  "bad-face": "此设置无效",
+  "bad-language": "没有识别器能识别此语言",
+  "bad-message": "系统不接受此请求",
+  "bad-mouth-profile": "口型不适用",
+  "bad-token": "会话的令牌无效",
+  busy: "系统繁忙，请稍后再试",
+  finished: "会话已结束",
+  "no-link": "服务之间无法连接，请运行 kouxing doctor",
+  "no-service": "缺少服务，请运行 kouxing run",
+  "no-video": "无法录制视频，请查看驱动服务的日志",
+  "not-allowed": "网关的密钥没有权限，见 kouxing keys list",
+  "session-exists": "同名会话已存在",
+  timeout: "服务没有及时应答，请重试",
+  "too-many-services": "服务太多，请先停止一些",
+  "too-many-sessions": "会话太多，请先关闭一些",
+  "unknown-session": "会话已不存在",
+};
+
 const PATTERNS = Object.entries(CHINESE).map(([english, chinese]) => {
   const literals = english.split(/\{\w+\}/).map((part) => part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&"));
   const names = [...english.matchAll(/\{(\w+)\}/g)].map(([, name]) => name);
@@ -116,4 +152,10 @@ export function toChinese(text) {
   }
   const [, subject, rest] = /^(.+?): (.+)$/.exec(text) ?? [];
   return subject === undefined ? text : `${subject}：${toChinese(rest)}`;
+}
+
+/** Translate an error of control. If its text has no translation, its code states the reason. */
+export function errorToChinese(code, text) {
+  const chinese = toChinese(text);
+  return chinese === text && code in REASONS ? `${REASONS[code]}：${text}` : chinese;
 }

@@ -164,10 +164,10 @@ export class Head {
   }
 
   /**
-   * How it is drawn: { isCoarse, width, height, numPictures, pictureMs, isCurrent }.
+   * How it is drawn: { isCoarse, width, height, numImages, imageMs, isCurrent }.
    *
-   * isCoarse is true if the processor draws. The size is in pixels. numPictures counts images since
-   * the start, and pictureMs is the duration of drawing. isCurrent is true if the newest face is drawn.
+   * isCoarse is true if the processor draws. The size is in pixels. numImages counts images since
+   * the start, and imageMs is the duration of drawing. isCurrent is true if the newest face is drawn.
    */
   get drawing() {
     const { width, height } = this.#renderer.domElement;
@@ -175,8 +175,8 @@ export class Head {
       isCoarse: this.#isSoftware,
       width,
       height,
-      numPictures: this.#images.numDrawn,
-      pictureMs: this.#drawRate.imageMs,
+      numImages: this.#images.numDrawn,
+      imageMs: this.#drawRate.imageMs,
       isCurrent: !this.#needsDrawing && !this.#images.isDrawing,
     };
   }

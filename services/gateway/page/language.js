@@ -1,6 +1,6 @@
 // The page's language, English or Chinese: the chosen one, else the browser's.
 
-import { toChinese } from "./gateway-texts.js";
+import { errorToChinese, toChinese } from "./gateway-texts.js";
 import { TEXTS } from "./texts.js";
 
 const ATTRIBUTES = { title: "title", label: "aria-label" }; // by their data- attributes
@@ -25,6 +25,12 @@ export function say(key, values = {}) {
 /** Return a text of the gateway in the page's language. */
 export function sayReceived(text) {
   return language === "zh" ? toChinese(text) : text;
+}
+
+/** Return the text of an error message in the page's language. */
+export function sayError({ code, text }) {
+  if (code === "bad-mouth-profile") return say("oldMouthProfile");
+  return language === "zh" ? errorToChinese(code, text) : text;
 }
 
 /** Set the page's language and translate all elements that name a text (data-text etc.). */

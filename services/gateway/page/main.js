@@ -3,7 +3,7 @@
 import { socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
-import { say } from "./language.js";
+import { say, sayError } from "./language.js";
 import { MouthLesson } from "./learn-mouth.js";
 import { LevelMeter } from "./level.js";
 import { Player } from "./player.js";
@@ -12,7 +12,7 @@ import { MOTIONS, Settings } from "./settings.js";
 import { Sound } from "./sound.js";
 import { SpeechControls } from "./speech-controls.js";
 import { Stage } from "./stage.js";
-import { GatewayState, Notice, StatusBar, errorText, showLevel } from "./status.js";
+import { GatewayState, Notice, StatusBar, showLevel } from "./status.js";
 import { MouthProfileStore, Preferences } from "./storage.js";
 import { ViewerSocket } from "./viewer-socket.js";
 
@@ -128,7 +128,7 @@ function showNews(text) {
 }
 
 function showError(error) {
-  notice.showNews(errorText(error), "error");
+  notice.showNews(sayError(error), "error");
 }
 
 /** Whether the session that is shown is the microphone's, or the sample that this page asked for. */
@@ -169,7 +169,7 @@ function draw(nowMs) {
   // During a lesson the machine is needed to find the user's face.
   stage.draw(nowMs, hasChanged && lesson.step === "closed", (seenMs) => {
     player.imageVisible(nowMs, seenMs, frameTime);
-    window.kouxing.onPicture?.({ seenMs, ...shown });
+    window.kouxing.onImage?.({ seenMs, ...shown });
   });
   if (mediaTime !== null) {
     // The user's own voice is shown when it is recorded, not again when it is played.
@@ -186,7 +186,7 @@ function draw(nowMs) {
 
 /** State for programs that embed or test the page; see proto/GATEWAY.md. */
 window.kouxing = {
-  onPicture: null, // called for each image that becomes visible
+  onImage: null, // called for each image that becomes visible
   set readingS(seconds) {
     lesson.readingS = seconds;
   },
@@ -202,10 +202,10 @@ window.kouxing = {
       playoutDelayMs: player.playout.delayMs,
       frameWaitMs: player.playout.frameWaitMs,
       voiceToFrameMs: player.voiceToFrameMs,
-      voiceToPictureMs: player.voiceToImageMs,
+      voiceToImageMs: player.voiceToImageMs,
       sound: sound.state,
       soundSamplesPlayed: sound.numPlayed,
-      soundMinusPictureMs: player.soundMinusImageMs,
+      soundMinusImageMs: player.soundMinusImageMs,
       microphone: speech.state === "on",
       lips: gateway.lips,
       acoustic: gateway.acoustic,

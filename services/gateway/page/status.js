@@ -2,9 +2,8 @@
 
 import { isThisComputer } from "./address.js";
 import { element, setText } from "./elements.js";
-import { say, sayReceived } from "./language.js";
+import { say } from "./language.js";
 import { SILENT_DB } from "./level.js";
-import { TEXTS } from "./texts.js";
 
 const NEWS_MS = 8000; // for which news is shown
 const SHORT_MS = 1000; // a fault that is over within this time is not shown
@@ -116,11 +115,6 @@ export function hintText({ isConnected, wasConnected, isRefused, missing }) {
     });
   }
   return "";
-}
-
-/** Return the text of the gateway's error message. */
-export function errorText({ code, text }) {
-  return TEXTS[`error.${code}`] === undefined ? sayReceived(text) : say(`error.${code}`, { text });
 }
 
 /** A fault that lasts: its hint after some time, and the news that it is over. Time is injected. */

@@ -99,26 +99,10 @@ export const TEXTS = {
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
   noSpeech: { en: "{file}: no speech was found", zh: "{file}：没有找到语音" },
   noSpeechSilent: { en: "{file}: no speech was found; it is silent", zh: "{file}：没有找到语音，文件是静音的" },
-  "error.bad-audio": { en: "{text}", zh: "音频有误，请重试" },
-  "error.bad-face": { en: "{text}", zh: "此设置无效，请重新选择" },
-  "error.bad-language": { en: "{text}", zh: "没有识别器能识别此语言，请在“设置”中选择其他语言" },
-  "error.bad-message": { en: "{text}", zh: "系统不接受此请求，请重新载入页面" },
-  "error.bad-mouth-profile": {
+  oldMouthProfile: {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
     zh: "学到的口型不适用于当前版本：请重新“学我的口型”。",
   },
-  "error.bad-token": { en: "{text}", zh: "会话的令牌无效，请重新载入页面" },
-  "error.busy": { en: "{text}", zh: "系统繁忙，请稍后再试" },
-  "error.finished": { en: "{text}", zh: "会话已结束，请重新开始" },
-  "error.no-link": { en: "{text}", zh: "服务之间无法连接，请运行 kouxing doctor" },
-  "error.no-service": { en: "{text}", zh: "缺少服务，请运行 kouxing run" },
-  "error.no-video": { en: "{text}", zh: "无法录制视频，请查看驱动服务的日志" },
-  "error.not-allowed": { en: "{text}", zh: "网关的密钥没有权限，见 kouxing keys list" },
-  "error.session-exists": { en: "{text}", zh: "同名会话已存在" },
-  "error.too-many-services": { en: "{text}", zh: "服务太多，请先停止一些" },
-  "error.too-many-sessions": { en: "{text}", zh: "会话太多，请先关闭一些" },
-  "error.unknown-session": { en: "{text}", zh: "会话已不存在" },
-  "error.timeout": { en: "{text}", zh: "服务没有及时应答，请重试" },
 
   // Settings
   settings: { en: "Settings", zh: "设置" },
@@ -133,8 +117,8 @@ export const TEXTS = {
   lips: { en: "Lips", zh: "口型" },
   speechLanguage: { en: "Speech language", zh: "说话的语言" },
   speechErrors: {
-    en: "The lips follow any language. Phonetic feature errors: Mandarin 2 %, German 6 %, English 7 to 13 %, Italian 8 %, Korean 26 %. Other languages were not measured.",
-    zh: "口型适用于任何语言。音素特征错误率：普通话 2%，德语 6%，英语 7% 至 13%，意大利语 8%，韩语 26%；其他语言未测。",
+    en: "The lips work in any language.",
+    zh: "口型适用于任何语言。",
   },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
   captions: { en: "Captions", zh: "字幕" },
