@@ -209,7 +209,7 @@ static void stabilize(Face *face, const LipFrame *frame, double *faps) {
   closure -= closure_doubt(&face->rest, frame->time_s, frame->closure);
   double share = smooth_step(0.5 + 0.5 * closure / RULE_DOUBT);
   const double before = face->shares[0], newest = face->shares[1];
-  if (before < LEARNT_CLOSED_SHARE && LEARNT_CLOSED_SHARE <= newest) share = fmax(share, newest);
+  if (before < LEARNT_CLOSED_FRACTION && LEARNT_CLOSED_FRACTION <= newest) share = fmax(share, newest);
   face->shares[0] = newest;
   face->shares[1] = share;
   move_to_rest(faps, share);
