@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from kouxing.services.cli.options import Assignments, ConfigFile, Language
+from kouxing.services.cli.options import Assignments, ConfigFile, Language, Output
 from kouxing.shared.terminal import (
     Force,
     JsonFile,
@@ -15,6 +15,7 @@ from kouxing.shared.terminal import (
     plural,
     print_message,
     write_json,
+    write_output,
 )
 
 app = typer.Typer(
@@ -108,3 +109,14 @@ def report(
     results = make_report(study, read_answers(folder))
     print_report(study, results, Console())
     write_json(json_file, {"opinions": [asdict(opinion) for opinion in results]})
+
+
+@app.command()
+def export(folder: Folder, output: Output = None, force: Force = False) -> None:
+    """Write every score as a line of CSV, to standard output or a file."""
+    from kouxing.evaluation.mos.report import to_csv
+    from kouxing.evaluation.mos.store import read_answers
+    from kouxing.evaluation.mos.study import load_study
+
+    check_output(output, force=force)
+    write_output(to_csv(load_study(folder), read_answers(folder)), output)

@@ -5,9 +5,11 @@ fences; these are Tukey's. An interval of scores without outliers is too narrow,
 has the mean of all scores.
 """
 
+import csv
+import io
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,3 +118,15 @@ def print_report(study: Study, opinions: Iterable[Opinion], console: Console) ->
     ]
     print_table(console, "mean opinion scores, 95 % confidence", columns, rows)
     console.print("Use the intervals of all scores; those without outliers are too narrow.")
+
+
+def to_csv(study: Study, answers: Iterable[Answer]) -> str:
+    """Return a table with a line per score, and the role of its condition."""
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow([*(field.name for field in fields(Answer)), "role"])
+    roles = {study.reference: "reference", study.anchor: "anchor"}
+    for answer in answers:
+        role = "practice" if answer.place < 0 else roles.get(answer.condition, "")
+        writer.writerow([*asdict(answer).values(), role])
+    return table.getvalue()

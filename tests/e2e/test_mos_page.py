@@ -25,18 +25,21 @@ SENTENCES = ("one", "two")
 class Served:
     """``kouxing mos serve`` in a process that can be killed and started again."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *options: str) -> None:
         self.folder = folder
+        self._options = options
         self.port = free_port()
         self.start()
 
     def start(self) -> None:
         code = "from kouxing.evaluation.mos.commands import app; app()"
         command = [sys.executable, "-c", code, "serve", str(self.folder), f"--set=port={self.port}"]
-        self._process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(
+            [*command, *self._options], cwd=ROOT, stderr=subprocess.PIPE, text=True
+        )
         assert self._process.stderr is not None
-        line = self._process.stderr.readline()
-        assert line.startswith("judges open http"), line
+        self.line = self._process.stderr.readline()
+        assert self.line.startswith("judges open http"), self.line
 
     def kill(self) -> None:
         """Kill the process, as in a crash."""
@@ -82,8 +85,8 @@ def folder(tmp_path: Path, video: Path) -> Path:
 
 
 @pytest.fixture
-def served(folder: Path) -> Iterator[Served]:
-    served = Served(folder)
+def served(folder: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
+    served = Served(folder, *getattr(request, "param", ()))
     yield served
     assert served.stop() == 0
 
@@ -133,6 +136,18 @@ def test_sends_only_the_next_video_and_rejects_invalid_answers(served: Served) -
     assert served.ask(answers, good, Host="evil.example")[0] == 403
     assert read_answers(served.folder) == []
     assert served.state(answers, good)["place"] == -1
+
+
+@pytest.mark.parametrize("served", [("--set", "gateway.token=secret")], indirect=True)
+def test_the_gateways_token_protects_everything_but_the_page(served: Served) -> None:
+    assert served.line.endswith("/#token=secret\n")
+    assert served.ask("/")[0] == served.ask("/main.js")[0] == 200
+    for path in ("/state", "/stimulus/-2"):
+        assert served.ask(path)[0] == 403
+    for path in ("/judges", "/answers", "/judges?token=wrong"):
+        assert served.ask(path, {})[0] == 403
+    assert served.state("/state?token=secret") == {"title": "study", "videos": 4}
+    assert served.ask("/judges?token=secret", {})[0] == 200
 
 
 @pytest.fixture(scope="module")

@@ -57,6 +57,13 @@ def test_recordings_fill_a_minute_with_equal_pauses() -> None:
         join_recordings([np.tile(second, 59)])
 
 
+def test_videos_of_heads_do_not_replace_a_study(folder: Path) -> None:
+    new_study(folder)
+    result = CliRunner().invoke(app, ["heads", str(folder), "speech.wav"])
+    assert isinstance(result.exception, UserError)
+    assert "answers may refer to it; use another folder" in str(result.exception)
+
+
 def test_rejects_a_study_with_gaps_or_unknown_conditions(folder: Path) -> None:
     with pytest.raises(
         UserError, match="no condition is named 'ideal'; choose from late, live, real, still"
@@ -136,6 +143,12 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     figures = json.loads((folder / "figures.json").read_text())
     means = {item["condition"]: item["of_all"]["value"] for item in figures["opinions"]}
     assert means == pytest.approx(given)
+    exported = run(app, ["export", str(folder), "-o", str(folder / "scores.csv")])
+    assert exported.stderr == f"wrote {folder / 'scores.csv'}\n"
+    head, first, *_, last = (folder / "scores.csv").read_text().splitlines()
+    assert head == "judge,place,sentence,condition,scale,score,language,unix_s,role"
+    assert first == "0,0,a,late,realism,3,zh,0.0,"
+    assert last == "1,-1,a,real,sync,1,zh,0.0,practice"
     text = StringIO()
     print_report(study, make_report(study, read_answers(folder)), Console(file=text, width=80))
     assert "real (hidden reference)" in text.getvalue()
