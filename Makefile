@@ -210,5 +210,5 @@ $(HEADS): $(HEAD_SOURCES) | .venv/installed
 
 $(LIPS_MODELS): services/cli/web_model.py $(wildcard services/recognizer/models/*.npz \
 		services/recognizer/*.py services/recognizer/*/*.py services/synthesizer/*.py \
-		services/synthesizer/modifiers/*.py services/synthesizer/lips/learnt/*.py shared/face/*) | .venv/installed
+		services/synthesizer/modifiers/*.py services/synthesizer/lips/learned/*.py shared/face/*) | .venv/installed
 	$(BIN)/kouxing export web --force $(LIPS)/models

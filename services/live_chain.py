@@ -56,7 +56,7 @@ class LiveChain:
     synthesizer
         Settings of the synthesizer. ``lips`` is ignored.
     lip_predictor
-        The network that predicts learnt lips. If None, the recognizer's default.
+        The network that predicts learned lips. If None, the recognizer's default.
 
     Attributes
     ----------

@@ -7,8 +7,8 @@
 The live chain's ``FaceAnimator`` makes the face, with the same lip models and modifiers. It
 has the longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes
 blend all visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small to see.
-With learnt lips, phones also decide where the lips do not close. In the live chain, they arrive too
-late.
+With learned lips, phones also decide where the lips do not close. In the live chain, phones arrive
+too late for this.
 """
 
 import dataclasses
@@ -31,8 +31,8 @@ from kouxing.services.recognizer.speech_segmenter import (
 )
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, FaceAnimator, Frame
-from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
-from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+from kouxing.services.synthesizer.lips.learned.closures import ClosureRule
+from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import (
@@ -81,7 +81,7 @@ def analyze_recording(
     phones
         The phones of the recording, recognized or of a known text.
     lip_predictor
-        The network that predicts learnt lips, if any.
+        The network that predicts learned lips, if any.
     is_text_known
         Whether the phones come from a known text.
     with_progress
@@ -131,7 +131,7 @@ def animate_recording(
 
     ``with_progress`` shows the progress.
     """
-    if isinstance(lip_model, LearntLips):
+    if isinstance(lip_model, LearnedLips):
         lip_model = dataclasses.replace(
             lip_model, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED
         )

@@ -173,7 +173,7 @@ static double ajar_amount_at(Rest *rest, double time_s) {
   return ajar_share(rest);
 }
 
-/* ---- learnt lips ---- */
+/* ---- learned lips ---- */
 
 /* Move inner lips towards rest, and the outer lips by the same distance. */
 static void move_to_rest(double *faps, double share) {
@@ -186,10 +186,10 @@ static void move_to_rest(double *faps, double share) {
 
 /* Compute the FAPs of the next lip frame, stabilized and with closures. */
 static void stabilize(Face *face, const LipFrame *frame, double *faps) {
-  if (frame->time_s - track_end_s(&face->track) <= LEARNT_MAX_GAP_S) {
+  if (frame->time_s - track_end_s(&face->track) <= LEARNED_MAX_GAP_S) {
     for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
       const double change = frame->faps[i] - face->stable[i];
-      if (change != 0.0) face->stable[i] += change * change * change / (change * change + LEARNT_JITTER_SQUARED[i]);
+      if (change != 0.0) face->stable[i] += change * change * change / (change * change + LEARNED_JITTER_SQUARED[i]);
     }
   } else {
     face->shares[0] = face->shares[1] = 0.0;
@@ -209,7 +209,7 @@ static void stabilize(Face *face, const LipFrame *frame, double *faps) {
   closure -= closure_doubt(&face->rest, frame->time_s, frame->closure);
   double share = smooth_step(0.5 + 0.5 * closure / RULE_DOUBT);
   const double before = face->shares[0], newest = face->shares[1];
-  if (before < LEARNT_CLOSED_FRACTION && LEARNT_CLOSED_FRACTION <= newest) share = fmax(share, newest);
+  if (before < LEARNED_CLOSED_FRACTION && LEARNED_CLOSED_FRACTION <= newest) share = fmax(share, newest);
   face->shares[0] = newest;
   face->shares[1] = share;
   move_to_rest(faps, share);
@@ -237,8 +237,8 @@ static void follow_track(Face *face, double time_s) {
     const Mouth now = track_at(&face->track, face->time_s);
     bool is_different = false;
     for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
-      is_different |= fabs(face->on_track.value[i] - now.value[i]) > LEARNT_EPSILON;
-      is_different |= fabs(face->on_track.velocity[i] - now.velocity[i]) > LEARNT_EPSILON;
+      is_different |= fabs(face->on_track.value[i] - now.value[i]) > LEARNED_EPSILON;
+      is_different |= fabs(face->on_track.velocity[i] - now.velocity[i]) > LEARNED_EPSILON;
     }
     if (is_different) {
       for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
@@ -249,11 +249,11 @@ static void follow_track(Face *face, double time_s) {
     }
   }
   face->on_track = track_at(&face->track, time_s);
-  const double u = fmin((time_s - face->transition_s) / LEARNT_TRANSITION_S, 1.0);
+  const double u = fmin((time_s - face->transition_s) / LEARNED_TRANSITION_S, 1.0);
   for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
     const double value = face->difference.value[i], velocity = face->difference.velocity[i];
-    face->mouth.value[i] = face->on_track.value[i] + remaining(value, velocity, u, LEARNT_TRANSITION_S);
-    face->mouth.velocity[i] = face->on_track.velocity[i] + remaining_velocity(value, velocity, u, LEARNT_TRANSITION_S);
+    face->mouth.value[i] = face->on_track.value[i] + remaining(value, velocity, u, LEARNED_TRANSITION_S);
+    face->mouth.velocity[i] = face->on_track.velocity[i] + remaining_velocity(value, velocity, u, LEARNED_TRANSITION_S);
   }
 }
 
@@ -362,7 +362,7 @@ void face_visemes(Face *face, double time_s, float *weights) {
   for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
     faps[MOUTH_FAPS[i] - 1] = (float)(face->mouth.value[i] + ajar * (REST_AJAR[i] - face->mouth.value[i]));
   }
-  for (int i = 0; i < LEARNT_UNTRACKED_LENGTH; i++) faps[MOUTH_FAPS[LEARNT_UNTRACKED[i]] - 1] = 0.0;
+  for (int i = 0; i < LEARNED_UNTRACKED_LENGTH; i++) faps[MOUTH_FAPS[LEARNED_UNTRACKED[i]] - 1] = 0.0;
   apply_expressiveness(faps);
   for (int shape = 0; shape < NUM_SHAPES; shape++) {
     right[shape] = 0.0;

@@ -53,7 +53,7 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """Name of its folder of videos, such as ``scheme3-learnt-blocks``."""
+        """Name of its folder of videos, such as ``scheme3-learned-blocks``."""
         return "-".join(filter(None, (f"scheme{self.scheme}", self.lips, self.recognizer)))
 
 

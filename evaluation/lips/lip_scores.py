@@ -75,7 +75,7 @@ def load_faces(
         path = Path(name)
         if path.suffix == ".npz" and not path.is_file():
             raise UserError(f"{path}: no such file")
-        kind = {".npz": "learnt", ".json": "dynamic-visemes"}.get(path.suffix, name)
+        kind = {".npz": "learned", ".json": "dynamic-visemes"}.get(path.suffix, name)
         lips: LipModel = load_lip_model(inventory.language, kind)
         if path.suffix == ".json":
             lips = DynamicVisemes(load_parameters(path), inventory)

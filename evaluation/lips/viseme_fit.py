@@ -2,7 +2,7 @@
 
 Source: Wang & Cai 2003, section 4; their figure 4 shows measured and modeled curves. Here the full
 model runs over the phones of each clip. The phones are aligned if the text is known, and recognized
-otherwise. The model runs with the learnt parameters and with the initial ones, which were set by
+otherwise. The model runs with the learned parameters and with the initial ones, which were set by
 hand. Each frame counts for the nearest viseme. The level of the voice is not used.
 """
 
@@ -45,7 +45,7 @@ class VisemeError:
     measure: str
     num_frames: int
     extent: float  # standard deviation of the measured values in these frames
-    learnt: float
+    learned: float
     guessed: float  # with the initial parameters
 
 
@@ -56,37 +56,37 @@ class FittedClip:
     clip: LipClip
     phones: list[Phone]
     inventory: PhoneInventory
-    learnt: Array  # (num_frames, 68)
+    learned: Array  # (num_frames, 68)
     guessed: Array  # (num_frames, 68)
 
     def curves(self, measure: str) -> tuple[Array, Array, Array]:
-        """Return measured, learnt and guessed values, (num_frames,), without the clip's means."""
+        """Return measured, learned and guessed values, (num_frames,), without the clip's means."""
         real = CURVES[measure](real_faps(self.clip))
         is_known = ~np.isnan(real)
-        learnt, guessed = CURVES[measure](self.learnt), CURVES[measure](self.guessed)
+        learned, guessed = CURVES[measure](self.learned), CURVES[measure](self.guessed)
         if is_known.any():
-            real, learnt, guessed = (v - v[is_known].mean() for v in (real, learnt, guessed))
-        return real, learnt, guessed
+            real, learned, guessed = (v - v[is_known].mean() for v in (real, learned, guessed))
+        return real, learned, guessed
 
 
 def fit_folder(folder: Path, parameters: Path | None) -> list[FittedClip]:
     """Model all clips of a folder that the parameters were not trained on."""
     model = load_model()
-    learnt, guessed = (
+    learned, guessed = (
         DynamicVisemes(values, model.inventory)
         for values in (load_parameters(parameters), initial_parameters())
     )
     clips = clips_to_score(folder, [parameters], language=model.inventory.code)
     return [
-        fit_clip(clip, label_clip(model, clip), learnt, guessed)
+        fit_clip(clip, label_clip(model, clip), learned, guessed)
         for clip in track(clips, description="clips", transient=True)
     ]
 
 
 def fit_clip(
-    clip: LipClip, phones: list[Phone], learnt: DynamicVisemes, guessed: DynamicVisemes
+    clip: LipClip, phones: list[Phone], learned: DynamicVisemes, guessed: DynamicVisemes
 ) -> FittedClip:
-    """Model a clip's lips with learnt and with initial parameters."""
+    """Model a clip's lips with learned and with initial parameters."""
 
     def curves(lips: DynamicVisemes) -> Array:
         num_frames = int(max(clip.time_s[-1], 0.0) * FRAME_RATE_HZ) + 2
@@ -94,7 +94,7 @@ def fit_clip(
         frame_s = np.arange(num_frames) / FRAME_RATE_HZ
         return np.stack([np.interp(clip.time_s, frame_s, fap) for fap in frames.T], axis=1)
 
-    return FittedClip(clip, phones, learnt.inventory, curves(learnt), curves(guessed))
+    return FittedClip(clip, phones, learned.inventory, curves(learned), curves(guessed))
 
 
 def viseme_errors(fitted: Sequence[FittedClip]) -> list[VisemeError]:
@@ -103,7 +103,7 @@ def viseme_errors(fitted: Sequence[FittedClip]) -> list[VisemeError]:
     errors = []
     for measure in CURVES:
         curves = zip(*(clip.curves(measure) for clip in fitted), strict=True)
-        real, learnt, guessed = (np.concatenate(values) for values in curves)
+        real, learned, guessed = (np.concatenate(values) for values in curves)
         for name in ("all", *VISEMES):
             rows = ~np.isnan(real)
             if name != "all":
@@ -114,7 +114,7 @@ def viseme_errors(fitted: Sequence[FittedClip]) -> list[VisemeError]:
                     measure=measure,
                     num_frames=int(rows.sum()),
                     extent=float(real[rows].std()),
-                    learnt=_rms(learnt[rows] - real[rows]),
+                    learned=_rms(learned[rows] - real[rows]),
                     guessed=_rms(guessed[rows] - real[rows]),
                 )
                 errors.append(error)
@@ -143,12 +143,12 @@ def print_errors(errors: Sequence[VisemeError], console: Console) -> None:
     for viseme in dict.fromkeys(error.viseme for error in errors):
         of_viseme = {error.measure: error for error in errors if error.viseme == viseme}
         cells = {
-            measure: f"{error.learnt:.0f} ({error.guessed:.0f}); {error.extent:.0f}"
+            measure: f"{error.learned:.0f} ({error.guessed:.0f}); {error.extent:.0f}"
             for measure, error in of_viseme.items()
         }
         num_frames = max(error.num_frames for error in of_viseme.values())
         rows.append([viseme, str(num_frames), *(cells.get(measure, "") for measure in CURVES)])
-    title = "error in FAP units: learnt (initial); standard deviation of the measured values"
+    title = "error in FAP units: learned (initial); standard deviation of the measured values"
     print_table(console, title, ("viseme", "frames", *CURVES), rows)
 
 
@@ -159,11 +159,11 @@ def fit_figure(fitted: Sequence[FittedClip]) -> Any:
     clip = max(fitted, key=lambda clip: len(_first_phones(clip)))
     is_shown = clip.clip.time_s <= _SENTENCE_S
     for axis, name in zip(axes, CURVES, strict=True):
-        real, learnt, guessed = (curve[is_shown] for curve in clip.curves(name))
+        real, learned, guessed = (curve[is_shown] for curve in clip.curves(name))
         time_s = clip.clip.time_s[is_shown]
         axis.plot(time_s, guessed, color="C1", linewidth=0.8, label="initial parameters")
         axis.plot(time_s, real, color="0.6", linewidth=2.5, label="measured")
-        axis.plot(time_s, learnt, color="black", linewidth=1.2, label="learnt parameters")
+        axis.plot(time_s, learned, color="black", linewidth=1.2, label="learned parameters")
         axis.set_ylabel(f"{name}, FAP units", fontsize=8)
     top = axes[0].get_ylim()[1]
     for number, phone in enumerate(_first_phones(clip)):

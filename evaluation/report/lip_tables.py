@@ -12,7 +12,7 @@ from kouxing.evaluation.tables import format_number, percent
 
 _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
 _COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", ALL: "all clips"}
-_OWN = "learnt"
+_OWN = "learned"
 _COMPARED = {  # compared measures, and whether higher is better
     "r_opening": ("correlation of the opening", True),
     "r_width": ("correlation of the width", True),
@@ -257,7 +257,7 @@ def viseme_fit(results: Results) -> Table:
         cells = (
             join_values(
                 format_number(of_viseme[measure][key], ".0f")
-                for key in ("learnt", "guessed", "extent")
+                for key in ("learned", "guessed", "extent")
             )
             if measure in of_viseme
             else "-"

@@ -13,7 +13,7 @@ SAMPLE = ROOT / "shared" / "demo" / "hello-female.wav"
 DELAYS_MS = (0, 30, 60, 100, 160, 220, 300)
 _MODELS = "--acoustic blocks --acoustic light --acoustic gmm"
 _DELAYS = " ".join(f"--delay-ms {delay}" for delay in DELAYS_MS)
-_ALL_LIPS = "--lips learnt --lips dynamic-visemes --lips ferguson"
+_ALL_LIPS = "--lips learned --lips dynamic-visemes --lips ferguson"
 _TABLES = " ".join(f"--from-csv {{rivals}}/{name}" for name in PROGRAMS)
 
 # A result is out of date if one of these files, or a module that it imports, has changed.
@@ -99,7 +99,7 @@ STEPS: Mapping[str, Step] = {
         (*_LIP_SCORES_CODE, "evaluation/rivals"),
         (
             "evaluate rivals {rivals} --clips {lips} --program headaudio --program loudness",
-            f"{_LIP_SCORES} --condition clean --lips learnt --from-csv {{rivals}}/headaudio"
+            f"{_LIP_SCORES} --condition clean --lips learned --from-csv {{rivals}}/headaudio"
             " --from-csv {rivals}/loudness --every 8",
         ),
     ),

@@ -185,7 +185,7 @@ def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, LipP
 
 
 def _load_lip_predictor(mouth: Path | None) -> LipPredictor:
-    """Return the network that predicts learnt lips, adapted to a mouth profile, if any."""
+    """Return the network that predicts learned lips, adapted to a mouth profile, if any."""
     predictor = load_lip_predictor()
     if mouth is None:
         return predictor

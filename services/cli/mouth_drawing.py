@@ -198,7 +198,7 @@ def _widths(
     """Return times, and the distance of the corners at each, relative to the mouth at rest."""
     if lips is WidthSource.FERGUSON:
         return np.zeros(1), np.ones(1)
-    predictor = load_lip_predictor() if lips is WidthSource.LEARNT else None
+    predictor = load_lip_predictor() if lips is WidthSource.LEARNED else None
     recording = analyze_recording(samples, timed, predictor, with_progress=with_progress)
     lip_model = load_lip_model(inventory.language, lips)
     frames = animate_recording(

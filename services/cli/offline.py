@@ -91,7 +91,7 @@ def render(
     lips: Annotated[
         list[str] | None,
         typer.Option(
-            help="Lip model, such as learnt or dynamic-visemes. Repeat the option to show several"
+            help="Lip model, such as learned or dynamic-visemes. Repeat the option to show several"
             " faces side by side."
         ),
     ] = None,
@@ -159,8 +159,8 @@ def render(
     if captions is CaptionKind.CHARACTERS and text is None:
         raise UserError("--captions characters needs the spoken text; add --text")
     models = tuple(lips or [DEFAULT_LIP_MODEL])
-    if mouth is not None and "learnt" not in models:
-        raise UserError("--mouth applies to learnt lips; add --lips learnt")
+    if mouth is not None and "learned" not in models:
+        raise UserError("--mouth applies to learned lips; add --lips learned")
     *sources, last = files
     if output is None and len(sources) == 1 and (is_output(last) or not last.exists()):
         pairs = [(sources[0], last)]

@@ -100,7 +100,7 @@ class WidthSource(StrEnum):
     """Source of the width of a mouth that is drawn in two dimensions."""
 
     VISEMES = "dynamic-visemes"
-    LEARNT = "learnt"
+    LEARNED = "learned"
     FERGUSON = "ferguson"  # always the same width, as in the paper
 
 

@@ -43,7 +43,7 @@ from kouxing.services.recognizer.search import decoder
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.services.synthesizer import face_animator
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.learnt import closures, model, rest, track
+from kouxing.services.synthesizer.lips.learned import closures, model, rest, track
 from kouxing.services.synthesizer.modifiers import expressiveness, feeling, nonverbal
 from kouxing.shared import clock
 from kouxing.shared.face import expression_motion, shapes
@@ -79,7 +79,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "_MAX_PUSH _WIDTH _PUSH",
     ),
     "feeling": (feeling, "_GAIN _FILTER_S _SIZE _AROUSED _TIRED _PLEASANT _UNPLEASANT"),
-    "learnt": (
+    "learned": (
         model,
         "HOLD_S MAX_GAP_S NUM_MOUTH_FAPS _TRANSITION_S _MEMORY_S _TEETH_LOG_ODDS "
         "_CLOSED_FRACTION _EPSILON _UNTRACKED _JITTER_SQUARED",

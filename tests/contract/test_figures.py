@@ -22,7 +22,7 @@ FIGURES: list[tuple[str, Callable[[Any], str]]] = [  # step and value of each ro
     ("chain", lambda r: f"{sum(r['cpu_s_per_audio_s'].values()):.2f} s"),
     ("read", phone_errors),
     ("conversation", phone_errors),
-    ("rivals", lambda r: f"{r['learnt, 60 ms']['clean']['zh']['r_opening']:.2f}"),
+    ("rivals", lambda r: f"{r['learned, 60 ms']['clean']['zh']['r_opening']:.2f}"),
     ("chain", lambda r: f"{r['page']['drawings']['microphone']['pictures_per_s']:.0f}"),
 ]
 

@@ -143,7 +143,7 @@ def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Br
     assert opening.mouth_profile == profile
     wait_until(lambda: control.of(SetFace))
     assert [(change.session, change.face) for change in control.of(SetFace)] == [
-        (session, FaceSettings(lip_model="learnt"))
+        (session, FaceSettings(lip_model="learned"))
     ]
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone")

@@ -375,13 +375,13 @@ def test_settings_apply_at_once_and_to_later_sessions(
     second = turn_on_microphone(control, page)
     page.wait_for(f"{STATE}.lips === 'ferguson'")
     wait_until(lambda: len(amounts(control)) == 2)
-    choose(page, "lips", "learnt")
-    page.wait_for(f"{STATE}.lips === 'learnt'")
+    choose(page, "lips", "learned")
+    page.wait_for(f"{STATE}.lips === 'learned'")
     turn_off_microphone(page)
     assert [(name, face.lip_model) for name, face in changes(control) if face.lip_model] == [
         (first, "ferguson"),
         (second, "ferguson"),
-        (second, "learnt"),
+        (second, "learned"),
     ]
     assert amounts(control) == [(first, 0.7), (second, 0.7)]
 

@@ -91,7 +91,7 @@ def test_renders_a_transparent_picture_of_any_head(face: Path, tmp_path: Path) -
     [
         ("a.png", {"at": 9.0, "size": "64x48"}, "use 0 to 0.45 seconds"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
-        ("a.mp4", {"lips": ["learnt"]}, "--lips applies to sound"),
+        ("a.mp4", {"lips": ["learned"]}, "--lips applies to sound"),
         ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth applies to sound"),
         ("a.mp4", {"live": True}, "--live applies to sound"),
         ("a.csv", {"text": "你好"}, "--text applies to sound"),
@@ -132,14 +132,14 @@ def test_renders_lip_models_side_by_side(tmp_path: Path) -> None:
     alone, both = tmp_path / "alone.png", tmp_path / "beside.png"
     shot: dict[str, Any] = {"camera": Framing.MOUTH, "at": 1.2}
     render(SENTENCE, alone, size="200x160", **shot)
-    lips = ["dynamic-visemes", "learnt"]
+    lips = ["dynamic-visemes", "learned"]
     render(SENTENCE, both, lips=lips, size="400x160", **shot)
     default = np.asarray(Image.open(alone)).astype(int)
-    visemes, learnt = np.split(np.asarray(Image.open(both)).astype(int), 2, axis=1)
-    assert DEFAULT_LIP_MODEL == "learnt"
-    np.testing.assert_array_equal(learnt[:140], default[:140])
-    assert np.abs(visemes - learnt)[:140].max() > 40
-    assert default[140:].min(axis=2).max() < 200 < learnt[140:].min(axis=2).max(), "a caption"
+    visemes, learned = np.split(np.asarray(Image.open(both)).astype(int), 2, axis=1)
+    assert DEFAULT_LIP_MODEL == "learned"
+    np.testing.assert_array_equal(learned[:140], default[:140])
+    assert np.abs(visemes - learned)[:140].max() > 40
+    assert default[140:].min(axis=2).max() < 200 < learned[140:].min(axis=2).max(), "a caption"
     with pytest.raises(UserError, match="choose a width that is a multiple of 2"):
         render(SENTENCE, both, lips=lips, size="401x160", **shot)
 

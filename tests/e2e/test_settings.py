@@ -62,12 +62,12 @@ def test_lips_are_switched_while_a_session_runs(system: System) -> None:
         client.open_session(encoding="f32le", paced=False) as session,
     ):
         session.set_face(lip_model="muscles")  # is reported and ignored
-        session.set_face(lip_model="learnt")
+        session.set_face(lip_model="learned")
         sent = Stream(session)
         sent.send(SAMPLES)
         sent.finish()
     # the choice may overtake the start of the audio; the face is at rest there
-    np.testing.assert_allclose(sent.faps, frames_of_the_chain("learnt"), atol=0.5)
+    np.testing.assert_allclose(sent.faps, frames_of_the_chain("learned"), atol=0.5)
 
 
 def test_refuses_one_session_too_many_and_the_others_continue(

@@ -60,7 +60,7 @@ test("every text that the page uses exists in both languages, and every text is 
 
 test("a mouth profile is stored until it is deleted", () => {
   const storage = new FakeStorage();
-  const learned = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
+  const learned = { profile: "YWJj", learnedOn: 1, before: {}, after: {} };
   new MouthProfileStore(() => storage).keep(learned);
   const later = new MouthProfileStore(() => storage);
   assert.deepEqual(later.current, learned);

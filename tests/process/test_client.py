@@ -147,7 +147,7 @@ def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeCont
             frames = await session.frames()
             await session.push(CHUNK[:1])
             await session.push(CHUNK[1:])
-            await session.set_face(lip_model="learnt")
+            await session.set_face(lip_model="learned")
             await asyncio.to_thread(control.publish, control.faps, frame(1), frame(2), END)
             values = [result.values[0] async for result in frames]
             await session.close()

@@ -44,7 +44,7 @@ def test_restores_a_session_unchanged(stage: Stage, client: Socket) -> None:
     recognizer, synthesizer = stage.services
     stage.receive(synthesizer)  # its heartbeat is answered
     stage.receive(recognizer)
-    face = FaceSettings(lip_model="learnt", expressiveness=1.5)
+    face = FaceSettings(lip_model="learned", expressiveness=1.5)
     recognizer.send(report(face=face))
     for service in stage.services:
         (start,) = stage.receive(service)

@@ -370,16 +370,16 @@ async def test_microphone_and_sample_choose_their_lips(
     async with connected(gateway.page, "viewer", "microphone") as (viewer, microphone):
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
-        for lips in ("learnt", "dynamic-visemes"):
+        for lips in ("learned", "dynamic-visemes"):
             await microphone.send_json({"lips": lips})
             await receive_json(viewer, "lips", lips=lips)
         await viewer.send_json({"play": "sample", "lips": 1})
         assert (
             "lips must be the name of a lip model" in (await receive_json(viewer, "error"))["text"]
         )
-        await viewer.send_json({"lips": "learnt"})
+        await viewer.send_json({"lips": "learned"})
         assert "only for the sample sentence" in (await receive_json(viewer, "error"))["text"]
-        await viewer.send_json({"play": "sample", "lips": "learnt"})
+        await viewer.send_json({"play": "sample", "lips": "learned"})
         await until(lambda: len(control.of(SetFace)) == 3)
         await receive_json(viewer, "session", sample=True)
         await viewer.send_json({"lips": "dynamic-visemes"})
@@ -389,7 +389,7 @@ async def test_microphone_and_sample_choose_their_lips(
     sessions = control.sessions_of(SetFace)
     lips_chosen = tuple(message.face.lip_model for message in control.of(SetFace))
     assert sessions[0] == sessions[1] != sessions[2] == sessions[3]
-    assert lips_chosen == ("learnt", "dynamic-visemes") * 2
+    assert lips_chosen == ("learned", "dynamic-visemes") * 2
 
 
 # --- other programs

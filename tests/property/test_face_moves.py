@@ -137,7 +137,7 @@ def assert_closed_in_time(frames: Sequence[Frame], lips: str) -> None:
 
 
 cuts = st.integers(0, 10_000).map(lambda number: number % (len(events()) - 60) + 40)
-lip_models = st.sampled_from(["learnt", "dynamic-visemes", "ferguson"])
+lip_models = st.sampled_from(["learned", "dynamic-visemes", "ferguson"])
 
 
 MOVES = [with_another_synthesizer, with_another_recognizer]
@@ -154,7 +154,7 @@ def test_another_process_continues_anywhere(
 
 
 def test_stress_before_a_move_causes_no_brow_movement_after_it() -> None:
-    assert_unseen(with_another_synthesizer("learnt", 143), "learnt")
+    assert_unseen(with_another_synthesizer("learned", 143), "learned")
 
 
 @pytest.mark.parametrize("fap", [JAW, LOWER_LIP, EYELID, HEAD_PITCH])
@@ -162,14 +162,14 @@ def test_stress_before_a_move_causes_no_brow_movement_after_it() -> None:
 def test_continues_during_the_largest_movement(
     move: Callable[[str, int], list[Frame]], fap: int
 ) -> None:
-    plain = undisturbed("learnt")
+    plain = undisturbed("learned")
     shown_s = plain[int(steps(plain)[20:, fap - 1].argmax()) + 20][0]
-    known_s = shown_s + lip_model_info("learnt").delay_ms / 1e3
+    known_s = shown_s + lip_model_info("learned").delay_ms / 1e3
     cut = next(
         number
         for number, event in enumerate(events())
         if isinstance(event, Progress) and event.time_s > known_s + 0.001
     )
-    frames = move("learnt", cut)
-    assert_unseen(frames, "learnt")
-    assert_closed_in_time(frames, "learnt")
+    frames = move("learned", cut)
+    assert_unseen(frames, "learned")
+    assert_closed_in_time(frames, "learned")

@@ -43,7 +43,7 @@ START = replace(
 
 TEXTS = st.sampled_from(
     ["", "demo", "t", "recognizer-1", "worker", "observer", "draining", "ready", "start-0-1",
-     "learnt", "f32le", "tcp://-:1", "tcp://*:1", "tcp://127.0.0.1:1", "ipc:///tmp/x", "../x",
+     "learned", "f32le", "tcp://-:1", "tcp://*:1", "tcp://127.0.0.1:1", "ipc:///tmp/x", "../x",
      "x" * 2000, "\0", "人"]
 )  # fmt: skip
 NUMBERS = st.sampled_from([0, 1, 2, 7, 8, 320, 2**31, 2**40, 2**53, -1, 2**63])

@@ -13,7 +13,7 @@ from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import CLOSURE_FAPS, VISEME_INDEX
-from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.records import replace
@@ -228,8 +228,8 @@ def sound(seed: int) -> list[SoundEvent]:
 
 @few_examples
 @given(st.integers(0, 1000), st.sampled_from([0.0, 0.02, 0.1]))
-def test_learnt_lips_have_no_jumps_or_corners(seed: int, delay_s: float) -> None:
-    face = FaceAnimator(LearntLips(LIPS), frame_rate_hz=FINE_RATE_HZ, delay_s=delay_s)
+def test_learned_lips_have_no_jumps_or_corners(seed: int, delay_s: float) -> None:
+    face = FaceAnimator(LearnedLips(LIPS), frame_rate_hz=FINE_RATE_HZ, delay_s=delay_s)
     faps = np.array([faps for event in sound(seed) for _, faps in face.process(event)])
     faps = faps[:, [fap - 1 for fap in MOUTH_FAPS if fap not in (14, 44, 45, 46, 47)]]
     assert np.isfinite(faps).all()

@@ -75,7 +75,7 @@ def test_a_default_may_depend_on_another_key() -> None:
     assert (item.value, item.default) == (1, 2)
     assert item.origin == "default with acoustic = gmm"
     assert item.meaning.endswith("Other defaults: 1 with acoustic = light or gmm.")
-    delays_ms = {name: settings(synthesizer__lips=name) for name in ("learnt", "ferguson")}
+    delays_ms = {name: settings(synthesizer__lips=name) for name in ("learned", "ferguson")}
     assert [g.load(SynthesizerConfig).delay_ms for g in delays_ms.values()] == [60.0, 160.0]
 
 

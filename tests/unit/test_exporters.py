@@ -80,7 +80,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
     [
         ("a.fap", {"form": CurveFormat.ARKIT}, "holds faps; for arkit, write .csv"),
         ("a.glb", {"form": CurveFormat.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
-        ("a.csv", {"lips": ["dynamic-visemes", "learnt"]}, "a curve file holds one face"),
+        ("a.csv", {"lips": ["dynamic-visemes", "learned"]}, "a curve file holds one face"),
         ("no/a.csv", {}, "cannot write"),
         ("no/a.mp4", {}, "cannot write"),
         ("a.jsonl", {"form": CurveFormat.LIVELINK}, "for livelink, write .csv"),

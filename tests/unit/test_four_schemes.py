@@ -76,11 +76,19 @@ def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
         "utt_id\tpath\tspeaker\tsplit\ttext\nhello\thello.wav\tA\ttest\t你好\n", encoding="utf-8"
     )
     videos = tmp_path / "videos"
-    conditions = ["scheme1-learnt", *(f"scheme{number}-learnt-blocks" for number in (2, 3, 4))]
+    conditions = ["scheme1-learned", *(f"scheme{number}-learned-blocks" for number in (2, 3, 4))]
     for name in conditions[1:]:
         (videos / name).mkdir(parents=True)
         (videos / name / "hello.mp4").write_bytes(b"made before")
-    arguments = ["schemes", "--manifest", str(tmp_path), "--acoustic", "blocks", "--lips", "learnt"]
+    arguments = [
+        "schemes",
+        "--manifest",
+        str(tmp_path),
+        "--acoustic",
+        "blocks",
+        "--lips",
+        "learned",
+    ]
     outputs = ["--videos", str(videos), "--json", str(tmp_path / "figures.json")]
     result = CliRunner().invoke(app, [*arguments, *outputs], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -101,4 +109,4 @@ def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
     assert all(
         score["jerk"] > 0.0 and score["like_real_lips"] is None for score in figures["scores"]
     )
-    assert "learnt, blocks, opening: recognition errors cost 0." in result.output
+    assert "learned, blocks, opening: recognition errors cost 0." in result.output

@@ -86,7 +86,7 @@ def test_parses_face_settings() -> None:
     manner: dict[str, Any] = {"feeling": 0, "still": True, "eye_contact": False, "listen_to": "bob"}
     assert wire.parse_face_settings(manner) == FaceSettings(**manner)
     assert wire.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
-    assert wire.parse_face_settings({"lips": "learnt"}) == FaceSettings(lip_model="learnt")
+    assert wire.parse_face_settings({"lips": "learned"}) == FaceSettings(lip_model="learned")
     assert wire.parse_face_settings({"acoustic": "light"}) == FaceSettings(acoustic="light")
 
 
@@ -131,7 +131,7 @@ def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
     viewers = Viewers(WebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED)
     face = RestingFace(seed=0)
     frame = np.zeros(68, "<f4").tobytes()
-    viewers.add_session("talk", 1, "learnt")
+    viewers.add_session("talk", 1, "learned")
     with viewers.connected("", None) as viewer:
         viewers.show_frame("talk", 1, 0, frame, now_s=0.0)
         assert viewers.rest_from_s < 0

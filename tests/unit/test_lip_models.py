@@ -41,7 +41,7 @@ def install(folder: Path, package: str, code: str) -> None:
 
 
 def test_built_in_lip_models() -> None:
-    assert lip_models().keys() >= {"dynamic-visemes", "ferguson", "learnt"}
+    assert lip_models().keys() >= {"dynamic-visemes", "ferguson", "learned"}
     assert DEFAULT_LIP_MODEL in lip_models()
     for name, info in lip_models().items():
         assert LIP_MODEL_NAME.fullmatch(name)

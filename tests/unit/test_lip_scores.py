@@ -36,22 +36,22 @@ def write_clip(folder: Path) -> None:
 def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
     write_clip(tmp_path)
     path = tmp_path / "scores.json"
-    options = ["--lips", "learnt", "--delay-ms", "0", "--delay-ms", "60"]
+    options = ["--lips", "learned", "--delay-ms", "0", "--delay-ms", "60"]
     conditions = ["--condition", CLEAN, "--condition", MUSIC]
     arguments = ["lips", "--clips", str(tmp_path), *options, *conditions, "--json", str(path)]
     result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     results = json.loads(path.read_text(encoding="utf-8"))
-    assert [*results] == ["real", "learnt, 0 ms", "learnt, 60 ms"]
+    assert [*results] == ["real", "learned, 0 ms", "learned, 60 ms"]
     groups = {"all", "zh", "zh new", "source cam", "speaker ann"}
     assert {*results["real"][CLEAN]} == groups
     assert {*results["real"][CLEAN]["all"]} == {"clips", *MEASURES} - COMPARISONS
-    for title in ("learnt, 0 ms", "learnt, 60 ms"):
+    for title in ("learned, 0 ms", "learned, 60 ms"):
         assert {*results[title][CLEAN]} == groups
         assert {*results[title][MUSIC]} == groups
         assert {*results[title][CLEAN]["all"]} == {"clips", *MEASURES}
-    assert results["learnt, 0 ms"][CLEAN]["all"] != results["learnt, 60 ms"][CLEAN]["all"]
-    assert "A: learnt, 0 ms, B: learnt, 60 ms" in result.output
+    assert results["learned, 0 ms"][CLEAN]["all"] != results["learned, 60 ms"][CLEAN]["all"]
+    assert "A: learned, 0 ms, B: learned, 60 ms" in result.output
 
 
 def test_omitted_clips_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,7 +41,7 @@ def test_lips_close_and_open_for_the_phones_of_a_known_text() -> None:
     model = load_model()
     aligned = align_text(model, samples, rate_hz, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")
     analyzed = analyze_recording(samples[:, 0], aligned, load_lip_predictor())
-    frames = animate_recording(analyzed, load_lip_model(name="learnt"), STILL)
+    frames = animate_recording(analyzed, load_lip_model(name="learned"), STILL)
     times_s = np.array([time_s for time_s, _ in frames])
     opening = np.array([-faps[3] - faps[4] for _, faps in frames])  # of the inner lips
     closing = [phone for phone in analyzed.phones if phone.symbol in ("b", "p", "m")]

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.learnt.rest import AJAR, CERTAIN, LEAD_S, PART_S, RestingLips
+from kouxing.services.synthesizer.lips.learned.rest import (
+    AJAR,
+    CERTAIN,
+    LEAD_S,
+    PART_S,
+    RestingLips,
+)
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import EndOfSound, Progress, SpeechChange
 

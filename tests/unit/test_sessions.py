@@ -206,9 +206,9 @@ def test_a_new_worker_gets_the_face_as_it_is_now(system: System) -> None:
         "the synthesizer's default"
     )
     record.face.change(FaceSettings(expressions={"joy": 0.5}, hold_s=10.0), 0.0)
-    record.face.change(FaceSettings(expressiveness=1.8, lip_model="learnt", shapes=["arkit"]), 2.0)
+    record.face.change(FaceSettings(expressiveness=1.8, lip_model="learned", shapes=["arkit"]), 2.0)
     face = record.start_message(4.0).face
-    assert (face.lip_model, face.expressiveness, face.shapes) == ("learnt", 1.8, ["vrm", "arkit"])
+    assert (face.lip_model, face.expressiveness, face.shapes) == ("learned", 1.8, ["vrm", "arkit"])
     assert (face.expressions, face.hold_s) == ({"joy": 0.5}, 6.0)
     assert record.start_message(11.0).face.expressions is None
     system.lose("synthesizer-1")
@@ -216,7 +216,7 @@ def test_a_new_worker_gets_the_face_as_it_is_now(system: System) -> None:
     system.add(replace(worker("synthesizer", "synthesizer-2"), facts=facts))
     assert system.sessions.move(record, 12.0)
     start = record.start_message(12.0)
-    assert (start.facts.delay_ms, start.face.lip_model) == (40.0, "learnt")
+    assert (start.facts.delay_ms, start.face.lip_model) == (40.0, "learned")
 
 
 def test_a_session_moves_to_another_recognizer_and_resumes_where_it_was(system: System) -> None:

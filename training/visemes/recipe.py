@@ -123,7 +123,7 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
     text = format_parameters(
         parameters,
         f"{_SOURCE}; the rest learned from clips under: {licenses}",
-        learnt_from=[clip.name for clip in used],
+        learned_from=[clip.name for clip in used],
         chosen_with=[clip.name for clip in clips if clip.split == "choice"],
     )
     write_text(output, text)
@@ -133,13 +133,13 @@ def format_parameters(
     parameters: VisemeParameters,
     source: str,
     *,
-    learnt_from: Sequence[str],
+    learned_from: Sequence[str],
     chosen_with: Sequence[str],
 ) -> str:
     """Return parameters as JSON, one line per viseme and array.
 
-    ``source`` describes their origin. ``learnt_from`` and ``chosen_with`` are names of clips that a
-    fair evaluation must exclude.
+    ``source`` describes their origin. ``learned_from`` and ``chosen_with`` are names of clips
+    that a fair evaluation must exclude.
     """
 
     def line(name: str, values: NDArray[np.float64]) -> str:
@@ -159,7 +159,7 @@ def format_parameters(
         for name, value in (
             ("format", FORMAT),
             ("source", source),
-            ("learnt_from", list(learnt_from)),
+            ("learned_from", list(learned_from)),
             ("chosen_with", list(chosen_with)),
             ("c", parameters.c),
             ("closure_ratio", parameters.closure_ratio),

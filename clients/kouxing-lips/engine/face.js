@@ -3,7 +3,7 @@
 
 import { Expressions, applyExpressiveness } from "./expressions.js";
 import { Feeling } from "./feeling.js";
-import { LearntLips } from "./learnt-lips.js";
+import { LearnedLips } from "./learned-lips.js";
 import { NonverbalSounds } from "./nonverbal.js";
 
 export class Face {
@@ -26,7 +26,7 @@ export class Face {
     this.#delayS = delayS;
     this.#rateHz = model.defaults.frameRateHz;
     this.#expressiveness = expressiveness;
-    this.#lips = new LearntLips(model, delayS);
+    this.#lips = new LearnedLips(model, delayS);
     this.#expressions = new Expressions(model);
     this.#nonverbal = new NonverbalSounds(model);
     this.#feeling = new Feeling(model, feeling);

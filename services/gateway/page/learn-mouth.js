@@ -70,7 +70,7 @@ export class MouthLesson {
     element("lesson-profile").hidden = current === null;
     if (current !== null) {
       const [, before, after] = figures(current)[0];
-      const day = new Date(current.learntOn).toLocaleDateString(lang);
+      const day = new Date(current.learnedOn).toLocaleDateString(lang);
       element("lesson-profile").firstElementChild.textContent =
         say("lessonLearned", { day, before, after });
     }
@@ -241,7 +241,7 @@ export class MouthLesson {
       return;
     }
     const { mouth_profile: profile, before, after } = answer;
-    this.#learned = { profile, learntOn: Date.now(), before, after };
+    this.#learned = { profile, learnedOn: Date.now(), before, after };
     this.#recording = null;
     this.#showResult(answer);
   }

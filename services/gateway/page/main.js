@@ -136,9 +136,9 @@ function isOwnSession() {
   return gateway.isSample || (gateway.session !== null && gateway.session === speech.session);
 }
 
-/** Return the lip model for new sessions, or null for the default. Only "learnt" uses a profile. */
+/** Return the lip model for new sessions, or null for the default. Only "learned" uses a profile. */
 function chosenLipModel() {
-  return preferences.get("lips") ?? (mouthProfiles.current === null ? null : "learnt");
+  return preferences.get("lips") ?? (mouthProfiles.current === null ? null : "learned");
 }
 
 function showLipModel() {

@@ -53,7 +53,7 @@ export class Preferences {
 
 /** The mouth profile of this browser's user, which the gateway learned. */
 export class MouthProfileStore {
-  current = null; // { profile (base64), learntOn (ms since 1970), before, after } or null
+  current = null; // { profile (base64), learnedOn (ms since 1970), before, after } or null
   #stored;
 
   constructor(storage) {

@@ -146,7 +146,7 @@ def clips_seen(path: Path | None = None) -> frozenset[str]:
 
 
 def _clips_of(data: dict[str, Any]) -> frozenset[str]:
-    return frozenset((*data["learnt_from"], *data["chosen_with"]))
+    return frozenset((*data["learned_from"], *data["chosen_with"]))
 
 
 def _read(path: Path | None) -> dict[str, Any]:

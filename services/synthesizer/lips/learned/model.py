@@ -1,4 +1,4 @@
-"""Live learnt lips: predicted lip frames and phones in, mouth FAPs out.
+"""Live learned lips: predicted lip frames and phones in, mouth FAPs out.
 
     lip frames -> stabilize -> closures -> lip track -> transition -> rest
     phones -> dynamic visemes -> tongue
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.learnt.closures import (
+from kouxing.services.synthesizer.lips.learned.closures import (
     ClosingPhones,
     ClosureRule,
     close_lips,
@@ -35,8 +35,8 @@ from kouxing.services.synthesizer.lips.learnt.closures import (
     log_odds_of,
     separate_lips,
 )
-from kouxing.services.synthesizer.lips.learnt.rest import RestingLips, part_lips
-from kouxing.services.synthesizer.lips.learnt.track import HOLD_S, MAX_GAP_S, LipTrack
+from kouxing.services.synthesizer.lips.learned.rest import RestingLips, part_lips
+from kouxing.services.synthesizer.lips.learned.track import HOLD_S, MAX_GAP_S, LipTrack
 from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import (
     NO_TRANSITION,
@@ -70,7 +70,7 @@ _JITTER_SQUARED = np.array(
 
 
 @dataclass(frozen=True, slots=True)
-class LearntLips:
+class LearnedLips:
     """The lip model that uses predicted lip frames, with the tongue of the dynamic visemes."""
 
     amplitude_applies: ClassVar[bool] = False
@@ -78,15 +78,15 @@ class LearntLips:
     visemes: DynamicVisemes
     closures: ClosureRule = field(default_factory=ClosureRule)
 
-    def stream(self, start_s: float, *, frame_rate_hz: float, delay_s: float) -> LearntStream:
+    def stream(self, start_s: float, *, frame_rate_hz: float, delay_s: float) -> LearnedStream:
         """Start a session at rest, as ``LipModel.stream``."""
-        return LearntStream(
+        return LearnedStream(
             self.visemes, self.closures, start_s, frame_rate_hz=frame_rate_hz, delay_s=delay_s
         )
 
 
-class LearntStream:
-    """A session of learnt lips; implements ``LipStream``."""
+class LearnedStream:
+    """A session of learned lips; implements ``LipStream``."""
 
     def __init__(
         self,

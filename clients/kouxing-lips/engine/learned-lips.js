@@ -1,4 +1,4 @@
-// Learnt lips: lip frames and levels in, FAPs of the mouth out; services/synthesizer/lips/learnt has
+// Learned lips: lip frames and levels in, FAPs of the mouth out; services/synthesizer/lips/learned has
 // the rules in model.py and closures.py. The tongue stays at rest.
 
 import { ClosingPhones, logOddsOf } from "./closing-phones.js";
@@ -6,7 +6,7 @@ import { clamp, smoothStep } from "./math.js";
 import { RestingLips } from "./resting-lips.js";
 import { LipTrack, Transition, add, still } from "./trajectory.js";
 
-export class LearntLips {
+export class LearnedLips {
   #model;
   #neutral;
   #delayS;
@@ -57,14 +57,14 @@ export class LearntLips {
     this.#timeS = timeS;
     const { AJAR } = this.#model.constants.rest;
     const faps = this.#mouth.value.map((x, i) => x + ajar * (AJAR[i] - x));
-    for (const column of this.#model.constants.learnt.UNTRACKED) faps[column] = 0;
+    for (const column of this.#model.constants.learned.UNTRACKED) faps[column] = 0;
     return faps;
   }
 
   #followTrack(timeS) {
     const continues = this.#track.endS >= this.#timeS;
     this.#extendTrack(timeS);
-    const { TRANSITION_S, EPSILON } = this.#model.constants.learnt;
+    const { TRANSITION_S, EPSILON } = this.#model.constants.learned;
     if (!continues) {
       const now = this.#track.at(this.#timeS);
       if (isDifferent(this.#onTrack, now, EPSILON)) {
@@ -78,7 +78,7 @@ export class LearntLips {
 
   #extendTrack(timeS) {
     this.#track.forgetBefore(this.#timeS);
-    const oldestS = timeS - this.#model.constants.learnt.MEMORY_S;
+    const oldestS = timeS - this.#model.constants.learned.MEMORY_S;
     for (const phones of [this.#bilabials, this.#labiodentals]) phones.forgetBefore(oldestS);
     while (this.#queue.length && this.#track.endS < timeS) {
       const frame = this.#queue.shift();
@@ -90,7 +90,7 @@ export class LearntLips {
 
   /** Return the FAPs of the next lip frame, stabilized and with closures. */
   #stabilize(frame) {
-    const { JITTER_SQUARED, MAX_GAP_S, CLOSED_FRACTION, TEETH_LOG_ODDS } = this.#model.constants.learnt;
+    const { JITTER_SQUARED, MAX_GAP_S, CLOSED_FRACTION, TEETH_LOG_ODDS } = this.#model.constants.learned;
     const { closures } = this.#model.constants;
     const rule = this.#model.closureRule;
     if (frame.timeS - this.#track.endS <= MAX_GAP_S) {

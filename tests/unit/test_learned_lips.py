@@ -1,4 +1,4 @@
-"""Learnt lips follow lip frames smoothly, close for closures, and rest."""
+"""Learned lips follow lip frames smoothly, close for closures, and rest."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
-from kouxing.services.synthesizer.lips.learnt.model import LearntLips
-from kouxing.services.synthesizer.lips.learnt.rest import CLOSE_S, HOLD_S
+from kouxing.services.synthesizer.lips.learned.model import LearnedLips
+from kouxing.services.synthesizer.lips.learned.rest import CLOSE_S, HOLD_S
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange
@@ -39,7 +39,7 @@ def phone(symbol: str, onset_s: float, confidence: float = 0.95, index: int = 0)
 
 
 def speaking_face(lips: LipModel | None = None, delay_s: float = DELAY_S) -> FaceAnimator:
-    face = FaceAnimator(lips or LearntLips(LIPS), frame_rate_hz=50.0, delay_s=delay_s)
+    face = FaceAnimator(lips or LearnedLips(LIPS), frame_rate_hz=50.0, delay_s=delay_s)
     face.process(SpeechChange(active=True, time_s=0.0))
     return face
 
@@ -126,15 +126,17 @@ def test_prediction_and_phone_decide_a_closure_together(
 
 def test_dynamic_visemes_move_the_mouth_without_lip_frames() -> None:
     phones = [(0.4, phone("d", 0.35, index=0)), (0.5, phone("a", 0.42, index=1))]
-    learnt, visemes = (run(speaking_face(lips), 0.0, 0.6, nothing, phones) for lips in (None, LIPS))
-    assert values(learnt, JAW).max() > 50.0
-    assert np.corrcoef(values(learnt, JAW), values(visemes, JAW))[0, 1] > 0.99
+    learned, visemes = (
+        run(speaking_face(lips), 0.0, 0.6, nothing, phones) for lips in (None, LIPS)
+    )
+    assert values(learned, JAW).max() > 50.0
+    assert np.corrcoef(values(learned, JAW), values(visemes, JAW))[0, 1] > 0.99
 
 
-@pytest.mark.parametrize("to_learnt", [True, False])
-def test_changing_the_lip_model_is_continuous(to_learnt: bool) -> None:
-    models = (LIPS, LearntLips(LIPS))
-    first, second = models if to_learnt else models[::-1]
+@pytest.mark.parametrize("to_learned", [True, False])
+def test_changing_the_lip_model_is_continuous(to_learned: bool) -> None:
+    models = (LIPS, LearnedLips(LIPS))
+    first, second = models if to_learned else models[::-1]
     frames = []
     for changes in (True, False):
         face = FaceAnimator(first if changes else second, frame_rate_hz=240.0, delay_s=DELAY_S)

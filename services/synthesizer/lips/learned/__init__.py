@@ -1,4 +1,4 @@
-"""Learnt lips: predicted from the audio, with closures and tongue from recognized phones."""
+"""Learned lips: predicted from the audio, with closures and tongue from recognized phones."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:  # importing NumPy would slow down every command
 def _load(inventory: PhoneInventory) -> LipModel:
     from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
     from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-    from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+    from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 
-    return LearntLips(DynamicVisemes(load_parameters(), inventory))
+    return LearnedLips(DynamicVisemes(load_parameters(), inventory))
 
 
 LIP_MODEL = LipModelInfo(
