@@ -138,7 +138,9 @@ function isOwnSession() {
 
 /** Return the lip model for new sessions, or null for the default. Only "learned" uses a profile. */
 function chosenLipModel() {
-  return preferences.get("lips") ?? (mouthProfiles.current === null ? null : "learned");
+  const chosen = preferences.get("lips");
+  if (chosen in offers.lips) return chosen; // a stored name may no longer exist
+  return mouthProfiles.current === null ? null : "learned";
 }
 
 function showLipModel() {
