@@ -28,6 +28,11 @@ class AudioQueue:
         """Duration of the queued audio. Each chunk counts as at least 1 ms, also an empty one."""
         return max(self._num_samples / self._rate_hz, _MIN_CHUNK_S * len(self._chunks))
 
+    @property
+    def media_time(self) -> int:
+        """Media time of the oldest queued sample; there must be a chunk."""
+        return self._chunks[0][0]
+
     def append(self, chunk: Chunk, now_s: float) -> None:
         """Add a chunk that has arrived."""
         media_time, samples = chunk

@@ -76,15 +76,15 @@ class LiveBatches:
     def decode(self, sessions: Sequence[RecognizerSession]) -> None:
         """Decode a part of the queued audio of sessions; skip audio that is too old.
 
-        The network's thread decodes sessions that need the block network. Until it finishes,
-        their later audio stays queued. Under load, their lips are sent before it finishes.
+        The network's thread decodes sessions that need the block network. Under load, their lips
+        are sent before it finishes. Otherwise, their later audio waits in the queue.
         """
         # Under load, the network runs at the longest hop, and on another core.
         network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
         if decoded := self._network.take_decoded():
             self._busy.add(network_weight * self._network.batch_s)
             self._on_decoded(decoded)
-        sessions = [session for session in sessions if session.audio and not session.is_scoring]
+        sessions = [session for session in sessions if session.can_accept]
         now_s = time.monotonic()
         if sessions:
             is_behind = any(session.audio.overload.is_behind for session in sessions)
@@ -96,7 +96,7 @@ class LiveBatches:
             for session in group:
                 session.accept_waveform(part_s, now_s, self._pace.hop)
             self._recognizer.run_encoder([session.stream for session in group])
-            if len(self._all) <= 1:  # no other session waits
+            if len(self._all) <= 1 and not group[0].is_scoring:  # no other session waits
                 network_s = BlockRunner.run_s
                 self._decode(group)
                 self._busy.add((network_weight - 1.0) * (BlockRunner.run_s - network_s))
@@ -106,15 +106,16 @@ class LiveBatches:
         self._on_batch()
 
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
-        self._recognizer.decode_streams([session.stream for session in sessions])
+        self._recognizer.decode_found([session.stream for session in sessions])
         self._on_decoded(sessions)
 
     def _waits_for_network(self, session: RecognizerSession) -> bool:
         """Queue a session for the block network if needed; under load, send its lips first."""
-        if not self._recognizer.needs_network(session.stream):
+        if not (session.is_scoring or self._recognizer.needs_network(session.stream)):
             return False
-        if self._pace.hop > 1:
+        if session.is_scoring or self._pace.hop > 1:
             session.stream.decode_early()
             self._on_early(session)
-        self._network.add(session, time.monotonic())
+        if not session.is_scoring:
+            self._network.add(session, time.monotonic())
         return True

@@ -15,7 +15,8 @@ MAX_WAIT_S = 0.02  # longest wait for more sessions, to save processor time
 class NetworkThread:
     """Decodes sessions whose next audio is due for the block network (``is_due``).
 
-    While a session is on the thread (``is_scoring``), its stream must not be used elsewhere.
+    While a session is on the thread (``is_scoring``), other threads may only use its stream as
+    ``SpeechStream.start_scoring`` describes, so that lips do not wait for the network.
 
     Parameters
     ----------
@@ -56,6 +57,7 @@ class NetworkThread:
         self._batch, self._due = self._due[:MAX_SESSIONS], self._due[MAX_SESSIONS:]
         for session in self._batch:
             session.is_due, session.is_scoring = False, True
+            session.stream.start_scoring()
         streams = [session.stream for session in self._batch]
         self._job = self._executor.submit(self._decode, streams)
         self._job.add_done_callback(lambda _: self._on_decoded())
@@ -68,6 +70,7 @@ class NetworkThread:
         self._job = None
         for session in self._batch:
             session.is_scoring = False
+            session.stream.finish_scoring()
         return self._batch
 
     def wait(self) -> None:
@@ -77,6 +80,6 @@ class NetworkThread:
 
     def _decode(self, streams: Sequence[SpeechStream]) -> None:
         start_s = time.thread_time()
-        self._recognizer.decode_streams(streams)
+        self._recognizer.decode_found(streams)
         self.batch_s = time.thread_time() - start_s
         self.work_s += self.batch_s

@@ -16,7 +16,7 @@ from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import run_encoder, score_streams
+from kouxing.services.recognizer.speech_scorer import run_encoder, score_found
 from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
@@ -106,7 +106,12 @@ class Recognizer:
 
     def decode_streams(self, streams: Sequence[SpeechStream]) -> None:
         """Decode all audio that the streams have accepted; the model scores it in batches."""
-        score_streams([scorer for stream in streams for scorer in stream.scorers])
+        self.run_encoder(streams)
+        self.decode_found(streams)
+
+    def decode_found(self, streams: Sequence[SpeechStream]) -> None:
+        """Decode the speech that ``run_encoder`` has found."""
+        score_found([scorer for stream in streams for scorer in stream.scorers])
         for stream in streams:
             stream.decode()
 

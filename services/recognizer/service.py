@@ -289,7 +289,7 @@ class RecognizerService(Service):
     @property
     def _has_live_audio(self) -> bool:
         sessions = self._sessions.values()
-        return any(one.audio and one.start.paced and not one.is_scoring for one in sessions)
+        return any(one.start.paced and one.can_accept for one in sessions)
 
     @property
     def _has_unpaced_audio(self) -> bool:

@@ -201,17 +201,29 @@ class RecognizerSession:
         aligned = self.resumption.align((media_time, samples), rate_hz)
         return aligned if len(aligned[1]) else None
 
+    @property
+    def can_accept(self) -> bool:
+        """Whether there is queued audio that the stream may take now."""
+        if not self.audio:
+            return False
+        return not self.is_scoring or self.stream.can_continue(self.audio.media_time)
+
     def accept_waveform(self, max_s: float, now_s: float, hop: int) -> None:
         """Pass up to ``max_s`` of queued audio to the stream. Skip audio that is too old.
 
-        ``hop`` is the hop of the block network, in blocks.
+        ``hop`` is the hop of the block network, in blocks. During scoring, it does not change, and
+        nothing is skipped.
         """
         self.accepted_s = now_s
-        self.stream.set_hop(hop)
-        has_skipped = self.audio.skip_old(now_s)
-        is_light = self.face.settings.acoustic == AcousticModelName.LIGHT
-        self.stream.set_light(is_light or self.audio.overload.needs_light_model(now_s))
-        for media_time, samples in self.audio.take(max_s):
+        has_skipped = False
+        if not self.is_scoring:
+            self.stream.set_hop(hop)
+            has_skipped = self.audio.skip_old(now_s)
+            is_light = self.face.settings.acoustic == AcousticModelName.LIGHT
+            self.stream.set_light(is_light or self.audio.overload.needs_light_model(now_s))
+        chunks = self.audio.take(max_s)
+        while self.can_accept and (chunk := next(chunks, None)) is not None:
+            media_time, samples = chunk
             if has_skipped:
                 self.stream.skip_to(media_time)
                 has_skipped = False

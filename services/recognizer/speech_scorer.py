@@ -68,7 +68,7 @@ class SpeechScorer:
     """Scores the speech of one session.
 
     ``accept_waveform`` queues the audio. ``run_encoder`` finds the speech in it and
-    ``score_streams`` scores the speech, together with other sessions' audio. ``get_events`` returns
+    ``score_found`` scores the speech, together with other sessions' audio. ``get_events`` returns
     the results in order.
 
     For the other parameters, see :class:`SpeechSegmenter`.
@@ -92,6 +92,7 @@ class SpeechScorer:
         self._needs_light = False  # whether the light model scores the next speech
         # Frames to score, and events in order. The first item is to be scored; SpeechEnd is too.
         self._queue: deque[SpeechFrames | ScoreEvent] = deque()
+        self._found = self._queue  # takes what the encoder finds; another one during scoring
         self._events: list[ScoreEvent] = []  # not yet returned
         self._num_unscored = 0  # frames of the current speech without settled scores
 
@@ -148,13 +149,14 @@ class SpeechScorer:
                 return item
             self._encoder_queue.popleft()
             if item is None:
-                self._queue.extend(self._segmenter.input_finished())
+                self._found.extend(self._segmenter.input_finished())
             elif isinstance(item, _Slice):
                 traits = self._segmenter.traits._asdict()
-                self._queue.append(replace(item.progress, **traits))
+                self._found.append(replace(item.progress, **traits))
             else:
-                self._queue.append(item)
-        self._release_events()
+                self._found.append(item)
+        if self._found is self._queue:
+            self._release_events()
         return None
 
     @property
@@ -165,12 +167,33 @@ class SpeechScorer:
     def add_encoder_output(self, position: Position, output: EncoderOutput) -> None:
         """Add the output of the encoder at ``next_position``."""
         self._encoder_queue.popleft()
-        self._queue.extend(self._segmenter.process(position, output))
+        self._found.extend(self._segmenter.process(position, output))
+
+    def start_scoring(self) -> bool:
+        """Let another thread score the speech so far; return whether more audio may follow now.
+
+        If so, ``run_encoder`` and ``release_early`` process only audio that follows, until
+        ``finish_scoring``. Queued events prevent this, because their order would change.
+        """
+        if all(isinstance(item, SpeechFrames) for item in self._queue):
+            self._found = deque()
+        return self._found is not self._queue
+
+    def finish_scoring(self) -> None:
+        """Score further speech on this thread."""
+        if self._found is not self._queue:
+            self._queue.extend(self._found)
+            self._found = self._queue
 
     @property
     def is_ready(self) -> bool:
         """Whether there is audio to score."""
-        return bool(self._queue or self._encoder_queue)
+        return self.has_found or bool(self._encoder_queue)
+
+    @property
+    def has_found(self) -> bool:
+        """Whether there is speech to score, or its end."""
+        return bool(self._queue)
 
     @property
     def model(self) -> AcousticModel:
@@ -191,16 +214,18 @@ class SpeechScorer:
                 self._stream = (self._needs_light and self._light) or self._own
                 self._num_unscored = 0
 
-    def release_early(self) -> None:
-        """Make the lip frames and levels of unscored speech available before its phones."""
+    def release_early(self) -> list[EarlyEvent]:
+        """Return the lip frames and levels of unscored speech before its phones."""
         unscored: list[SpeechFrames] = []
-        while self._queue and isinstance(item := self._queue[0], SpeechFrames | EarlyEvent):
-            self._queue.popleft()
+        early: list[EarlyEvent] = []
+        while self._found and isinstance(item := self._found[0], SpeechFrames | EarlyEvent):
+            self._found.popleft()
             if isinstance(item, SpeechFrames):
                 unscored.append(item)
             else:
-                self._events.append(item)
-        self._queue.extendleft(reversed(unscored))
+                early.append(item)
+        self._found.extendleft(reversed(unscored))
+        return early
 
     def next_request(self) -> ScoreRequest:
         """Return the audio to score next."""
@@ -234,7 +259,12 @@ def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:
     """Score the queued audio of several sessions, in one batch for each model."""
     run_encoder(scorers)
-    while ready := [scorer for scorer in scorers if scorer.is_ready]:
+    score_found(scorers)
+
+
+def score_found(scorers: Sequence[SpeechScorer]) -> None:
+    """Score the speech that ``run_encoder`` has found, in one batch for each model."""
+    while ready := [scorer for scorer in scorers if scorer.has_found]:
         model = ready[0].model
         batch = [scorer for scorer in ready if scorer.model is model]
         scores = model.score([scorer.next_request() for scorer in batch])

@@ -8,6 +8,8 @@ them without loss.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.front_end.features import frame_at
 from kouxing.services.recognizer.front_end.pcm import SliceMeter
@@ -66,6 +68,7 @@ class SpeechStream:
         self._next_index = 0
         self._is_speaking = False
         self._results: list[StreamOutput] = []  # not yet returned
+        self._early: list[StreamOutput] | None = None  # the same during scoring on another thread
         self._segments = [self._new_segment(0)]  # those with results to come; the last takes audio
 
     @property
@@ -114,7 +117,7 @@ class SpeechStream:
             media_time = self.next_media_time
         if self._first_chunk is None:
             self._start_at(media_time)
-        elif media_time > self.next_media_time + MAX_JITTER:
+        elif self._is_gap_before(media_time):
             self.num_gaps += 1
             self._segments[-1].input_finished()
             self._start_at(media_time)
@@ -154,14 +157,40 @@ class SpeechStream:
 
     def decode_early(self) -> None:
         """Return the lip frames and levels of unscored speech before its phones."""
-        if len(self._segments) == 1:
-            self._segments[0].scorer.release_early()
+        if self._early is not None:
+            self._early += self._segments[0].decode_early()
+        elif len(self._segments) == 1:
             self.decode()
+            self._results += self._segments[0].decode_early()
+
+    def start_scoring(self) -> None:
+        """Let another thread decode the speech that was found, until ``finish_scoring``.
+
+        In the meantime, ``take_results`` returns only results of ``decode_early``. The stream may
+        take further audio if ``can_continue``, and no other calls.
+        """
+        if len(self._segments) == 1 and self._segments[0].scorer.start_scoring():
+            self._early = []
+
+    def finish_scoring(self) -> None:
+        """Use the stream as usual again."""
+        self._segments[0].scorer.finish_scoring()
+        self._early = None
+
+    def can_continue(self, media_time: int) -> bool:
+        """Return whether the stream may take audio from this time on during scoring."""
+        return self._early is not None and not self._is_gap_before(media_time)
 
     def take_results(self) -> list[StreamOutput]:
         """Return the results since the last call."""
+        if self._early is not None:
+            early, self._early = self._early, []
+            return early
         results, self._results = self._results, []
         return results
+
+    def _is_gap_before(self, media_time: int) -> bool:
+        return media_time > self.next_media_time + MAX_JITTER
 
     def _renumber(self, phone: Phone, segment: _AudioSegment) -> Phone:
         """Continue the phone indices of the previous segments."""
@@ -232,9 +261,16 @@ class _AudioSegment:
 
     def decode(self) -> list[StreamOutput]:
         """Return the new results at the session's times, without lip frames before the audio."""
+        return self._to_session_times(self._decoder.decode(self.scorer.get_events()))
+
+    def decode_early(self) -> list[StreamOutput]:
+        """Return the lip frames and levels of unscored speech, as ``decode`` would later."""
+        return self._to_session_times(self.scorer.release_early())
+
+    def _to_session_times(self, results: Iterable[StreamOutput]) -> list[StreamOutput]:
         return [
             self._to_session_time(result)
-            for result in self._decoder.decode(self.scorer.get_events())
+            for result in results
             if not (isinstance(result, LipPositions) and result.time_s < 0.0)
         ]
 

@@ -16,6 +16,13 @@ class FakeSession:
     def __init__(self) -> None:
         self.is_due = self.is_scoring = False
         self.stream = self
+        self.num_scored = 0
+
+    def start_scoring(self) -> None:
+        assert self.is_scoring
+
+    def finish_scoring(self) -> None:
+        self.num_scored += 1
 
 
 class FakeRecognizer:
@@ -25,7 +32,7 @@ class FakeRecognizer:
         self.batches: list[Sequence[Any]] = []
         self.error: Exception | None = None
 
-    def decode_streams(self, streams: Sequence[Any]) -> None:
+    def decode_found(self, streams: Sequence[Any]) -> None:
         self.batches.append(streams)
         if self.error is not None:
             raise self.error
@@ -64,6 +71,7 @@ def test_decodes_waiting_sessions_once_and_in_order(
     thread.start(0.0)
     assert decoded(thread) == sessions[MAX_SESSIONS:]
     assert not any(session.is_due or session.is_scoring for session in sessions)
+    assert [cast(FakeSession, session).num_scored for session in sessions] == [1] * len(sessions)
     assert [len(batch) for batch in recognizer.batches] == [MAX_SESSIONS, 1]
 
 

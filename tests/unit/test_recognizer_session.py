@@ -94,6 +94,28 @@ class PacedClient:
         return True
 
 
+def test_audio_after_a_gap_waits_for_the_end_of_scoring() -> None:
+    session = make_session(sample_rate_hz=16_000)
+    samples = samples_of_file(VOWELS_FILE)[:9600]
+    session.audio.append((0, samples[:3200]), 0.0)
+    session.accept_waveform(1.0, 0.0, hop=1)
+    RECOGNIZER.decode_streams([session.stream])
+    session.is_scoring = True
+    session.stream.start_scoring()
+    session.audio.append((3200, samples[3200:6400]), 0.0)
+    session.audio.append((16_000, samples[6400:]), 0.0)
+    session.accept_waveform(1.0, 0.0, hop=1)
+    assert session.stream.media_time == 6400
+    assert session.audio
+    assert not session.can_accept
+    session.is_scoring = False
+    session.stream.finish_scoring()
+    assert session.can_accept
+    session.accept_waveform(1.0, 0.0, hop=1)
+    assert session.stream.media_time == 19_200
+    assert not session.can_accept
+
+
 def test_reports_the_acoustic_model_in_use() -> None:
     session = make_session(sample_rate_hz=16_000)
     samples = samples_of_file(VOWELS_FILE)[7_000:]

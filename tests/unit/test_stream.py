@@ -177,6 +177,64 @@ def test_lips_may_be_early_and_phones_are_the_same() -> None:
         assert same[0] == same[1]
 
 
+def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
+    outputs: list[list[StreamOutput]] = []
+    num_early = 0
+    for continues in (False, True):
+        recognizer = Recognizer(MODEL)
+        stream = recognizer.create_stream(**FACE)
+        stream.set_hop(4)
+        results: list[StreamOutput] = []
+        is_scoring = False
+        for begin in range(0, len(SAMPLES), 320):
+            stream.accept_waveform(SAMPLES[begin : begin + 320])
+            recognizer.run_encoder([stream])
+            if is_scoring:  # the other thread finishes after the next chunk
+                stream.decode_early()
+                early = recognizer.get_result(stream)
+                num_early += len(of_kind(LipPositions, early))
+                results += early
+                recognizer.decode_found([stream])
+                stream.finish_scoring()
+                recognizer.run_encoder([stream])
+            elif recognizer.needs_network(stream):
+                stream.decode_early()
+                results += recognizer.get_result(stream)
+                if continues:
+                    stream.start_scoring()
+            is_scoring = stream.can_continue(stream.next_media_time)
+            if not is_scoring:
+                recognizer.decode_found([stream])
+                results += recognizer.get_result(stream)
+        outputs.append(results)
+    assert num_early > 5
+    for kind in (Phone, LipPositions, Progress, SpeechChange):
+        same = [messages_of(of_kind(kind, results)) for results in outputs]
+        assert same[0]
+        assert same[0] == same[1]
+
+
+def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
+    recognizer = Recognizer(MODEL)
+    stream = recognizer.create_stream(**FACE)
+    stream.set_hop(4)
+    recognizer.decode_streams([stream])
+    begin = 0
+    while not recognizer.needs_network(stream):
+        stream.accept_waveform(SAMPLES[begin : begin + 320])
+        recognizer.run_encoder([stream])
+        begin += 320
+    stream.start_scoring()
+    assert not stream.can_continue(begin)  # the lips of this audio are not sent yet
+    stream.finish_scoring()
+    stream.decode_early()
+    stream.start_scoring()
+    assert stream.can_continue(begin)
+    assert not stream.can_continue(begin + MAX_JITTER + 1)
+    stream.finish_scoring()
+    assert not stream.can_continue(begin)
+
+
 def test_a_longer_hop_changes_only_the_phones() -> None:
     expected = recognize_live(MODEL, SAMPLES, 320, **FACE)
     stream = LiveStream(MODEL, **FACE)
