@@ -34,6 +34,27 @@ _LIKE_REAL = {  # measures that are best when they equal the value of real lips
     "phone_spread": "spread",
     "turns_per_s": "number of turns per second",
 }
+_CLOSURE_COLUMNS = {  # measures by title
+    "F1": "closure_f1",
+    "recall": "closure_recall",
+    "precision": "closure_precision",
+    "b p m": "precision_bpm",
+    "a e i": "precision_aei",
+    "u o": "precision_uo",
+    "pauses": "precision_pause",
+    "closed at b p m": "labials_shut",
+    "closed in speech": "share_shut",
+}
+_MOTION_COLUMNS = {  # measures and formats by title
+    "lag, ms": ("lag_ms", ".0f"),
+    "MTM, ms": ("mtm_ms", ".0f"),
+    "SLCC": ("slcc", ".2f"),
+    "effort": ("effort_correlation", ".2f"),
+    "opening at rest": ("rest_opening", ".0f"),
+    "closed after, ms": ("closing_time_ms", ".0f"),
+    "spread": ("phone_spread", ".0f"),
+    "turns per s": ("turns_per_s", ".1f"),
+}
 _MEASURE_NAMES = {name: title for name, (title, _) in _COMPARED.items()} | _LIKE_REAL
 _NAMES = {
     "headaudio": "HeadAudio 0.1.0",
@@ -123,58 +144,17 @@ def _format_measure(measure: str, value: float | None) -> str:
 
 
 def closures(results: Results) -> Table:
-    """Return recall and precision of closures, also by class of phones."""
-    columns = (
-        "face, delay",
-        "F1",
-        "recall",
-        "precision",
-        "b p m",
-        "a e i",
-        "u o",
-        "pauses",
-        "closed at b p m",
-        "closed in speech",
-    )
-    measures = (
-        "closure_f1",
-        "closure_recall",
-        "closure_precision",
-        *(f"precision_{name}" for name in ("bpm", "aei", "uo", "pause")),
-        "labials_shut",
-        "share_shut",
-    )
-    return columns, [
-        [title, *(percent(scores.get(measure), ".0f") for measure in measures)]
+    """Return recall and precision of closures in percent, also by class of phones."""
+    return ("face, delay", *_CLOSURE_COLUMNS), [
+        [title, *(percent(scores.get(name), ".0f") for name in _CLOSURE_COLUMNS.values())]
         for title, scores in _all_faces(results)
     ]
 
 
 def motion(results: Results) -> Table:
     """Return timing, effort and rest of the faces, and of real lips."""
-    columns = (
-        "face, delay",
-        "lag, ms",
-        "MTM, ms",
-        "SLCC",
-        "effort",
-        "opening at rest",
-        "closed after, ms",
-        "spread",
-        "turns per s",
-    )
-    forms = {
-        "lag_ms": ".0f",
-        "mtm_ms": ".0f",
-        "slcc": ".2f",
-        "effort_correlation": ".2f",
-        "rest_opening": ".0f",
-        "closing_time_ms": ".0f",
-        "phone_spread": ".0f",
-        "turns_per_s": ".1f",
-    }
-    return columns, [
-        [title, *(format_number(scores.get(measure), form) for measure, form in forms.items())]
+    return ("face, delay", *_MOTION_COLUMNS), [
+        [title, *(format_number(scores.get(name), form) for name, form in _MOTION_COLUMNS.values())]
         for title, scores in _all_faces(results)
     ]
 
