@@ -7,7 +7,7 @@ FAPs of a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face ri
 
 Every clip belongs to one split: training (``train``), choosing settings (``choice``), or scoring
 (``held``). The rule `split_of` decides, so clips cannot be picked by hand. ``held.txt`` in the
-folder names further clips and speakers to hold out.
+folder names additional clips and speakers to hold out.
 """
 
 import csv

@@ -39,7 +39,7 @@ BLOCK_S = 0.02
 CLIPPED_LEVEL = 0.999
 CLIPPED_FRACTION = 0.01  # fraction of the samples; the user is warned above it
 _MIN_MISSING_S = 0.05  # a file that lacks more is reported as cut off
-_MAX_SPOOLED_BYTES = 64 << 20  # for a pipe that must be read to its end first; more goes to a file
+_MAX_SPOOLED_BYTES = 64 << 20  # in memory, for a pipe that must be read completely
 MAX_FILE_BYTES = 8 << 30
 MAX_DURATION_S = 3 * 3600.0  # limit for a recording that is held in memory
 _PIPE = Path("-")
@@ -55,7 +55,7 @@ class AudioSource:
     duration_s: float | None  # None: not known
     blocks: Iterator[Samples]
     warnings: list[str] = field(default_factory=list)  # problems; complete after the last block
-    is_live: bool = False  # it arrives in real time
+    is_live: bool = False  # the pipe is read in real time
     notices: list[str] = field(default_factory=list)  # messages to print before reading
 
 

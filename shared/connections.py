@@ -51,7 +51,7 @@ MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # all connections together; libzmq takes up to 120 times as much memory
 PENALTY_S = 1.0  # a disconnected peer cannot connect again for this time
-LONG_PENALTY_S = 3.0  # if no well-behaved peer could have done what it did
+LONG_PENALTY_S = 3.0  # after behavior that no well-behaved peer shows
 TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
@@ -99,7 +99,7 @@ class Connection:
         self.topics: set[bytes] = set()
         self.is_disconnected = False
         self.undelivered = 0  # bytes since the last delivered message
-        self.incomplete = 0  # bytes of them that belong to an incomplete message, at least
+        self.incomplete = 0  # minimum number of these bytes that belong to an incomplete message
         self.unread = 0  # messages that may wait for the peer, at most
         self._delivered_before = 0
         self._read_before = 0  # bytes, when num_delivered last changed
@@ -357,7 +357,7 @@ class ConnectionLimiter:
         self._tarpit.release(now_s)
         connections = []
         for connection in list(self._connections.values()):
-            if connection.is_disconnected:  # its peer keeps sending, or does not let libzmq read
+            if connection.is_disconnected:  # the peer keeps sending, or blocks libzmq
                 kernel_sockets.reset(connection.descriptor, connection.inode)
             else:
                 connections.append(connection)

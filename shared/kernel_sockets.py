@@ -125,7 +125,7 @@ def _shut_down(connection: socket.socket, how: int) -> None:
     with contextlib.suppress(OSError):  # closed already
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         connection.shutdown(how)
-        while connection.recv_into(_SINK, 0, _DISCARD):  # or libzmq would read it
+        while connection.recv_into(_SINK, 0, _DISCARD):  # otherwise libzmq would read the data
             pass
 
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 CONTROL = "control"
 CLIENT = "client"
 CLIENT_ROLES = ("client", "operator")  # roles of the user of control's machine
-MAX_KEYS = 1000  # with MAX_ROLES, what fits in one message from control
+MAX_KEYS = 1000  # with MAX_ROLES each, the keys fit in one message from control
 MAX_ROLES = 16  # limit for a key
 MAX_KEY_SHARE = 0.75  # fraction of the sessions, videos and connections that one key can have
 _MAX_ALLOWED_BYTES = 768 * 1024
@@ -55,7 +55,7 @@ class Peer:
 
     address: bytes = b""  # ROUTING_ID
     key: str = ""  # authenticated public key, empty without encryption
-    connection: int = field(default=0, compare=False)  # 0: it has ended
+    connection: int = field(default=0, compare=False)  # 0: the connection has ended
 
 
 NO_PEER = Peer()

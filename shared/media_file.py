@@ -28,7 +28,7 @@ from kouxing.shared.sound_formats import (
 _MAX_STREAMS = 64
 _MAX_RATE_HZ = 1_000_000
 OPTIONS = {"protocol_whitelist": "none"}  # no network access, and no files from playlists
-# A pipe's first frame is decoded as soon as its bytes are there.
+# A pipe's first frame is decoded as soon as its bytes arrive.
 _PIPE_OPTIONS = OPTIONS | {"probesize": "512", "formatprobesize": "8192"}
 _PACKET_OPTIONS = _PIPE_OPTIONS | {"probesize": "4096"}  # with the list of tracks
 _JITTER_S = 0.05  # timestamps that differ less from the number of samples are inexact

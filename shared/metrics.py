@@ -96,8 +96,8 @@ def memory_mb() -> float:
 def use_single_malloc_arena() -> None:
     """Let all threads share one glibc arena. Call this before starting threads.
 
-    ``trim_heap`` cannot release memory at the end of further arenas, such as the arenas of ZeroMQ's
-    threads.
+    ``trim_heap`` cannot release memory at the end of additional arenas, such as the arenas of
+    ZeroMQ's threads.
     """
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
@@ -120,11 +120,11 @@ class LoadMeter:
         self._marks = deque([(now_s, 0.0)])  # times, and the total of working time until then
 
     def start_working(self, now_s: float) -> None:
-        """Note that the loop starts to work."""
+        """Record that the loop starts to work."""
         self._changed_s, self._works = now_s, True
 
     def start_waiting(self, now_s: float) -> None:
-        """Note that the loop starts to wait."""
+        """Record that the loop starts to wait."""
         self._busy_s = self._busy_at(now_s)
         self._changed_s, self._works = now_s, False
 

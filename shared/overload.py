@@ -114,8 +114,8 @@ class SkipPolicy:
         self._start_s = start_s
         self._due_s: float | None = None  # when the newest audio was due; None: on arrival
         self._late_since_s = math.inf  # when the session exceeded its limit
-        self.is_behind = False  # so that the block network should run less often
-        self._light_until_s = -math.inf  # when it has been on time for a while
+        self.is_behind = False  # far enough to run the block network less often
+        self._light_until_s = -math.inf  # end of the use of the light model
         self._reported_s, self._report_due_s = 0.0, -math.inf  # part of skipped_s; next report
 
     def add(self, duration_s: float, now_s: float, *, has_waiting: bool) -> None:

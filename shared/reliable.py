@@ -31,7 +31,7 @@ class ReliableSender:
         self._session = session
         self.epoch = epoch
         self._next = 1
-        self.unacknowledged: deque[Message] = deque()  # oldest first; their owner limits them
+        self.unacknowledged: deque[Message] = deque()  # oldest first; the owner limits their number
         self._waiting: list[Message] = []  # to be sent together
         self._progress_s = 0.0
 

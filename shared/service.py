@@ -93,7 +93,7 @@ class Service(MessageLoop):
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # endpoints that it provides, by name
         self.facts = SessionFacts()  # about the sessions that it serves
-        self.languages: list[str] = []  # further languages that its sessions may choose
+        self.languages: list[str] = []  # additional languages that its sessions may choose
         self.tick_callbacks: set[Callable[[], float]] = set()  # as `on_tick`
         self._exit_requested = False
         self._hand_over_end_s = 0.0
@@ -153,11 +153,11 @@ class Service(MessageLoop):
         return ()
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Return, for each session, how far its input is processed."""
+        """Return the input progress of each session."""
         return {}
 
     def gauges(self) -> dict[str, float]:
-        """Return further figures by name, for heartbeats and Prometheus."""
+        """Return additional figures by name, for heartbeats and Prometheus."""
         return {}
 
     def deliver_heartbeat(self, heartbeat: Heartbeat) -> None:

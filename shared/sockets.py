@@ -24,10 +24,10 @@ from kouxing.shared.wire.session import Error, Joined
 from kouxing.shared.zap import Zap
 
 ERROR_COST = 4.0  # a message that is answered with an error takes this from the sender's budget
-ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report has 15 MB
+ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report is 15 MB
 MAX_PARTS = 4
 MAX_DROPPED = 20_000  # parts of one message, before other sockets get their turn
-MAX_FOLLOWED = 4096  # subscriptions; with more, messages are also encoded for nobody
+MAX_FOLLOWED = 4096  # subscriptions; with more, every message is encoded
 MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
 T = TypeVar("T", int, str)
 _MORE, _READABLE = zmq.DONTWAIT | zmq.SNDMORE, int(zmq.POLLIN)
@@ -57,7 +57,7 @@ class Socket:
         self.raw = raw
         self._key = key
         self._zap = zap  # for a socket that is bound with a key
-        self._limited = limited  # if it is bound
+        self._limited = limited  # if the socket is bound
         self._routes = routes
         self._publishes = publishes
         self._on_joined = on_joined
@@ -67,7 +67,7 @@ class Socket:
         self._unread_parts_from: Connection | None = None
         self._name = secrets.token_hex(8)
         self._followed: set[bytes] = set()  # subscriptions, now or before
-        self._prefixes: tuple[bytes, ...] = ()  # those that are not a whole topic
+        self._prefixes: tuple[bytes, ...] = ()  # prefixes that are not a whole topic
 
     @property
     def endpoint(self) -> str:
@@ -103,7 +103,7 @@ class Socket:
         return True
 
     def _is_followed(self, label: bytes) -> bool:
-        """Return whether a topic may have a subscriber. Encoding for nobody takes time."""
+        """Return whether a topic may have a subscriber. Otherwise encoding is unnecessary."""
         return label in self._followed or label.startswith(self._prefixes)
 
     def _follow(self, subscription: bytes) -> None:
@@ -180,7 +180,7 @@ class Socket:
             self._limited.disconnect_stalled(topics)
 
     def note_empty(self) -> None:
-        """Note that all complete messages have been received."""
+        """Record that all complete messages have been received."""
         if self._limited is not None:
             self._limited.num_polls += 1
 
@@ -299,7 +299,7 @@ class Poller:
     def __init__(self) -> None:
         self._poller = zmq.Poller()
         self._sockets: dict[zmq.Socket[bytes], Socket] = {}
-        self._quiet: set[zmq.Socket[bytes]] = set()  # those that end no `wait`
+        self._quiet: set[zmq.Socket[bytes]] = set()  # sockets that do not end `wait`
         self.waker = Waker()  # ends each `wait` until it is cleared
         self._poller.register(self.waker.descriptor, zmq.POLLIN)
 

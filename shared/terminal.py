@@ -135,7 +135,7 @@ def check_output(
     """Check that output files can be written. Call this before long work; None is skipped.
 
     Asks whether to overwrite a file, unless ``force`` is set. Raises ``UserError`` if a file cannot
-    be written, exists and nobody can be asked, or is also one of the ``inputs``.
+    be written, exists and there is no terminal to ask on, or is also one of the ``inputs``.
     """
     sources = [source for source in inputs if source is not None and _exists(source)]
     for path in paths:
@@ -162,7 +162,7 @@ def check_output(
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except (OSError, ValueError):  # it cannot be the name of a file
+    except (OSError, ValueError):  # not a valid file name
         return False
 
 

@@ -73,7 +73,7 @@ export interface SpeakerOptions {
   numChannels?: 1 | 2;
   /** of pushed bytes and of the messages; default "s16le" */
   encoding?: "s16le" | "f32le";
-  /** audio may come faster than real time, such as text-to-speech; it is played in real time */
+  /** audio may arrive faster than real time, such as text-to-speech; it is played in real time */
   ahead?: boolean;
   /** the speaker's mouth profile, base64 */
   mouthProfile?: string;
@@ -89,7 +89,7 @@ export class Speaker {
   private constructor();
   static open(gateway: string, options?: SpeakerOptions): Promise<Speaker>;
   readonly session: string;
-  /** Send interleaved audio. Await it if audio comes faster than real time. */
+  /** Send interleaved audio. Await it if audio arrives faster than real time. */
   push(audio: Int16Array | Float32Array | Uint8Array | ArrayBuffer): Promise<void>;
   /** Interrupt: drop audio whose face is not shown yet. The face returns to rest. */
   flush(): void;

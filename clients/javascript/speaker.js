@@ -58,7 +58,7 @@ export class Speaker {
   }
 
   /**
-   * Send audio. If it comes faster than real time, wait for the promise before the next call.
+   * Send audio. If it arrives faster than real time, wait for the promise before the next call.
    *
    * @param audio interleaved: Int16Array, Float32Array from -1 to 1, or bytes of PCM in the session's
    *   encoding

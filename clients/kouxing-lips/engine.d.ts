@@ -66,7 +66,7 @@ export class LipEngine {
   readonly names: Partial<Record<ShapeSetName, string[]>>;
   /** Duration of the audio so far, seconds. */
   readonly inputS: number;
-  /** Take samples, mono in [-1, 1]; return the frames that are due, 50 per second. */
+  /** Accept samples, mono in [-1, 1]; return the frames that are due, 50 per second. */
   push(samples: Float32Array): LipFrame[];
   /** Phones that the last push() or finish() found or changed. */
   readonly newPhones: LipPhone[];

@@ -3,7 +3,7 @@
 const MAX_S = 60; // older frames are dropped
 
 export class FrameTrack {
-  #frames = []; // times rise
+  #frames = []; // by ascending time
 
   /** Append frames { timeS, faps, ... } of the engine. */
   push(frames) {

@@ -41,7 +41,7 @@ export class LipSync extends EventTarget {
   listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;
   /** Start a session for push(). */
   open(sampleRateHz: number): Promise<void>;
-  /** Take PCM, mono in [-1, 1]; it may come faster than real time. */
+  /** Accept PCM, mono in [-1, 1]. It may arrive faster than real time. */
   push(samples: Float32Array): void;
   /** End pushed audio. Resolves when all its frames are known. */
   finish(): Promise<void>;

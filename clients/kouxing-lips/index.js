@@ -134,7 +134,7 @@ export class LipSync extends EventTarget {
     await this.#open({ sampleRateHz });
   }
 
-  /** Take PCM, mono in [-1, 1], at the rate of open(). Audio may come faster than real time. */
+  /** Accept PCM, mono in [-1, 1], at the rate of open(). Audio may arrive faster than real time. */
   push(samples) {
     this.#worker.postMessage({ type: "push", session: this.#session, samples });
   }

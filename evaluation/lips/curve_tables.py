@@ -2,7 +2,7 @@
 
 The column ``t`` is the duration of the audio that the program had received when it made the row,
 seconds. The other columns are ARKit's shapes (``jawOpen``), Oculus' visemes (``aa`` or
-``viseme_aa``) or ``opening``. Further columns are only inputs of the linear map.
+``viseme_aa``) or ``opening``. Other columns are only inputs of the linear map.
 """
 
 import csv
@@ -33,7 +33,7 @@ _LOWER_LIP = FAP_NUMBER["raise_b_midlip"] - 1
 class CurveTable:
     """Curves of a clip."""
 
-    time_s: Array  # (num_rows,), rising
+    time_s: Array  # (num_rows,), ascending
     names: tuple[str, ...]
     values: Array  # (num_rows, num_curves)
 

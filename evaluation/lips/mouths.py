@@ -26,7 +26,7 @@ _CLOSED_FRACTION = 0.1  # fraction of a real mouth's range
 class Mouth:
     """The motion of a mouth; frames without an opening are left out."""
 
-    time_s: Array  # (num_frames,), rising
+    time_s: Array  # (num_frames,), ascending
     curves: dict[str, Array]  # opening, width and jaw; width and jaw may be NaN
     is_closed: Mask
 

@@ -1,4 +1,4 @@
-"""Clips with tracked lips, their phones, and when someone speaks in them."""
+"""Clips with tracked lips, their phones, and their times of speech."""
 
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -57,7 +57,7 @@ class Reference:
         return float(np.sqrt(np.mean(np.square(self.clip.samples, dtype=float))))
 
     def is_speech(self, time_s: Array) -> Mask:
-        """Whether someone speaks at the given times.
+        """Whether there is speech at the given times.
 
         Voice activity is on, and a loud sound is within 0.1 s. Voice activity alone spans pauses of
         half a second, and the level mistakes noise for speech.

@@ -11,7 +11,7 @@ from kouxing.evaluation.lips.take import Takes
 
 
 def rest_opening(takes: Takes) -> float | None:
-    """Return the mean opening while nobody speaks, FAP units. Rigs do not count: they rest at 0."""
+    """Return the mean opening in silence, FAP units. Rigs do not count: they rest at 0."""
     openings = [
         take.predicted.at("opening", take.real.time_s[~take.in_speech])
         for take in takes

@@ -34,7 +34,7 @@ class Take:
 
     @cached_property
     def in_speech(self) -> Mask:
-        """Whether someone speaks, at the times of the real frames."""
+        """Whether there is speech, at the times of the real frames."""
         return self.reference.is_speech(self.real.time_s)
 
     @cached_property

@@ -108,7 +108,7 @@ class Busy:
     """All figures."""
 
     runs: list[Run]
-    idle: dict[str, Usage]  # by service, while nobody speaks
+    idle: dict[str, Usage]  # by service, in silence
     speaking: dict[str, Usage]  # by service, before the load
     machine_load: float  # load average of the minute before
 
@@ -307,7 +307,7 @@ def show(busy: Busy, console: Console) -> None:
     print_table(
         console,
         "",
-        ("per second", "nobody speaks: cores", "wake-ups", "one session: cores", "wake-ups"),
+        ("per second", "silence: cores", "wake-ups", "one session: cores", "wake-ups"),
         ([name, *_cells(busy.idle, name), *_cells(busy.speaking, name)] for name in names),
     )
     console.print(f"load average before: {busy.machine_load:.1f}")

@@ -81,7 +81,7 @@ class Outcome:
     """Effects of a fault."""
 
     fault: str
-    failure: str  # why the session did not complete; empty: it did
+    failure: str  # reason why the session did not complete; empty if it did
     face: Continuity | None = None  # None: no frame arrived
     num_refused: int = 0  # sessions
     late_p95_ms: float | None = None  # maximum over all sessions
@@ -161,7 +161,7 @@ _SPARED = (
     ("hangs", True),
     ("stopped", False),
     ("hangs", False),
-)  # what happens to a worker, and whether there is one more
+)  # fault of a worker, and whether there is a spare worker
 FAULTS = {
     "none": Fault(_nothing, is_sudden=False),
     **{

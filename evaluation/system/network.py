@@ -69,7 +69,7 @@ class Network:
             self._delayer.terminate()
             self._delayer.wait()
         for namespace in (self._router, *map(self._namespace, self._addresses)):
-            with contextlib.suppress(UserError):  # it does not exist
+            with contextlib.suppress(UserError):  # the namespace does not exist
                 _call("ip", "netns", "delete", namespace)
 
     def address(self, host: str) -> str:

@@ -34,7 +34,7 @@ class Drawing:
     size_px: tuple[int, int]  # size of the drawn picture, in a page of SIZE_PX
     picture_ms: float  # from the start of drawing to its end
     picture_cpu_ms: float  # on all cores, compositing included
-    voice_to_frame_ms: float | None  # until the frame has reached the page; None: nobody spoke
+    voice_to_frame_ms: float | None  # until the frame has reached the page; None: no speech
     voice_to_picture_ms: float | None
     load: float  # load average of the last minute
 

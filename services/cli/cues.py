@@ -21,7 +21,7 @@ from kouxing.services.cli.options import CurveFormat
 from kouxing.shared.face.mouth_shapes import CLOSED, REST, SILENCE, Cue, mouth_cues, oculus_cues
 
 Frames: TypeAlias = Iterable[tuple[float, NDArray[np.float32]]]  # times in seconds, FAPs (68,)
-_Span: TypeAlias = tuple[str, str, str]  # start and end, and the mouth between them
+_Span: TypeAlias = tuple[str, str, str]  # start, end, and the mouth between them
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,11 +32,11 @@ _DRAWING_OPTIONS = frozenset(
 class Exporter(Protocol):
     """Writes the motion of a face in one format."""
 
-    unit: ClassVar[str]  # what ``export`` counts
+    unit: ClassVar[str]  # unit that ``export`` counts
     options: ClassVar[frozenset[str]]  # fields of ``ExportOptions`` that apply
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
-        """Check output and options. This comes before long work."""
+        """Check output and options, before any long work."""
 
     def export(self, motion: FaceMotion, progress: Progress) -> int:
         """Write the motion and return the number of frames or images."""

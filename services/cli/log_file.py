@@ -61,7 +61,7 @@ class LogFile:
             descriptor = self._open()
         size = os.fstat(descriptor).st_size
         if os.write(descriptor, line) < len(line):
-            os.ftruncate(descriptor, size)  # otherwise, the next line would be appended to this one
+            os.ftruncate(descriptor, size)  # remove the incomplete line
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _open(self) -> int:

@@ -114,7 +114,7 @@ class RayWorkers:
         if drained:
             ray.wait(drained, num_returns=len(drained), timeout=DRAIN_TIMEOUT_S + 1.0)
         for actor in surplus:
-            ray.kill(actor)  # if it has no host yet, or did not finish
+            ray.kill(actor)  # the worker has no host yet, or did not finish
 
     def hosts(self) -> dict[str, str]:
         """Wait until the workers start; return each worker's host, or why it has no host."""

@@ -90,7 +90,7 @@ def find_control() -> str:
                 if control := file.read():
                     return control
                 continue
-            path.unlink()  # its system has ended
+            path.unlink()  # the system has ended
     return ""
 
 

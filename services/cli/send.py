@@ -109,7 +109,7 @@ def _send_frames(search: _SessionFinder, client: Client, senders: Senders) -> No
             if session is not None:
                 session.close()
             followed = None
-            with contextlib.suppress(KouxingError):  # it is closed already, or control restarts
+            with contextlib.suppress(KouxingError):  # already closed, or control restarts
                 session = client.follow(newest.session)
                 frames = session.frames()
                 print_message(f"following session {newest.session}")

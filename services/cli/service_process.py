@@ -53,7 +53,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         self._hang_limit_s = hang_limit_s
         self._silence = SilenceMeter(time.monotonic())
         self._idle_s = 0.0  # extra time until the next heartbeat of a service without sessions
-        self.is_ready = False  # it has sent a heartbeat
+        self.is_ready = False  # whether the process has sent a heartbeat
 
     def read_heartbeats(self) -> None:
         """Update the state of the process. Call this about every ``POLL_S``."""

@@ -145,7 +145,7 @@ class _Streaming:
                 self._update(0.0)
                 if paced and not source.is_live:
                     if is_pipe and time.monotonic() > due_s + PIPE_PAUSE_S:
-                        due_s = time.monotonic()  # it resumes after a pause
+                        due_s = time.monotonic()  # the source resumes after a pause
                     due_s += len(block) / source.sample_rate_hz * (PIPE_CLOCK if is_pipe else 1.0)
                     time.sleep(max(0.0, due_s - time.monotonic()))
         except KeyboardInterrupt:

@@ -128,7 +128,7 @@ class Supervisor:
         for process in processes:
             process.read_heartbeats()
         if len(processes) > 1 and all(process.is_silent for process in processes):
-            for process in processes:  # all were stopped, so none of them hangs
+            for process in processes:  # all processes were stopped, so none of them hangs
                 process.reset_silence()
         for name, process in list(self._processes.items()):
             status = process.poll()

@@ -1,6 +1,6 @@
 """Extracts the spoken text from subtitles, markup and other files with more than the text.
 
-A format is recognized by its content, because a text may come without a file name. Times and tags
+A format is recognized by its content, because a text may have no file name. Times and tags
 are left out. A format whose text cannot be extracted is rejected by its name.
 """
 

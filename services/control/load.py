@@ -81,7 +81,7 @@ class WorkerLoad:
         return max(of_sessions, self._measured + num_new * self.cost)
 
     def has_room(self, num_new: int, now_s: float, max_load: float) -> bool:
-        """Return whether further sessions stay within a limit; the first sessions always do."""
+        """Return whether more sessions stay within a limit; the first sessions always do."""
         if self.num_sessions + num_new <= MIN_SESSIONS or not num_new:
             return True
         return self.expected(now_s) + num_new * self.cost <= max_load

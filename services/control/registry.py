@@ -32,7 +32,7 @@ class ServiceRecord:
     """One running service."""
 
     peer: Peer  # on control's socket; NO_PEER for control itself
-    heartbeat: Heartbeat  # the first one, with keys in its endpoints and without sessions
+    heartbeat: Heartbeat  # first heartbeat, with keys in its endpoints and without sessions
     bare_endpoints: Mapping[str, str]  # without keys
     heartbeat_s: float = 0.0  # when the newest heartbeat arrived
     state: str = "ready"

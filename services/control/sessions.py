@@ -207,7 +207,7 @@ class Sessions:
     # --- reports of services -------------------------------------------------------------------
 
     def record_input(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
-        """Record how far a service has processed a session's input; return its idle time."""
+        """Record a service's progress in a session's input; return its idle time."""
         state = heartbeat.sessions[record.name]
         record.media_time = max(record.media_time, state.media_time)
         if state.skipped_s:

@@ -62,7 +62,7 @@ class RealTimeLimit:
     """Limits one browser's data to real time, after an initial burst."""
 
     def __init__(self) -> None:
-        self._used_until_s = 0.0  # when all data so far would end if it had come in real time
+        self._used_until_s = 0.0  # when all data so far would end if it had arrived in real time
 
     async def wait(self, duration_s: float) -> None:
         """Charge for data of a given duration; return when more may be read."""

@@ -195,7 +195,7 @@ class GatewayService(Service):
     # --- from control ----------------------------------------------------------------------------
 
     def start_session(self, start: StartSession) -> bool:
-        """Subscribe to a session that someone needs; confirm when this is in effect."""
+        """Subscribe to a session for a viewer or sender; confirm when this is in effect."""
         session = self._sessions.get(start.session)
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)

@@ -35,7 +35,7 @@ class Uploads(ABC):
         return self._process is not None
 
     def close(self) -> None:
-        """Stop the process, and reject further uploads."""
+        """Stop the process, and reject new uploads."""
         self._is_closing = True
         self._kill()
 
@@ -69,7 +69,7 @@ class Uploads(ABC):
     ) -> tuple[int, bytes, str]:
         """Run a command; return its exit status, its output and its messages.
 
-        Raises ``TimeoutError`` after ``limit_s``, and ``UserError`` if nobody waits anymore.
+        Raises ``TimeoutError`` after ``limit_s``, and ``UserError`` if the client has left.
         """
         process = self._process = await asyncio.create_subprocess_exec(
             *command,

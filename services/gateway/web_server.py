@@ -24,7 +24,7 @@ MAX_CONNECTIONS = 256
 IDLE_TIMEOUT_S = 10.0  # limit until the first or the next request arrives
 BODY_TIMEOUT_S = 70.0  # for the body on unlimited paths; an upload is answered before that
 MAX_HEAD_BYTES = 64 * 1024  # limit for the first line and the headers of a request
-ANSWER_TIMEOUT_S = 120.0  # limit for sending a file; a head has 5 MB
+ANSWER_TIMEOUT_S = 120.0  # limit for sending a file; a head is 5 MB
 BACKLOG = 128
 KEEPALIVE_S = 20  # after this time without data, the system checks that the client exists
 _KEEPALIVE_PROBES, _PROBE_S = 3, 5
@@ -120,7 +120,7 @@ class _Connection(web.RequestHandler):
     async def finish_response(
         self, request: web.BaseRequest, resp: web.StreamResponse, start_time: float | None
     ) -> tuple[web.StreamResponse, bool]:
-        """Send an answer. Read no further request until the client has received it."""
+        """Send an answer. Read the next request only after the client has received it."""
         if self.transport is not None:
             self.transport.pause_reading()
         try:

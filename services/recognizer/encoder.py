@@ -111,7 +111,7 @@ class EncoderStream:
         self.state = np.zeros(encoder.state_width, np.float32)
 
     def process_position(self, frames: Floats) -> EncoderOutput:
-        """Take the next position's frames, (2, 80)."""
+        """Process the next position's frames, (2, 80)."""
         return process_positions([self], [frames])[0]
 
 

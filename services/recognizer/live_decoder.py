@@ -55,9 +55,10 @@ class LiveDecoder:
     The final phones therefore equal offline decoding. Their confidence is the mean over
     their frames. The output rule and the provisional scores affect neither.
 
-    If the model has provisional scores, the search continues over them. When the next scores come,
-    it restarts from the last settled frame. The output rule gets each frame once, as soon as the
-    frame has a score of either kind. So phones are emitted early and corrected by better scores.
+    If the model has provisional scores, the search continues over them. When the next scores
+    arrive, it restarts from the last settled frame. The output rule gets each frame once, as soon
+    as the frame has a score of either kind. So phones are emitted early and corrected by better
+    scores.
     """
 
     def __init__(self, topology: Topology, rule: OutputRuleConfig) -> None:

@@ -65,7 +65,7 @@ class Resumption:
         self._time_s = time_s
         self._silence = silence
         self._emitted: set[int] = set()  # indices of phones that were emitted, not yet final
-        self._is_speaking = False  # at ``time_s``, as far as known
+        self._is_speaking = False  # at ``time_s``, if known
         self._is_aligned = False
         self._has_emitted = False
 
@@ -80,7 +80,7 @@ class Resumption:
         return media_time + begin * MEDIA_RATE_HZ // sample_rate_hz, samples[begin:]
 
     def new_results(self, results: Iterable[StreamOutput]) -> list[StreamOutput]:
-        """Return a stream's results that are new, preceded by whether someone speaks."""
+        """Return a stream's new results, preceded by the state of the voice activity."""
         emitted: list[StreamOutput] = []
         for result in results:
             new = self._trim(result)

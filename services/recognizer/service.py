@@ -43,8 +43,8 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
 from kouxing.shared.wire.speech import Acknowledge, Speech
 
-MAX_QUEUED_S = 60.0  # limit for live audio; further audio waits at the clients
-READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for further late audio: once, and in total
+MAX_QUEUED_S = 60.0  # limit for live audio; later audio waits at the clients
+READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for more late audio: once, and in total
 MAX_UNPACED_S = 0.06  # limit for unpaced audio that live audio may have to wait for
 FREE_MEMORY_AFTER_S = 10.0  # from the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # interval between ticks while a session is open
@@ -244,7 +244,7 @@ class RecognizerService(Service):
         return all(session.link.backlog == 0 for session in sessions)
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Return how far the input of each session has come."""
+        """Return the input progress of each session."""
         read_s = {True: time.monotonic(), False: self._unpaced_read_s}  # by paced
         return {
             name: SessionInput(

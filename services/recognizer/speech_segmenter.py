@@ -92,7 +92,7 @@ class SpeechSegmenter:
         self._detector = VoiceActivityDetector()
         self._traits = load_voice_readout().create_stream()
         self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next position
-        self._features: Floats | None = None  # its feature frames
+        self._features: Floats | None = None  # feature frames of the next position
         # Features and positions before speech
         self._recent: deque[tuple[Floats, EncoderOutput]] = deque(maxlen=_MAX_RECENT)
         self._num_frames = 0
@@ -104,12 +104,12 @@ class SpeechSegmenter:
         return self._traits.newest
 
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
-        """Take samples, 16 kHz mono, shape (n,); yield what follows from them."""
+        """Accept samples, 16 kHz mono, shape (n,); yield the resulting items."""
         for position in self.positions(samples):
             yield from self.process(position, self.encoder.process_position(position.mels))
 
     def positions(self, samples: Floats) -> Iterator[Position]:
-        """Take samples, 16 kHz mono, shape (n,); yield the new positions, to be processed."""
+        """Accept samples, 16 kHz mono, shape (n,); yield the new positions, to be processed."""
         features = self._front_end.accept_waveform(samples)
         mels = features if self._mel is None else self._mel.accept_waveform(samples)
         self._mels = np.concatenate([self._mels, mels])

@@ -69,7 +69,7 @@ class SpeechStream:
         self._is_speaking = False
         self._results: list[StreamOutput] = []  # not yet returned
         self._early: list[StreamOutput] | None = None  # the same during scoring on another thread
-        self._segments = [self._new_segment(0)]  # those with results to come; the last takes audio
+        self._segments = [self._new_segment(0)]  # the last one accepts audio
 
     @property
     def is_light(self) -> bool:

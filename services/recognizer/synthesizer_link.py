@@ -26,7 +26,7 @@ class SynthesizerLink:
     def __init__(self) -> None:
         self._sender: ReliableSender | None = None
         self._kept: deque[Message] = deque()  # acknowledged messages of the last KEPT samples
-        self._speech: Speech | None = None  # the newest one before those
+        self._speech: Speech | None = None  # the newest message before those
         self._newest_frame: NewestFrame | None = None  # published by the synthesizer
         self._full_since_s: float | None = None
         self._drops = False

@@ -87,7 +87,7 @@ class VoiceTraitsStream:
         self._since_laugh = _LAUGH_POSITIONS  # positions since a laugh
 
     def process_position(self, position: EncoderOutput) -> None:
-        """Take the next position of the encoder."""
+        """Process the encoder's next position."""
         # Few numbers: lists take less time than arrays.
         outputs: list[float] = (
             position.state @ self._readout.weights + self._readout.bias

@@ -36,7 +36,7 @@ class SenderState:
 
     target: str  # address, as given
     delay_ms: float  # additional delay of each frame
-    contents: str  # description of what is sent
+    contents: str  # description of the data
     rate_hz: float  # frames per second, over the last 2 s
     problem: str  # why frames do not reach the target; empty if no problem is known
 
@@ -64,7 +64,7 @@ class PlayoutClock:
     def __init__(self) -> None:
         self._time_s = -math.inf  # time of the newest frame
         self._window_end_s = -math.inf
-        self._shortest_s = self._previous_shortest_s = math.inf  # this window's and the last one's
+        self._shortest_s = self._previous_shortest_s = math.inf  # this window, previous window
 
     def earliest_s(self, time_s: float, now_s: float) -> float:
         """Return the earliest time at which a frame that has just arrived could have arrived.

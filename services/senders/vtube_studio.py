@@ -121,7 +121,7 @@ class VTubeStudioProtocol:
         if number == _ACCESS_OFF:
             text = "VTube Studio's API is off: turn on 'Start API (allow plugins)' in its settings"
         elif number == _ASKING:
-            text = self.problem  # it still shows the window of an earlier connection
+            text = self.problem  # VTube Studio still shows the window of an earlier connection
         elif number == _IN_USE:
             text = f"another plugin sets the same parameters: {text}"
         if not self.is_ready or number == _UNAUTHENTICATED:  # the token may have been revoked

@@ -114,7 +114,7 @@ class FaceAnimator:
         self._time_s = number / self._frame_rate_hz  # time of the last frame
         self._known_s = -math.inf  # the sound is known up to here
         self._phones = PhoneNumbers()
-        self._is_speaking = False  # whether someone spoke at the last frame
+        self._is_speaking = False  # whether there was speech at the last frame
         self._changes: deque[SpeechChange] = deque()  # changes in future frames
         self._levels: list[tuple[float, float]] = []  # since the last frame
         self._pitches: list[tuple[float, float]] = []  # since the last frame

@@ -296,7 +296,7 @@ class SynthesizerService(Service):
         """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:
-            text = "dropped phones of an unknown session"  # it has just been closed
+            text = "dropped phones of an unknown session"  # the session has just been closed
             self.warn("unknown-session", text, message.session, logging.INFO)
         elif sender.key != key_of(session.start.endpoints.get("phones", "")):
             self.warn("foreign", "dropped phones of another recognizer", message.session)

@@ -68,12 +68,12 @@ _HEAD = fap_slice("head_pitch", "head_roll")
 class State(Enum):
     """Conversational state; it controls gaze and head motion."""
 
-    LISTENING = "listening"  # or nobody speaks
-    ATTENDING = "attending"  # listening to someone who speaks
-    STARTING = "starting"  # the first second of one's own speech
+    LISTENING = "listening"  # or silence
+    ATTENDING = "attending"  # listening to a speaker
+    STARTING = "starting"  # the first second of the session's speech
     SPEAKING = "speaking"
-    ENDING = "ending"  # the first moment after one's own speech
-    THINKING = "thinking"  # a pause within one's own speech
+    ENDING = "ending"  # the first moment after the session's speech
+    THINKING = "thinking"  # a pause within the session's speech
 
 
 _PAUSES = (State.ENDING, State.THINKING)

@@ -37,7 +37,7 @@ class SyllableTrack:
         self._characters = characters
         self._num_dropped = 0  # characters before the first kept phone
         self._phones: dict[int, Phone] = {}
-        # by index, with what they were made of
+        # by index, with their phones
         self._syllables: dict[int, tuple[_Source, Syllable]] = {}
 
     def reset(self) -> None:

@@ -50,9 +50,9 @@ class EventName(StrEnum):
 
 
 class SessionInput(Struct, frozen=True, kw_only=True):
-    """How far a service has processed the input of one session."""
+    """Progress of a service in the input of one session."""
 
-    idle_s: Seconds = 0.0  # since its last input
+    idle_s: Seconds = 0.0  # since the session's last input
     sequence: Count = 0  # last audio message that a replacement recognizer does not need
     media_time: Samples = 0  # the session's phones are final up to here
     lateness: Lateness | None = None  # lateness of a synthesizer's frames; None: no live frames
@@ -74,13 +74,13 @@ class Heartbeat(Message, frozen=True, kw_only=True):
     facts: SessionFacts = field(default_factory=SessionFacts)
     languages: Annotated[list[Name], Meta(max_length=64)] = field(
         default_factory=list
-    )  # further languages that its sessions may choose
+    )  # additional languages that its sessions may choose
     build: Text = ""  # version of kouxing
     load: Probability = 0.0  # fraction of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)
     sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(
         default_factory=dict
-    )  # sessions that it takes part in
+    )  # sessions of the service
 
 
 class AllowedKey(Struct, frozen=True, kw_only=True):

@@ -41,8 +41,8 @@ class FaceSettings(Struct, frozen=True, kw_only=True):
     still: bool | None = None  # the head and the brows do not move
     eye_contact: bool | None = None  # the eyes do not leave the viewer
     listen_to: SessionName | None = None  # session that the face listens to; "": none
-    listening: bool | None = None  # someone else speaks; control sets it with listen_to
-    expressions: ExpressionMap | None = None  # strengths by name; {}: fade those shown now
+    listening: bool | None = None  # another person speaks; control sets it with listen_to
+    expressions: ExpressionMap | None = None  # strengths by name; {}: fade the current ones
     hold_s: Annotated[float, Meta(ge=0, le=MAX_HOLD_S)] = DEFAULT_HOLD_S  # until they fade
     shapes: ShapeSets | None = None  # also publish these sets of shapes
 

@@ -27,7 +27,7 @@ class AudioState(StrEnum):
 
     RUNNING = "running"
     STALLED = "stalled"  # the client sends no audio, so media time does not advance
-    RESUMED = "resumed"  # it sends audio again; that audio is not processed yet
+    RESUMED = "resumed"  # the client sends audio again, which is not processed yet
     SKIPPED = "skipped"  # the audio before was too old: the face continues here
     ENDED = "ended"  # no more results follow
 
@@ -95,9 +95,10 @@ class Progress(Message, frozen=True, kw_only=True):
     pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
     arousal: Feeling = 0.0  # arousal in the voice, relative to the speaker's mean
     valence: Feeling = 0.0  # valence, relative to the speaker's mean; below 0: unpleasant
-    is_laughter: bool = False  # someone laughs, which is not speech
+    is_laughter: bool = False  # laughter, which is not speech
     is_breath: bool = False  # audible breath
-    # Of the lost synthesizer: the new one continues after it. In the first message of an epoch
+    # Newest frame of the lost synthesizer; the new one continues after it. In the first message of
+    # an epoch
     newest_frame: NewestFrame | None = None
 
 

@@ -35,7 +35,7 @@ BATCH_S = 32
 BATCHES_PER_STEP = 8
 _POSITIONS_PER_S = 50
 _LENGTHS = (80, 120, 160, 200)  # positions of an excerpt
-_BEYOND = 25  # further positions that only the teacher sees
+_BEYOND = 25  # additional positions that only the teacher sees
 # lengths of a block and its right context, positions: live, then offline
 _BLOCKS = ((2, 14), (3, 12), (4, 12), (5, 10), (10, 10), (20, 10), (40, 10))
 _BLOCK_PROBS = (0.25, 0.1, 0.1, 0.15, 0.1, 0.2, 0.1)

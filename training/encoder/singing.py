@@ -85,7 +85,7 @@ def _stretch(
     held = -1
     if not is_melody or rng.random() < _HOLD_PROB:
         power = envelope.sum(axis=1) * voiced
-        held = int(rng.choice(np.argsort(power)[-int(voiced.sum()) // 4 :]))  # it is voiced
+        held = int(rng.choice(np.argsort(power)[-int(voiced.sum()) // 4 :]))  # a voiced frame
         durations[held] += rng.uniform(_MIN_HOLD_S, _MAX_HOLD_S) / _FRAME_S
     ends = np.cumsum(durations)
     source = np.searchsorted(ends, np.arange(int(ends[-1])), side="right")

@@ -61,7 +61,7 @@ class Recording:
     name: str
     read: Callable[[], Samples]  # ValueError if it cannot be read
     weight: float  # relative sampling frequency
-    voice: VoiceKind = VoiceKind.SPEECH  # where it is audible
+    voice: VoiceKind = VoiceKind.SPEECH  # frames in which the sound is audible
 
 
 @dataclass(frozen=True, slots=True)

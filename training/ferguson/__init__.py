@@ -1,1 +1,1 @@
-"""Learns the table of the ferguson lip model, and how far each FAP travels."""
+"""Trains the table of the ferguson lip model, and the travel of each FAP."""

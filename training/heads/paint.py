@@ -218,7 +218,7 @@ def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
         away, index = spatial.cKDTree(curve).query(texels[near])
         above = (texels[near] - curve[index])[:, 1]
         fade = np.sin(np.pi * np.clip(0.02 + 0.96 * steps[index], 0, 1))
-        if line[0, 0] == 0.0:  # it continues across the middle
+        if line[0, 0] == 0.0:  # the line continues across the middle
             fade = np.cos(np.pi / 2 * steps[index])
         across = away + waver[near]
         groove = np.exp(-((across / 0.009) ** 2)) + 0.45 * np.exp(-((across / 0.028) ** 2))

@@ -35,7 +35,7 @@ from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
 
 Samples = NDArray[np.float32]
-Sound = NDArray[np.floating[Any]]  # samples while they are worked on
+Sound = NDArray[np.floating[Any]]  # samples during processing
 
 _HALF_RATE_HZ = SAMPLE_RATE_HZ / 2
 _HALF_WINDOW = WINDOW_S / HOP_S / 2  # from a frame's first sample to its middle, frames

@@ -62,7 +62,7 @@ export class LipEngine {
     this.#face.express(strengths, holdS);
   }
 
-  /** Take samples, mono in [-1, 1]; return the frames that are due. */
+  /** Accept samples, mono in [-1, 1]; return the frames that are due. */
   push(samples) {
     if (!(samples instanceof Float32Array)) throw new TypeError("samples must be a Float32Array");
     const clipped = clip(samples);

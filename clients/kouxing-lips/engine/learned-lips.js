@@ -49,7 +49,7 @@ export class LearnedLips {
     }
   }
 
-  /** Return the FAPs of the mouth at a media time, seconds; times rise. */
+  /** Return the FAPs of the mouth at a media time, seconds; times increase. */
   frameAt(timeS) {
     this.#resting.followVoice(timeS);
     if (this.#hasLipFrames) this.#followTrack(timeS);

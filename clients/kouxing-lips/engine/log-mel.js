@@ -38,7 +38,7 @@ export class LogMel {
     this.#power = new Float64Array(this.#size / 2 + 1);
   }
 
-  /** Take samples at 16 kHz, in [-1, 1]; return the new feature frames. */
+  /** Accept samples at 16 kHz, in [-1, 1]; return the new feature frames. */
   accept(samples) {
     const known = new Float32Array(this.#samples.length + samples.length);
     known.set(this.#samples);

@@ -32,7 +32,7 @@ export class RestingLips {
     else if (event.type === "end") this.#hasEnded = true;
   }
 
-  /** Process the events up to the time of a frame; times rise. */
+  /** Process the events up to the time of a frame; times increase. */
   followVoice(timeS) {
     while (this.#changes[0]?.timeS <= timeS) {
       const change = this.#changes.shift();

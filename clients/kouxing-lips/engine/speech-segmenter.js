@@ -56,7 +56,7 @@ export class SpeechSegmenter {
     return this.#traits.newest;
   }
 
-  /** Take samples at 16 kHz; return speech changes, phones and lip frames, in order. */
+  /** Accept samples at 16 kHz; return speech changes, phones and lip frames, in order. */
   accept(samples) {
     this.#frames.push(...this.#mel.accept(samples));
     const { FRAMES_PER_POSITION } = this.#model.constants.segmenter;

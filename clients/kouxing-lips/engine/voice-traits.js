@@ -24,7 +24,7 @@ export class VoiceTraits {
     this.#feeling = this.#mean = [...arrays["traits.mean"].values];
   }
 
-  /** Take the next position's state and probabilities of the kinds of voice. */
+  /** Process the next position's state and probabilities of the kinds of voice. */
   accept(state, voice) {
     const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_FRACTION } = this.#c;
     const { values, shape: [, numOutputs] } = this.#weights;

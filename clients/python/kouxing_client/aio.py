@@ -132,7 +132,7 @@ class AsyncSession(BaseSession):
         if self._options is not None:
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._signal.wait(self._is_delivered), LAST_ANSWER_S)
-            with contextlib.suppress(Refused):  # it is closed already
+            with contextlib.suppress(Refused):  # already closed
                 await asyncio.wrap_future(self._close())
         await asyncio.wrap_future(self._thread.forget(self._core))
 

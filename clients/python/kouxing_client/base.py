@@ -43,7 +43,7 @@ class FaceSettings(TypedDict, total=False):
     listen_to: str
     """session to which the face listens: it looks at the viewer and nods in pauses; or ``""``"""
     listening: bool
-    """whether someone without a session is speaking, to whom the face listens"""
+    """whether a person without a session speaks, so the face listens"""
     shapes: Sequence[str]
     """blendshape sets to publish in addition to FAPs"""
 
@@ -99,7 +99,7 @@ class BaseSession:
     is a context manager that closes it at the end.
     """
 
-    _signal: Any  # wakes what waits for the session
+    _signal: Any  # wakes callers that wait for the session
 
     def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
         self._thread = thread
@@ -290,13 +290,13 @@ class BaseSession:
         stream = self._core.stream
         if stream is None:
             return 0
-        return self._num_added - stream.sequence + stream.num_unacknowledged  # new and sent ones
+        return self._num_added - stream.sequence + stream.num_unacknowledged  # queued and sent
 
 
 class BaseResults:
     """Results or events of one session. After ``close()``, no more arrive."""
 
-    _signal: Any  # wakes what waits for results
+    _signal: Any  # wakes callers that wait for results
 
     def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
         self._inbox = inbox

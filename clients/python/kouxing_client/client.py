@@ -170,7 +170,7 @@ class Session(BaseSession):
             return
         if self._options is not None:
             self._signal.wait(self._is_delivered, LAST_ANSWER_S)
-            with contextlib.suppress(Refused):  # it is closed already
+            with contextlib.suppress(Refused):  # already closed
                 self._close().result()
         self._thread.forget(self._core).result()
 

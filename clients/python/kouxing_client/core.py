@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
 
 RETRY_S = 1.0  # interval between attempts of an unanswered request
-WATCHED = ("event", "session-moved")  # what control publishes about a session
+WATCHED = ("event", "session-moved")  # topics that control publishes about a session
 EVENTS = Decoders(Event)
 T = TypeVar("T")
 U = TypeVar("U")

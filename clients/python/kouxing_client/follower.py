@@ -8,9 +8,9 @@ from typing import Any, Protocol
 from kouxing_client.errors import KouxingError
 
 RETRY_S = 3.0  # an unconfirmed subscription is made again after this time
-OVERLAP_S = 3.0  # how long a connection that may be dead stays open for what TCP still delivers
+OVERLAP_S = 3.0  # time for which a possibly dead connection stays open for late data
 CATCH_UP_S = 0.1  # queued messages arrive within this time after a suspension
-MAX_HELD_FRAMES = 8  # how many of these live frames are kept
+MAX_HELD_FRAMES = 8  # number of these live frames that are kept
 END = "end-of-faps"
 _PUBLISHER_OF = {"fap-frame": "faps", END: "faps"}  # endpoint; other kinds are at "phones"
 _Number = tuple[int, int]  # epoch and sequence, or media time and sequence
@@ -96,18 +96,18 @@ class Follower:
         self._on_complete = on_complete
         self._on_new_epoch = on_new_epoch
         self._connection: object | None = None
-        self._old_connection: object | None = None  # open until the new one is complete, or longer
+        self._old_connection: object | None = None  # open until the new one is complete
         self._close_old_due_s = math.inf
         self._retry_s = math.inf
         self._addresses: set[str] = set()
         self._live_addresses: set[str] = set()
-        self._keeps_publisher = False  # one of the addresses was also among those before
+        self._keeps_publisher = False  # an address was also used before the move
         self._confirmed: set[str] = set()  # publishers
         self._first_epoch = 0
         self._epochs: dict[str, int] = {}  # publisher: epoch of its newest message
         self._newest: dict[str, _Number] = {}  # numbers of the newest message, by kind
-        self._newest_before: dict[str, _Number] = {}  # newest when it subscribed again
-        self._seen: set[tuple[str, _Number]] = set()  # messages since it subscribed again
+        self._newest_before: dict[str, _Number] = {}  # newest at the new subscription
+        self._seen: set[tuple[str, _Number]] = set()  # messages since the new subscription
         self._last_frame = _NONE  # media time and sequence
         self._last_sequence: int | None = None
         self._held_frames: deque[Any] = deque(maxlen=MAX_HELD_FRAMES)
@@ -133,7 +133,7 @@ class Follower:
             self._live_addresses = {endpoints["faps"]}
         self._addresses = addresses
         if has_incomplete and replaced is not None:
-            self._transport.close_connection(replaced)  # so far, only the old one works
+            self._transport.close_connection(replaced)  # so far, only the old connection works
             self._keeps_publisher = self._keeps_publisher and stays
         else:
             self._close_old_connection()
@@ -200,7 +200,7 @@ class Follower:
         if (connection := self._old_connection) is None:
             return
         self._transport.drain(connection)
-        if self._old_connection is connection:  # no handler has closed it
+        if self._old_connection is connection:  # no handler has closed the connection
             self._transport.close_connection(connection)
             self._old_connection = None
 

@@ -12,7 +12,7 @@ import msgspec
 if TYPE_CHECKING:
     Floats = array[float]
 else:
-    Floats = array  # what msgspec can evaluate
+    Floats = array  # a type that msgspec can evaluate
 
 VERSION = 3
 MEDIA_RATE_HZ = 16000

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
 
 RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect again
-MOVE_LIMIT_S = 5.0  # how long a session that its recognizer does not know may take to move
+MOVE_LIMIT_S = 5.0  # limit for the move of a session whose recognizer is lost
 END_LIMIT_S = 5.0  # maximum wait for the last phones after the last frame
 LAST_S = 0.5  # for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
@@ -50,7 +50,7 @@ class Inbox:
     def __init__(self, signal: Signal, capacity: int | None) -> None:
         self.messages: deque[Any] = deque(maxlen=capacity)
         self.is_over = False  # no more messages arrive
-        self.failure: KouxingError | None = None  # why it ended too early
+        self.failure: KouxingError | None = None  # reason for an early end
         self.num_missed = 0  # frames and phones that did not arrive
         self.signal = signal
 
@@ -210,13 +210,13 @@ class SessionCore:
             self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_live)
         self.signal = signal
         self.errors: deque[Refused] = deque()  # errors about the audio
-        self.failure: KouxingError | None = None  # why the session is over; None: it was closed
+        self.failure: KouxingError | None = None  # reason for the end; None: closed
         self.is_over = False
         self.is_blocked = False  # the audio socket takes no more
         self._audio: Connection | None = None
         self._subscriptions: list[Subscription] = []
         self._resubscribe_end_s = 0.0  # audio waits for subscriptions until this time
-        self._unknown: tuple[float, Refused] | None = None  # its recognizer does not know it
+        self._unknown: tuple[float, Refused] | None = None  # unknown to the recognizer
         self._closing: tuple[float, str] | None = None  # deadline and reason of control
 
     def connect(self) -> None:
@@ -341,7 +341,7 @@ class SessionCore:
             self.stream.acknowledge(fields["sequence"], self.sockets.now_s)
         elif kind == "error":
             error = refused(fields)
-            if error.code == "unknown-session":  # a recognizer that restarted; control moves it
+            if error.code == "unknown-session":  # the recognizer restarted
                 self._unknown = self._unknown or (self.sockets.now_s, error)
             else:
                 self.errors.append(error)

@@ -60,7 +60,7 @@ class Sockets:
     def call(self, function: Callable[[], None]) -> None:
         """Let the thread call a function soon."""
         self._calls.append(function)
-        with contextlib.suppress(OSError):  # full, so the thread wakes anyway; or closed
+        with contextlib.suppress(OSError):  # the pipe is full or closed
             self._waker.send(b"\0")
 
     def step(self, timeout_s: float) -> None:

@@ -42,7 +42,7 @@ def _text_px(size_px: tuple[int, int]) -> float:
 class Captions:
     """Draws captions in a band below the picture, so that they hide nothing.
 
-    ``captions`` are in order of time. ``size_px`` is the size of the picture with the band.
+    ``captions`` are sorted by time. ``size_px`` is the size of the picture with the band.
     """
 
     def __init__(self, captions: Sequence[Caption], size_px: tuple[int, int]) -> None:

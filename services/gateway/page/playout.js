@@ -8,7 +8,7 @@ const FRAME_MS = 20; // between two FAP frames; interpolation needs both
 const FIRST_DELAY_MS = 120; // before anything has been measured
 // percentile: of the arrivals to wait for. marginMs: added for interpolation. leapMs: smaller errors
 // are corrected by gliding. With sound, playback must not run dry or leap audibly. Without sound,
-// nobody notices a face that is one frame too old.
+// a face that is one frame too old is not visible as late.
 const WITH_SOUND = { percentile: 0.95, marginMs: FRAME_MS, leapMs: 30 };
 const WITHOUT_SOUND = { percentile: 0.8, marginMs: 0, leapMs: 5 };
 const ADJUST_EVERY_MS = 500;

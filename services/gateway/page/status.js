@@ -78,7 +78,7 @@ export function playoutDelaysText(soundMs, frameMs) {
   return say("playoutDelays", { soundMs: sound, frameMs: frame });
 }
 
-/** Round to tens: nobody sees a few milliseconds, and the text changes less often. */
+/** Round to tens: a few milliseconds are invisible, and the text changes less often. */
 export function roundToTens(ms) {
   return Math.round(ms / 10) * 10;
 }

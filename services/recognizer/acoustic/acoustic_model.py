@@ -55,7 +55,7 @@ class FrontEnd(Protocol):
     """
 
     def accept_waveform(self, samples: Floats) -> Floats:
-        """Take samples, shape (n,), 16 kHz, in [-1, 1]; return the new frames, (m, k)."""
+        """Accept samples, shape (n,), 16 kHz, in [-1, 1]; return the new frames, (m, k)."""
 
 
 class AcousticStream(ABC):
@@ -66,7 +66,7 @@ class AcousticStream(ABC):
     """
 
     uses_encoder = False  # whether its frames are the encoder's phones instead of the front end's
-    look_ahead_frames: int  # the settled scores of a frame come at most this many frames after it
+    look_ahead_frames: int  # maximum delay of a frame's settled scores, frames
     provisional: Floats  # (k, states) of the frames after the settled ones; a change is a new array
 
     def __init__(self, model: AcousticModel) -> None:

@@ -278,7 +278,7 @@ class BlockStream(AcousticStream):
         return num_positions >= self._num_due or (self._ended and num_positions > 0)
 
     def is_due_after(self, num_frames: int) -> bool:
-        """Return whether the network must run after this number of further frames."""
+        """Return whether the network must run after this number of additional frames."""
         return self._num_positions_after(num_frames) >= self._num_due
 
     @property

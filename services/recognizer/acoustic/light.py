@@ -50,7 +50,7 @@ class EncoderPhones:
         self._frames = np.empty((0, NUM_MELS), np.float32)
 
     def accept_waveform(self, samples: Floats) -> Floats:
-        """Take samples, shape (n,), 16 kHz, in [-1, 1]; return the new rows."""
+        """Accept samples, shape (n,), 16 kHz, in [-1, 1]; return the new rows."""
         self._frames = np.concatenate([self._frames, self._mel.accept_waveform(samples)])
         rows = [self._rows[:0]]
         while len(self._frames) >= FRAMES_PER_POSITION:

@@ -118,7 +118,7 @@ class LogMel:
         self._num_read = 0
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take samples, shape (n,), 16 kHz, in [-1, 1].
+        """Accept samples, shape (n,), 16 kHz, in [-1, 1].
 
         Returns the new feature frames, shape (frames, 41): log energy, 40 log-mel bands.
         """

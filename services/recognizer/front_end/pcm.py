@@ -90,7 +90,7 @@ class SliceMeter:
     def accept_waveform(
         self, samples: NDArray[np.float32]
     ) -> Iterator[tuple[NDArray[np.float32], Progress | None]]:
-        """Take samples, (n,); yield pieces, each with the slice that ends there."""
+        """Accept samples, (n,); yield pieces, each with the slice that ends there."""
         for piece in slices(samples, self.media_time - self._start):
             self.media_time += len(piece)
             self._pieces.append(piece)

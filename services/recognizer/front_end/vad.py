@@ -29,12 +29,12 @@ class VoiceActivityDetector:
     """Follows one stream, position by position."""
 
     def __init__(self) -> None:
-        self.is_speech = False  # whether someone speaks or sings, so the audio is recognized
+        self.is_speech = False  # whether there is speech or singing, so the audio is recognized
         self._evidence = 0.0
         self._num_improbable = 0  # positions in a row
 
     def update(self, voice: Floats) -> None:
-        """Take the probabilities of a position, (4,), by ``VoiceKind``."""
+        """Process the probabilities of a position, (4,), by ``VoiceKind``."""
         probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SUNG])
         self._num_improbable = 0 if probability >= _IMPROBABLE else self._num_improbable + 1
         if self.is_speech:

@@ -114,7 +114,7 @@ class NccfPitchTracker:
     def accept_waveform(
         self, samples: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Take samples, shape (n,), 16 kHz, in [-1, 1].
+        """Accept samples, shape (n,), 16 kHz, in [-1, 1].
 
         Returns the pitch of the new feature frames, (frames,), 70 to 380 Hz or 0 if unvoiced, and
         its strength, (frames,), 0 to 1, above ``VOICED_STRENGTH`` in voiced sounds.
@@ -171,7 +171,7 @@ class PitchedLogMel:
         self._pitch = NccfPitchTracker()
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take samples, shape (n,), 16 kHz, in [-1, 1].
+        """Accept samples, shape (n,), 16 kHz, in [-1, 1].
 
         Returns the new feature frames, shape (frames, 43): log energy, 40 log-mel bands, the pitch
         in Hz and its strength.

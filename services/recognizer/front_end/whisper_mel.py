@@ -72,7 +72,7 @@ class WhisperMel:
         self._samples = np.empty(0, dtype=np.float32)
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take samples, (n,), 16 kHz, in [-1, 1]; return the new feature frames, (frames, 80)."""
+        """Accept samples, (n,), 16 kHz, in [-1, 1]; return the new feature frames, (frames, 80)."""
         known = np.concatenate([self._samples, samples.astype(np.float32, copy=False)])
         num_frames = frames_in(len(known))
         self._samples = known[HOP_SAMPLES * num_frames :]

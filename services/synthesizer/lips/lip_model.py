@@ -19,7 +19,7 @@ class Articulation(Protocol):
 
     @property
     def syllable_onsets_s(self) -> NDArray[np.float64]:
-        """Media time of each syllable's vowel onset, shape (num_syllables,), rising."""
+        """Media time of each syllable's vowel onset, shape (num_syllables,), ascending."""
 
     def usual_level_db(self, time_s: float) -> float | None:
         """Return the usual level of the speech at a time, relative to the speaker's mean."""

@@ -68,7 +68,7 @@ class Behavior:
 
     still: bool | None = None  # the head and the brows do not move
     eye_contact: bool | None = None  # the eyes do not leave the viewer
-    listening: bool | None = None  # someone else speaks
+    listening: bool | None = None  # another person speaks
 
 
 class SpeechMotion:

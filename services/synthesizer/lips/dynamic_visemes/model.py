@@ -133,7 +133,7 @@ class VisemeStream:
         self._pending_s = _SLOW_TRANSITION_S
 
     def frame_at(self, time_s: float) -> MouthFrame:
-        """Return the mouth at a media time, seconds; times rise."""
+        """Return the mouth at a media time, seconds; times increase."""
         if self._pending_s is not None:
             self._closures.forget(self._known.forget_before(self._time_s - _MEMORY_S))
             self._timeline = self._build_timeline()

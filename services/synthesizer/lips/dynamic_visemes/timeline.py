@@ -47,11 +47,11 @@ class OpenPhone(Record, frozen=True):
     """
 
     end_s: float  # estimated, seconds
-    is_held: bool  # its last viseme is one of a vowel, which may be held
+    is_held: bool  # its last viseme is a vowel's, which may be held
 
 
 class Timeline(Record, frozen=True, kw_only=True):
-    """Visemes in order of time, and the silences before, between and after words."""
+    """Visemes sorted by time, and the silences before, between and after words."""
 
     viseme: NDArray[np.intp]  # (num_visemes,) rows of VisemeParameters
     apex_start_s: NDArray[np.float64]  # (num_visemes,) seconds

@@ -130,9 +130,9 @@ def contour(openings: ArrayLike, num_points: int = 41) -> Array:
 def rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int = 41) -> Array:
     """Return the lip contour for openings R and widths (num_frames,), like :func:`contour`.
 
-    A width is the distance of the corners relative to the mouth at rest. If they come closer by w,
-    the opening narrows by w squared and keeps its area, as rounded lips do; x counts mouth widths
-    at rest. This is not in the paper.
+    A width is the distance of the corners relative to the mouth at rest. If they approach each
+    other by w, the opening narrows by w squared and keeps its area, as rounded lips do; x counts
+    mouth widths at rest. This is not in the paper.
     """
     width = np.clip(widths, *_WIDTH_RANGE)
     points = contour(np.minimum(openings / width**2, MAX_OPENING), num_points)

@@ -28,7 +28,7 @@ _MIN_STEP_S = 1e-3  # minimum time between key frames
 class KeyFrames:
     """The openings R(t) of a mouth; constant before the first and after the last key frame."""
 
-    times_s: Array  # (num_key_frames,) strictly rising, at least one
+    times_s: Array  # (num_key_frames,) strictly ascending, at least one
     openings: Array  # (num_key_frames,) R at these times, 0 to MAX_OPENING
 
     def openings_at(self, times_s: ArrayLike, *, smooth: bool = False) -> Array:
@@ -43,9 +43,9 @@ class KeyFrames:
 
 
 def anchors_of(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]:
-    """Return rising times at which the mouth has the opening of a phone.
+    """Return ascending times at which the mouth has the opening of a phone.
 
-    ``phones`` are in order of time; gaps and ``silence``, the phone of a closed mouth, are pauses.
+    ``phones`` are sorted by time; gaps and ``silence``, the phone of a closed mouth, are pauses.
     """
     spoken = [phone for phone in phones if phone.symbol != silence]
     anchors: list[tuple[float, str]] = []

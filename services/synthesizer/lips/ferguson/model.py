@@ -145,7 +145,7 @@ class FergusonStream:
         self._request_transition(_SLOW_TRANSITION_S)
 
     def frame_at(self, time_s: float) -> MouthFrame:
-        """Return the mouth at a media time, seconds; times rise."""
+        """Return the mouth at a media time, seconds; times increase."""
         if self._pending_s is not None:
             self._known.forget_before(self._time_s - _MEMORY_S)
             self._segments = [

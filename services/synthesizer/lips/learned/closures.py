@@ -86,7 +86,7 @@ class ClosingPhones:
         self._symbols = {
             symbol for symbol, visemes in inventory.visemes.items() if visemes[0][0] == viseme
         }
-        self._phones: dict[int, tuple[Phone, float]] = {}  # by index, with the time they were known
+        self._phones: dict[int, tuple[Phone, float]] = {}  # by index, with the time of recognition
 
     def add(self, phone: Phone, now_s: float) -> None:
         """Add a phone or a revision; ``now_s`` is the time of the next frame."""

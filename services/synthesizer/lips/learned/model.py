@@ -160,7 +160,7 @@ class LearnedStream:
         self._start_transition(still(self._neutral), _SLOW_TRANSITION_S)
 
     def frame_at(self, time_s: float) -> MouthFrame:
-        """Return the mouth at a media time, seconds; times rise."""
+        """Return the mouth at a media time, seconds; times increase."""
         visemes = self._visemes.frame_at(time_s)
         self._tongue = visemes.faps
         self._resting.follow_voice(time_s)

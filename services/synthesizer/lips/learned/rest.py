@@ -94,7 +94,7 @@ class RestingLips:
         self._is_voice, self._sound_s = False, -math.inf
 
     def follow_voice(self, time_s: float) -> None:
-        """Process the events up to the time of a frame; times rise."""
+        """Process the events up to the time of a frame; times increase."""
         while self._changes and self._changes[0].time_s <= time_s:
             change = self._changes.popleft()
             if change.active and not self._is_voice:
