@@ -1,4 +1,4 @@
-/** Set of blend shapes. */
+/** Set of blendshapes. */
 export type ShapeSet = "arkit" | "oculus" | "vrm";
 
 /** Media time: samples at 16 kHz since the session's first sample. */

@@ -1,4 +1,4 @@
-// A model that a stream of values moves: kouxing's heads by FAPs, other models by blend shapes.
+// A model that a stream of values moves: kouxing's heads by FAPs, other models by blendshapes.
 
 import { VRMLoaderPlugin, VRMLookAtBoneApplier, VRMUtils } from "@pixiv/three-vrm";
 import * as THREE from "three";

@@ -27,7 +27,7 @@ export class Viewer {
   /**
    * @param gateway address of the gateway
    * @param handlers functions by name, see index.d.ts
-   * @param options { session: name, "" for the newest; shapes: set of blend shapes to receive in
+   * @param options { session: name, "" for the newest; shapes: set of blendshapes to receive in
    *   addition to FAP frames; token: the gateway's token }
    */
   constructor(gateway, handlers, { session = "", shapes = "", token = "" } = {}) {

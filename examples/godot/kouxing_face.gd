@@ -1,5 +1,5 @@
 ## Moves a face with a live session. Godot 4: add this script to a node and choose the face in the
-## inspector. It moves every mesh below the face that has blend shapes of ARKit, Oculus or VRM, also
+## inspector. It moves every mesh below the face that has blendshapes of ARKit, Oculus or VRM, also
 ## under the names of other programs.
 extends Node
 
@@ -13,7 +13,7 @@ const RETRY_MS := 1000
 var _socket := WebSocketPeer.new()
 var _retry_at_ms := 0
 var _set := ""
-var _targets := {}  # [mesh, index] of the blend shapes, lists by shape
+var _targets := {}  # [mesh, index] of the blendshapes, lists by shape
 
 
 func _ready() -> void:

@@ -1,5 +1,5 @@
 // Unity 2021 or newer: add this component to an avatar. It moves every SkinnedMeshRenderer below the
-// avatar that has blend shapes of ARKit, Oculus or VRM, also under the names of other programs.
+// avatar that has blendshapes of ARKit, Oculus or VRM, also under the names of other programs.
 
 using System;
 using System.Collections.Generic;
@@ -10,7 +10,7 @@ public sealed class KouxingFace : MonoBehaviour
 {
     [SerializeField] string gateway = "ws://127.0.0.1:8080";
     [SerializeField, Tooltip("Session to follow; if empty, the newest")] string session = "";
-    [SerializeField, Tooltip("Unity's blend shapes range from 0 to 100")] float fullWeight = 100f;
+    [SerializeField, Tooltip("Unity's blendshapes range from 0 to 100")] float fullWeight = 100f;
 
     readonly List<(SkinnedMeshRenderer mesh, int shape, string name)> _shapes =
         new List<(SkinnedMeshRenderer, int, string)>();

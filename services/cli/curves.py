@@ -1,4 +1,4 @@
-"""Exporters of a face's curves: FAPs or blend shapes of every frame.
+"""Exporters of a face's curves: FAPs or blendshapes of every frame.
 
 To add a format, write a subclass of ``CurveExporter`` and add its suffix to ``CURVE_EXPORTERS``.
 ``kouxing render`` and ``kouxing listen`` then write it. ``curve_reader`` reads tables.

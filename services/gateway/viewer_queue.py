@@ -14,7 +14,7 @@ class MessageKind(Enum):
 
     TEXT = "text"
     FRAME = "frame"
-    SHAPES = "shapes"  # blend shapes of a frame
+    SHAPES = "shapes"  # blendshapes of a frame
     REST = "rest"  # the face while no session moves it
     REST_SHAPES = "rest shapes"
     SOUND = "sound"

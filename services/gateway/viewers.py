@@ -40,7 +40,7 @@ class Viewer:
     """One browser that shows a session."""
 
     chosen: str  # the requested session; empty: the newest
-    shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
+    shape_encoder: ShapeEncoder | None  # for frames as blendshapes, in addition to FAPs
     queue: ViewerQueue = field(default_factory=ViewerQueue)
     shown: tuple[str, int] | None = None  # session and epoch last announced to the viewer
     has_rest: bool = False  # whether it got the face at rest, with which its player starts
@@ -268,7 +268,7 @@ class Viewers:
         media_time: int,
         faps: bytes,
     ) -> None:
-        """Send a frame as blend shapes to the viewers that asked for them."""
+        """Send a frame as blendshapes to the viewers that asked for them."""
         messages: dict[ShapeEncoder, str | bytes] = {}
         for viewer in viewers:
             if (encoder := viewer.shape_encoder) is not None:

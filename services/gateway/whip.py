@@ -44,7 +44,7 @@ MISSING = (
 
 @dataclass(slots=True, eq=False)
 class _Client:
-    shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
+    shape_encoder: ShapeEncoder | None  # for frames as blendshapes, in addition to FAPs
     peer: WebRtcPeer | None = None
     session: AudioSession | None = None
     is_ending: bool = False  # the gateway itself closes the session

@@ -23,7 +23,7 @@ MAX_SHAPES = 256  # per set
 class ShapeSetName(StrEnum):
     """A set of blendshapes."""
 
-    ARKIT = "arkit"  # ARKit's 52 blend shapes
+    ARKIT = "arkit"  # ARKit's 52 blendshapes
     OCULUS = "oculus"  # Oculus' 15 visemes
     VRM = "vrm"  # VRM 1's expressions
 

@@ -255,7 +255,7 @@ class BaseSession:
         )
 
     def _add_shapes(self, name: str) -> Future[Fields] | None:
-        """Request a set of blend shapes, unless the session has it already."""
+        """Request a set of blendshapes, unless the session has it already."""
         if not name or name in (self._options or {}).get("face", {}).get("shapes", ()):
             return None
         return self._request("set-face", {"face": {"shapes": [name]}})

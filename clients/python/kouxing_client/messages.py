@@ -76,7 +76,7 @@ class FapFrame(Result, frozen=True, kw_only=True):
     values: Floats
     """68 values in FAP units, FAP 1 first"""
     shapes: dict[str, Floats] = {}
-    """the same face as weights of each requested set of blend shapes, by name of the set"""
+    """the same face as weights of each requested set of blendshapes, by name of the set"""
 
     def __post_init__(self) -> None:
         if len(self.values) != NUM_FAPS:
@@ -84,7 +84,7 @@ class FapFrame(Result, frozen=True, kw_only=True):
 
 
 class Shapes(Result, frozen=True, kw_only=True):
-    """The face at ``media_time`` as weights of blend shapes, from a ``FapFrame``."""
+    """The face at ``media_time`` as weights of blendshapes, from a ``FapFrame``."""
 
     set: str
     """``arkit``, ``oculus`` or ``vrm``"""

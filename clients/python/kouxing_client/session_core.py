@@ -71,7 +71,7 @@ class Subscription:
     Parameters
     ----------
     shape_set
-        Name of the set of blend shapes, if ``classes`` has ``Shapes``.
+        Name of the set of blendshapes, if ``classes`` has ``Shapes``.
     inbox
         Gets the results; ends with the session.
     on_joined

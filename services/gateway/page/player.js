@@ -26,7 +26,7 @@ export class Player {
    * @param {Sound} sound plays the session's sound
    * @param voiceAgeMs (nowMs, mediaTime): how long ago this browser's user spoke, ms; null if the
    *   session is not the user's
-   * @param numValues of a face; other than 68 for blend shapes
+   * @param numValues of a face; other than 68 for blendshapes
    */
   constructor(sound, voiceAgeMs = () => null, numValues = NUM_FAPS) {
     this.#sound = sound;
