@@ -101,7 +101,7 @@ class RowErrors:
     def no_recording_error(self, where: str) -> UserError:
         """Make the error that no recording can be used, with the reason for the last one."""
         last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
-        return UserError(f"no usable recordings {where}{last}; use other recordings")
+        return UserError(f"no usable recordings {where}{last}")
 
 
 def may_ship(license_name: str) -> bool:
@@ -151,7 +151,7 @@ def audio_files(folder: Path) -> list[Path]:
     """Find and sort the recordings in a folder, at any depth; UserError if it contains no audio."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
     if not files:
-        raise UserError(f"{folder} contains no wav, flac, ogg or opus files; use another folder")
+        raise UserError(f"{folder} contains no wav, flac, ogg or opus files")
     return files
 
 

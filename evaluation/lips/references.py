@@ -163,5 +163,5 @@ def _held_out(
             names = textwrap.shorten(", ".join(omitted), _MAX_NAMES_LENGTH, placeholder=" ...")
             print_message(f"omitted {plural(len(omitted), 'clip')} {fault}: {names}")
         if not clips:
-            raise UserError(f"{folder}: no clip can be scored; use other clips")
+            raise UserError(f"{folder}: no clip can be scored")
     return clips

@@ -82,7 +82,7 @@ def _parse(folder: Path, content: Any) -> Study:
         if not path.is_relative_to(root) or path.suffix.lower() not in SUFFIXES:
             raise UserError(f"{name}: not a video inside {folder}")
         if not path.is_file():
-            raise UserError(f"{name}: this video is missing from {folder}; restore it")
+            raise UserError(f"{name}: this video is missing from {folder}")
         files[Path(name).stem, Path(name).parent.name] = path
     if not files:
         raise UserError(f"{folder} has no videos; name them CONDITION/SENTENCE.mp4")

@@ -74,9 +74,7 @@ def read_table(path: Path) -> FapAnimation:
         except (ValueError, TypeError, IndexError):
             is_valid = False
         if not is_valid:
-            raise UserError(
-                f"{path}, frame {number}: a value is missing or not a number; correct it"
-            )
+            raise UserError(f"{path}, frame {number}: a value is missing or not a number")
         if is_shapes and (np.abs(values[-1]) > _MAX_WEIGHT).any():
             raise UserError(
                 f"{path}, frame {number}: values of shapes must be from 0 to 1; divide percentages"

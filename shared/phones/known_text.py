@@ -51,7 +51,7 @@ def characters_of(text: str, inventory: PhoneInventory) -> Characters:
     syllables = inventory.pronounce(characters)
     if len(syllables) != len(characters):
         raise UserError(
-            f"{text!r}: {len(characters)} characters have another number of syllables,"
-            f" {len(syllables)}; write one character for each syllable"
+            f"{text!r}: {len(characters)} characters do not match {len(syllables)} syllables;"
+            " write one character for each syllable"
         )
     return list(zip(characters, syllables, strict=True))

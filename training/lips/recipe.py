@@ -102,7 +102,7 @@ def train_lips(
     plain = track(speech_of(used), description="clips", total=len(used))
     trained_on = [stretch for stretches in plain for stretch in stretches]
     if not trained_on:
-        raise UserError(f"the clips in {folder} contain no speech; use clips with speech")
+        raise UserError(f"the clips in {folder} contain no speech")
     augmented = speech_of(used, copy=1)
     copies = [
         stretch

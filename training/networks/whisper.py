@@ -108,7 +108,7 @@ def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.flo
     if name not in arrays:
         raise ValueError(f"it lacks {name}")
     if arrays[name].dtype.kind != "f":
-        raise ValueError(f"{name} is quantized, so the model must be one of floats")
+        raise ValueError(f"{name} is quantized; use a model with float weights")
     array = arrays[name].astype(np.float32)
     if not np.isfinite(array).all():
         raise ValueError(f"{name} contains values that are not finite")
@@ -153,7 +153,7 @@ def _array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
     shape = tuple(_number(content, "<I") for _ in range(rank))
     kind = _number(content, "<B")
     if kind not in _KINDS:
-        raise ValueError(f"{name[:80]!r} is of the kind {kind}")
+        raise ValueError(f"{name[:80]!r} has the type {kind}")
     element = np.dtype(_KINDS[kind])
     num_bytes = _number(content, "<I")
     if num_bytes != math.prod(shape) * element.itemsize:

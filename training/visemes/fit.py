@@ -102,7 +102,7 @@ def frames_of(
             )
         )
     if not parts:
-        raise UserError("the training clips contain no speech; use clips with speech")
+        raise UserError("the training clips contain no speech")
     return Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

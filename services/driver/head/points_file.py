@@ -37,9 +37,7 @@ def read_points(path: Path) -> dict[str, Position | int]:
         try:
             values = [float(word) for word in words[1:]]
         except ValueError:
-            raise UserError(
-                f"{where}: {line.strip()!r} contains an invalid number; correct it"
-            ) from None
+            raise UserError(f"{where}: {line.strip()!r} contains an invalid number") from None
         if len(values) == 3 and all(map(math.isfinite, values)):
             positions[name] = np.array(values)
         elif len(values) == 1 and values[0] >= 0 and values[0] == int(values[0]):
@@ -54,9 +52,7 @@ def read_points(path: Path) -> dict[str, Position | int]:
 def _known(name: str, where: str, positions: dict[str, Position | int]) -> str:
     match = re.fullmatch(r"(\d+)\.(\d+)", name)
     if not match or not 1 <= int(match[2]) <= _GROUP_SIZES.get(int(match[1]), 0):
-        raise UserError(
-            f"{where}: {name!r} is not an MPEG-4 feature point, such as 2.1; correct it"
-        )
+        raise UserError(f"{where}: {name!r} is not an MPEG-4 feature point, such as 2.1")
     if name in positions:
         raise UserError(f"{where}: {name} occurs twice; delete one line")
     return name

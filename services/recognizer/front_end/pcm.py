@@ -28,7 +28,7 @@ def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float
     frame_bytes = SAMPLE_BYTES[encoding] * num_channels
     if len(pcm) % frame_bytes:
         raise BadAudio(
-            f"a length of {len(pcm)} B is not a multiple of {frame_bytes} B ({encoding}, channels: "
+            f"{len(pcm)} bytes are not a multiple of {frame_bytes} bytes ({encoding}, channels: "
             f"{num_channels}); send the encoding and channels that the session was opened with"
         )
     if encoding == "s16le":
