@@ -68,7 +68,7 @@ def test_rejects_impossible_audio_and_audio_after_the_end() -> None:
     session.check_open(chunk())
     with pytest.raises(AudioRejected, match="too large"):
         session.check_open(chunk(media_time=MAX_MEDIA_TIME + 1))
-    with pytest.raises(AudioRejected, match="is not a multiple of"):
+    with pytest.raises(AudioRejected, match="are not a multiple of"):
         session.read_chunk(chunk(pcm=b"123"), 0.0)
     session.end = chunk(last=True)
     with pytest.raises(AudioRejected, match="has ended"):
