@@ -117,7 +117,7 @@ class RecognizerSession:
         self.is_laughing = False  # the speaker
         self._published_acoustic = AcousticModelName.FULL
         self._sound = SoundPackets(face_delay_s)
-        self.last_sequence = 0
+        self.output_sequence = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
         self._lead_limit = _AheadLimit(now_s, may_catch_up=start.epoch > 1)
@@ -285,16 +285,16 @@ class RecognizerSession:
         return self._numbered(Acoustic(model=model, media_time=self.stream.media_time))
 
     def _numbered(self, message: M) -> M:
-        self.last_sequence += 1
+        self.output_sequence += 1
         return replace(
-            message, session=self.name, epoch=self.start.epoch, sequence=self.last_sequence
+            message, session=self.name, epoch=self.start.epoch, sequence=self.output_sequence
         )
 
     def on_acknowledge(self, ack: Acknowledge, now_s: float) -> None:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
             if isinstance(message, SpeechMessage) and not isinstance(message, LipMessage):
-                self.replay_window.update(event_of(message), self.last_sequence)
+                self.replay_window.update(event_of(message), self.output_sequence)
 
 
 class _AheadLimit:

@@ -360,11 +360,11 @@ class SynthesizerService(Service):
 
     def _end(self, session: SynthesizerSession) -> None:
         session.finished = True
-        session.last_sequence += 1
+        session.output_sequence += 1
         end = EndOfFaps(
             session=session.start.session,
             epoch=session.start.epoch,
-            sequence=session.last_sequence,
+            sequence=session.output_sequence,
             media_time=session.media_time,
         )
         session.replay.send(end, time.monotonic())
@@ -373,11 +373,11 @@ class SynthesizerService(Service):
     def _publish(self, session: SynthesizerSession, frames: Sequence[Frame]) -> None:
         self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
-            session.last_sequence += 1
+            session.output_sequence += 1
             session.newest = FapFrame(
                 session=session.start.session,
                 epoch=session.start.epoch,
-                sequence=session.last_sequence,
+                sequence=session.output_sequence,
                 media_time=to_samples(time_s),
                 values=faps.astype("<f4").tobytes(),
                 mask=MASK,

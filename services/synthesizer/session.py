@@ -42,7 +42,7 @@ class SynthesizerSession:
         self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledgement)
         self.input_epoch = 0  # epoch of the newest message from the recognizer; 0 before the first
         self.relax_at_s = time.monotonic() + RECOGNIZER_TIMEOUT_S  # start of frames without sound
-        self.last_sequence = 0
+        self.output_sequence = 0
         self.newest: FapFrame | None = None
         self.final = FinalTime()
         self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
@@ -66,7 +66,7 @@ class SynthesizerSession:
 
     def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
         """Continue after the newest frame of another synthesizer."""
-        self.last_sequence = num_frames
+        self.output_sequence = num_frames
         self.face.resume(to_seconds(media_time), num_frames, faps)
 
     @property
