@@ -38,7 +38,7 @@ class ProbeResult(Enum):
     """Result of an attempt to connect to an endpoint."""
 
     ACCEPTED = "accepted"
-    REFUSED = "refused"  # the service rejects this key, or has another key itself
+    REFUSED = "refused"  # the service rejects this key, or uses another key
     UNREACHABLE = "unreachable"
 
 
@@ -106,7 +106,7 @@ class Bus:
         A service that rejects the key closes the connection. A service that hangs does not.
         """
         probe = self._connect(zmq.SUB if is_publisher else zmq.DEALER, queue_length=1)
-        probe.raw.setsockopt(zmq.HANDSHAKE_IVL, 3 * HANDSHAKE_MS)  # not closed from here first
+        probe.raw.setsockopt(zmq.HANDSHAKE_IVL, 3 * HANDSHAKE_MS)  # closed by the peer
         ends = {zmq.EVENT_HANDSHAKE_SUCCEEDED, zmq.EVENT_CONNECT_RETRIED}
         monitor = probe.raw.get_monitor_socket(sum({zmq.EVENT_CONNECTED, *ends}))
         probe.connect(endpoint)
@@ -203,7 +203,7 @@ class Bus:
 
     def _connect(self, kind: int, *endpoints: str, queue_length: int = QUEUE_LENGTH) -> Socket:
         raw = self._open(kind, queue_length)
-        if kind == zmq.DEALER:  # a router knows this peer again after a reconnect
+        if kind == zmq.DEALER:  # a router recognizes this peer after a reconnect
             raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))
         socket = Socket(raw, self._key)
         self._sockets.append(socket)

@@ -45,13 +45,13 @@ class MessageLoop:
         self._poller.add(socket, is_quiet=is_quiet)
 
     def unregister(self, socket: Socket) -> None:
-        """Close a socket, and handle its messages no longer."""
+        """Close a socket, and stop handling its messages."""
         self._poller.remove(socket)
         del self._handlers[socket]
         self.bus.drop(socket)
 
     def pause(self, socket: Socket, *, paused: bool) -> None:
-        """Leave a socket's messages in its queue for now, so that the senders wait."""
+        """Leave a socket's messages in its queue, so that the senders wait."""
         if paused and socket not in self._paused:
             self._paused.add(socket)
             self._poller.remove(socket)

@@ -92,7 +92,7 @@ class Service(MessageLoop):
         self.stall = StallDetector(time.monotonic())
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # endpoints that it provides, by name
-        self.facts = SessionFacts()  # about the sessions that it serves
+        self.facts = SessionFacts()  # facts about the sessions of this service
         self.languages: list[str] = []  # additional languages that its sessions may choose
         self.tick_callbacks: set[Callable[[], float]] = set()  # as `on_tick`
         self._exit_requested = False
@@ -139,17 +139,17 @@ class Service(MessageLoop):
         }
 
     def start_session(self, start: StartSession) -> bool:
-        """Serve a session; return False to call ``session_started`` later."""
+        """Serve a session. Return False if ``session_started`` is called later."""
         return True
 
     def stop_session(self, session: str) -> None:
-        """Forget a session, if it exists."""
+        """Stop serving a session, if it exists."""
 
     def flush_session(self, session: str) -> None:
         """Drop audio of a session that is not yet shown."""
 
     def served_sessions(self) -> Iterable[StartSession]:
-        """Return the sessions that a restarted control learns from this service."""
+        """Return the sessions that a restarted control restores from this service."""
         return ()
 
     def session_inputs(self) -> dict[str, SessionInput]:
@@ -175,7 +175,7 @@ class Service(MessageLoop):
     def publish_event(
         self, name: EventName, session: str, detail: str = "", media_time: int = 0
     ) -> None:
-        """Let control publish an event about a session."""
+        """Request control to publish an event about a session."""
         event = Event(session=session, name=name, detail=detail[:2000], media_time=media_time)
         self.send_to_control(event)
 
@@ -192,7 +192,7 @@ class Service(MessageLoop):
 
     @property
     def is_handing_over(self) -> bool:
-        """Whether control may still move sessions of this worker, which stops."""
+        """Whether control may still move sessions of this stopping worker."""
         return time.monotonic() < self._hand_over_end_s
 
     # --- life cycle ----------------------------------------------------------------------------
@@ -332,7 +332,7 @@ class Service(MessageLoop):
             self._check_replies(now_s)
 
     def resync_with_control(self) -> None:
-        """After a stall, wait for control's decisions before anything more is published."""
+        """After a stall, wait for control's decisions before publishing anything else."""
         if time.monotonic() <= self._heartbeat_due_s + RESYNC_AFTER_S:
             return
         self._send_heartbeat(all_sessions=True)
@@ -439,7 +439,7 @@ class Service(MessageLoop):
                 )
 
     def _allow_keys(self, keys: Mapping[str, AllowedKey]) -> None:
-        """Let these keys connect, and no others."""
+        """Accept only connections with these keys."""
         if self.bus.zap is None:
             return
         grants = {key: Grant(allowed.name, tuple(allowed.roles)) for key, allowed in keys.items()}

@@ -42,6 +42,6 @@ class ControlConfig(ServiceConfig):
 
     @property
     def own_host(self) -> str:
-        """Host by which others find control, and so its events."""
+        """Host name of control and its events for other machines."""
         host, _ = split_endpoint(self.control, "control")
         return local_address() if is_loopback(host) or host in WILDCARDS else host

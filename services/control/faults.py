@@ -1,4 +1,4 @@
-"""Faults of services: short ones are only in the log, others are reported, and so is their end."""
+"""Faults of services. Short faults are only logged; longer ones are reported."""
 
 from dataclasses import dataclass
 
@@ -37,9 +37,9 @@ class FaultLog:
                 LOG.warning(fault.text)
 
     def end(self, instance: str, now_s: float) -> float:
-        """Record that a service has registered; return how long it was lost.
+        """Record that a service has registered; return for how long it was lost.
 
-        Its return is reported if its loss was.
+        The return is reported if the loss was reported.
         """
         fault = self._faults.pop(instance, None)
         if fault is None:

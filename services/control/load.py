@@ -11,7 +11,7 @@ they are silent, it does not fall below that.
 from collections import deque
 
 EQUAL_LOAD = 0.05  # loads that differ by less are equal
-MIN_SESSIONS = 2  # never refused; on a busy machine every session seems to be expensive
+MIN_SESSIONS = 2  # always accepted: on a busy machine every session seems expensive
 MEASURED_S = 2.0  # period over which a worker measures its load
 DEFAULT_COST = 0.1  # cost of a session until it is measured; typical of a slow machine
 COST_HALF_LIFE_S = 60.0  # half-life of the highest measured cost
@@ -40,13 +40,13 @@ class WorkerLoad:
         return DEFAULT_COST if self._cost is None else self._cost
 
     def add_session(self, now_s: float, *, paced: bool) -> None:
-        """Count another session."""
+        """Count an additional session."""
         self.num_sessions += 1
         self._num_unpaced += not paced
         self._placed_s.append(now_s)
 
     def remove_session(self, now_s: float, *, paced: bool) -> None:
-        """Count one session less."""
+        """Count one session fewer."""
         self.num_sessions -= 1
         self._ended_s.append(now_s)
         if not paced:
@@ -87,7 +87,7 @@ class WorkerLoad:
         return self.expected(now_s) + num_new * self.cost <= max_load
 
     def _is_unpaced(self, now_s: float) -> bool:
-        """Return whether the load means nothing: unpaced audio takes all the time that is free."""
+        """Return whether the load is meaningless: unpaced audio uses all idle time."""
         return self._num_unpaced > 0 or now_s < self._unpaced_until_s
 
 

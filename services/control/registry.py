@@ -23,7 +23,7 @@ from kouxing.shared.wire.session import ErrorCode, SessionFacts
 MAX_SERVICES = 2000
 MAX_SERVICES_PER_KEY = 1500
 MAX_REMEMBERED = 1000  # lost services that are recognized when they return
-MAX_LATE_S = 5.0  # a service that is back by then was late, not lost
+MAX_LATE_S = 5.0  # a service that returns within this time was late, not lost
 TIMEOUT_RESET_S = 60.0  # the usual timeout applies again after this time without a late service
 
 
@@ -144,7 +144,7 @@ class Registry:
         return record
 
     def remove(self, instance: str) -> None:
-        """Forget a service; remember its process in case it was declared lost by mistake."""
+        """Remove a service; keep its process in case it was declared lost by mistake."""
         record = self._services.pop(instance, None)
         if record is None:
             return
@@ -233,7 +233,7 @@ class Registry:
         }
 
     def facts(self, instances: Iterable[str]) -> SessionFacts:
-        """Return what services together state about their sessions."""
+        """Return the combined facts of services about their sessions."""
         facts = SessionFacts()
         for instance in instances:
             stated = self._services[instance].heartbeat.facts

@@ -3,7 +3,7 @@
 Li et al. 2011, section 2: the control module initializes the others, passes messages between them
 and synchronizes them. Audio, phones and FAPs do not pass through it.
 
-After a restart, control learns the sessions from the services that serve them.
+After a restart, control restores the sessions from the reports of the services.
 """
 
 import secrets
@@ -158,7 +158,7 @@ class ControlService(Service):
             return known.opened_message(self.endpoints["events"])
         if known is not None and not self._commands.is_open(known.client.connection):
             known.client = sender  # the client has reconnected
-            if known.announced and known.next_sequence == 1:  # its token may have been lost
+            if known.announced and known.next_sequence == 1:  # the client may have lost its token
                 self._lifecycle.end(known, "its client was disconnected before the answer arrived")
                 known = None
         if known is not None and not known.announced:
@@ -180,7 +180,7 @@ class ControlService(Service):
         return _done(message)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
-        if message.session == "":  # the face at rest, which only observers show
+        if message.session == "":  # for the face at rest, which only observers show
             self._resting_face.change(message.face, time.monotonic())
             for instance in self._registry.observers():
                 peer = self._registry[instance].peer
@@ -232,17 +232,17 @@ class ControlService(Service):
         is_new = instance not in self._registry
         is_gone = heartbeat.state == "draining" or self._registry.is_stale(instance, sender)
         if is_new and is_gone:
-            self._check_sessions(heartbeat, sender)  # those that have moved
+            self._check_sessions(heartbeat, sender)  # sessions that have moved
             return
         replaced = self._registry.replaced_by(heartbeat, sender) if is_new else None
         num_speaking = self._sessions.num_speaking(instance)
         self._registry.add(heartbeat, sender, time.monotonic(), num_speaking)
         self._takeover.record_observer(heartbeat)
-        self._check_sessions(heartbeat, sender)  # before others are placed on it
+        self._check_sessions(heartbeat, sender)  # before other sessions are placed on this worker
         if is_new:
             was_lost = self._registry.reclaim_lost(instance, sender) and not is_other
             self._on_new_service(heartbeat, sender, replaced, was_lost=was_lost)
-        # The reply is last: a service that stalled learns by then which sessions have moved.
+        # The reply is last, so that a stalled service first receives which sessions have moved.
         reply = HeartbeatReply(
             sent_ns=heartbeat.sent_ns,
             received_ns=received_ns,
@@ -252,7 +252,7 @@ class ControlService(Service):
         )
         self._commands.send(reply, to=sender)
         if heartbeat.state == "draining" and heartbeat.role == "worker":
-            self._move_sessions_of(instance)  # it continues to serve them until they have moved
+            self._move_sessions_of(instance)  # the worker serves its sessions until they have moved
         elif heartbeat.state == "draining":
             self._on_service_lost(instance, STOPPED)
 
@@ -294,7 +294,7 @@ class ControlService(Service):
             if record is not None and heartbeat.instance in record.lost:
                 continue  # the session has not moved yet
             if record is not None and record.moved and heartbeat.state == "draining":
-                continue  # its new worker is starting
+                continue  # the new worker is starting
             if record is None or not self._sessions.is_participant(record, heartbeat.instance):
                 self._commands.send(CloseSession(session=name), to=sender)
             elif self._sessions.record_input(record, heartbeat) > self._idle_limit_s:

@@ -26,49 +26,49 @@ class SessionRecord:
     opening: OpenSession
     client: Peer  # on control's socket
     opened_s: float
-    started_s: float  # when its services were last told to start it, or a worker was lost
-    workers: dict[str, str]  # instance by endpoint, lost ones included
+    started_s: float  # time of the newest start message, or loss of a worker
+    workers: dict[str, str]  # instance by endpoint, including lost workers
     endpoints: dict[str, str]  # address by endpoint
     facts: SessionFacts  # as stated by its workers
     face: CurrentFace
-    waiting_for: set[str]  # instances that have not started it yet
+    waiting_for: set[str]  # instances that have not started the session yet
     deferred: set[str] = field(default_factory=set)  # subset of `waiting_for` to be notified last
     lost: set[str] = field(default_factory=set)  # lost workers
     epoch: int = 1
     announced: bool = False  # the client has its endpoints
-    moved: bool = False  # it was placed again, and the client is not notified yet
-    restored: bool = False  # an earlier control opened it
+    moved: bool = False  # placed again, but the client is not notified yet
+    restored: bool = False  # opened by an earlier control
     speaking: bool = False
     speech_time: int = 0  # media time at which the newest speech started
     next_sequence: int = 1  # first audio message that a new recognizer would need
-    resume_sequence: int | None = None  # first one to resend; None: the recognizer stays
-    media_time: int = 0  # its phones are final up to here
+    resume_sequence: int | None = None  # first message to resend; None: same recognizer
+    media_time: int = 0  # phones are final up to this media time
     lateness: Lateness | None = None  # lateness of the session's frames in the last 10 s
     skipped_s: dict[str, float] = field(default_factory=dict)  # by instance
 
     @property
     def start_request(self) -> str:
-        """The request that services confirm; another session of this name has another one."""
+        """The request that services confirm. Every session of this name has a different request."""
         return f"start-{self.number}-{self.epoch}"
 
     @property
     def is_settled(self) -> bool:
-        """Whether it waits for nothing."""
+        """Whether no service and no client has to confirm anything."""
         return self.announced and not (self.moved or self.waiting_for or self.lost)
 
     @property
     def missing_workers(self) -> set[str]:
-        """Its workers that have not started it yet."""
+        """The session's workers that have not started it yet."""
         return self.waiting_for & {*self.workers.values()}
 
     @property
     def _audio(self) -> str:
-        """Endpoint that receives its client's audio."""
+        """Endpoint for the client's audio."""
         live = self.endpoints["audio"]
         return live if self.opening.paced else self.endpoints.get(UNPACED_AUDIO, live)
 
     def start_message(self, now_s: float) -> StartSession:
-        """Return the message that starts it at a service."""
+        """Return the message that starts the session at a service."""
         return StartSession(
             session=self.name,
             epoch=self.epoch,
@@ -91,7 +91,7 @@ class SessionRecord:
         )
 
     def opened_message(self, events: str) -> SessionOpened:
-        """Return the answer to its client; ``events`` is control's endpoint."""
+        """Return the answer to the client; ``events`` is control's endpoint."""
         return SessionOpened(
             session=self.name,
             epoch=self.epoch,
@@ -116,7 +116,7 @@ class SessionRecord:
         )
 
     def state(self, now_s: float) -> SessionState:
-        """Return its part of a status report."""
+        """Return the session's part of a status report."""
         return SessionState(
             session=self.name,
             state="open" if self.announced else "starting",

@@ -99,7 +99,7 @@ class Sessions:
         return list(self._pending.values())
 
     def num_speaking(self, instance: str) -> int:
-        """Return the number of a worker's sessions with speech at the moment."""
+        """Return the number of a worker's sessions with current speech."""
         return sum(record.speaking for record in self._of_worker.get(instance, {}).values())
 
     def participants(self, record: SessionRecord) -> set[str]:
@@ -131,7 +131,7 @@ class Sessions:
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
             text = f"your key has {num_of_key} open sessions, the maximum; close one first"
             raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
-        leaves_room = client.key and num_of_key and not opening.paced  # for another client
+        leaves_room = client.key and num_of_key and not opening.paced  # room for another client
         language = _language_of(opening)
         workers = self._placement.place({}, now_s, language, min_room=2 if leaves_room else 1)
         facts = self._registry.facts(workers.values())
@@ -220,7 +220,7 @@ class Sessions:
         return state.idle_s
 
     def record_started(self, record: SessionRecord, instance: str, media_time: int) -> set[str]:
-        """Record that a service serves a session; return deferred services to be told now."""
+        """Record that a service serves a session; return deferred services to notify now."""
         record.waiting_for.discard(instance)
         record.media_time = max(record.media_time, media_time)
         if record.missing_workers > record.deferred:
@@ -260,8 +260,8 @@ class Sessions:
     def move(self, record: SessionRecord, now_s: float) -> bool:
         """Place a session again after it lost workers; return whether that succeeded.
 
-        The recognizer is told last. By then the synthesizer has reported its final phones, and a
-        new synthesizer has the session, so that the recognizer can resume the face there.
+        The recognizer is notified last. By then the synthesizer has reported its final phones, or a
+        new synthesizer has the session, so the recognizer can resume the face there.
         """
         remaining = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:

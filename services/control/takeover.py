@@ -19,7 +19,7 @@ class RestartRecovery:
         self._observed: dict[str, Collection[str]] = {}  # sessions by observer
 
     def add(self, start: StartSession, instance: str) -> bool:
-        """Add a session that a service reports; return False if it may not do so."""
+        """Add a session that a service reports; return False if the service may not report it."""
         audio = self._registry[instance].heartbeat.endpoints.get("audio")
         if not self.is_active or audio is None or start.endpoints.get("audio") != audio:
             return False

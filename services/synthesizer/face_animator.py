@@ -181,8 +181,8 @@ class FaceAnimator:
         """Replace the face of another process, before this face has made any frames.
 
         Events of the last seconds may be repeated; their last frames are made but not shown.
-        ``time_s`` is the media time of the other face's newest frame, ``num_frames`` how many it
-        has made, and ``shown`` the FAPs (68,) of the newest one, if known.
+        ``time_s`` is the media time of the other face's newest frame, ``num_frames`` is the number
+        of its frames, and ``shown`` is the newest frame, FAPs (68,), if known.
         """
         self._first_shown = self._frame_number(time_s) + 1
         num_rehearsed = min(
@@ -220,7 +220,7 @@ class FaceAnimator:
         self._expressiveness.amount = amount
 
     def set_feeling(self, amount: float) -> None:
-        """Set the strength of the feeling in the voice on the face, 0 to 1."""
+        """Set how strongly the face shows the feeling in the voice, 0 to 1."""
         self._feeling.amount = amount
 
     def set_behavior(self, change: Behavior) -> None:
