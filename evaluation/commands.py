@@ -240,6 +240,29 @@ def lips(
     write_json(json_file, results)
 
 
+@app.command(name="lips-package")
+def lips_package(
+    clips: Clips,
+    manifest: Annotated[
+        Path | None, typer.Option(help="Manifest or corpus folder, to also compare the phones.")
+    ] = None,
+    audio: AudioFolder = None,
+    split: Split = "test",
+    json_file: JsonFile = None,
+    force: Force = False,
+) -> None:
+    """Compare the package kouxing-lips with the server, on held-out clips and a corpus.
+
+    Needs Node.
+    """
+    from kouxing.evaluation.system.lips_package import compare, show
+
+    check_output(json_file, force=force)
+    comparison = compare(clips, manifest, split, audio)
+    show(comparison, Console())
+    write_json(json_file, asdict(comparison))
+
+
 @app.command(name="pack-clips")
 def pack_clips(
     archive: Annotated[Path, typer.Argument(help="Archive to write (.zip).")],

@@ -37,7 +37,7 @@ TABLES = {
     "schemes": Part(("schemes", "schemes-paper-rule"), lip_tables.schemes),
     "visemes": Part(("visemes",), lip_tables.viseme_fit),
     "ferguson": Part(("ferguson",), lip_tables.ferguson),
-    "system": Part(("chain", "load", "busy", "browser", "sizes"), system_tables.system),
+    "system": Part(("chain", "load", "busy", "browser", "package", "sizes"), system_tables.system),
     "faults": Part(("faults",), system_tables.faults),
 }
 

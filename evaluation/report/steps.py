@@ -136,6 +136,11 @@ STEPS: Mapping[str, Step] = {
         ("clients/kouxing-lips", "evaluation/system/lips_page.py"),
         (f"bench lips-page {SAMPLE.relative_to(ROOT)}",),
     ),
+    "package": Step(
+        ("evaluate lips-package --clips {lips} --manifest {corpus}",),
+        ("clients/kouxing-lips/engine", "evaluation/system/lips_package.py", *_FACES),
+        (),
+    ),
     "sizes": Step(
         ("bench sizes",),
         ("services/recognizer/models/*.npz", "evaluation/system/sizes.py"),

@@ -20,7 +20,7 @@ _PACKAGE_FIGURES = {  # lower is better: name, scale and unit
 def system(results: Results) -> Table:
     """Return each figure of the running system with its physical floor."""
     return ("figure", "value", "floor", "source of the floor"), [
-        row for rows in (_chain, _load, _busy, _browser, _sizes) for row in rows(results)
+        row for rows in (_chain, _load, _busy, _browser, _package, _sizes) for row in rows(results)
     ]
 
 
@@ -135,6 +135,21 @@ def _browser(results: Results) -> Iterator[list[str]]:
             "",
             "",
         ]
+
+
+def _package(results: Results) -> Iterator[list[str]]:
+    package = results.get("package")
+    if not package:
+        return
+
+    def row(title: str, values: list[str]) -> list[str]:
+        return [f"server and kouxing-lips: {title}", join_values(values), "", ""]
+
+    correlation, f1 = package["opening_correlation"], package["closure_f1"]
+    yield row("correlation of the opening", [format_number(r, ".3f") for r in correlation.values()])
+    yield row("F1 of closures", [format_number(value, ".3f") for value in f1.values()])
+    for model, rates in package["phone_error_rate"].items():
+        yield row(f"wrong phones ({model}), difference, %", [percent(r) for r in rates.values()])
 
 
 def better_packages(results: Results) -> list[str]:

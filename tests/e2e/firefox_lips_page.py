@@ -13,7 +13,7 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
 from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, frames_of
 from tests.firefox import Firefox
-from tests.process.test_lips_package import package_faps
+from tests.process.test_lips_package import faps_of
 from tests.sound_server import sound_server
 from tests.system import DEMO, samples_of_file
 
@@ -91,7 +91,7 @@ def test_the_microphone_sends_sound(browser: Firefox) -> None:
 def test_frames_equal_those_of_node(browser: Firefox, site: Path) -> None:
     samples = samples_of_file(DEMO / "lake-male.wav")
     faps = frames_of(browser, samples)
-    np.testing.assert_allclose(faps, package_faps(site / "models", samples), atol=1e-3)
+    np.testing.assert_allclose(faps, faps_of(site / "models", samples), atol=1e-3)
 
 
 def test_sound_before_a_click_gives_a_notice(browser: Firefox) -> None:

@@ -11,7 +11,7 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
 from tests.browser import Browser
 from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, frames_of
-from tests.process.test_lips_package import package_faps
+from tests.process.test_lips_package import faps_of
 from tests.system import DEMO, NODE, samples_of_file
 
 SIZE_PX = (320, 480)  # heads are drawn without a GPU
@@ -98,7 +98,7 @@ def test_frames_in_the_browser_equal_those_of_node(
             browser.wait_for("document.getElementById('final').ariaPressed === 'true'")
             browser.evaluate(f"{FACE}.lips.then((lips) => {{ window.lips = lips; return 1; }})")
         faps = frames_of(browser, samples)
-    expected = package_faps(tmp_path, samples, phones=phones)
+    expected = faps_of(tmp_path, samples, phones=phones)
     np.testing.assert_allclose(faps, expected, atol=1e-3)
 
 

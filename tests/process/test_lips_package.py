@@ -3,7 +3,7 @@
 import difflib
 import json
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,9 @@ import pytest
 import soxr
 from numpy.typing import NDArray
 
-from kouxing.services.cli.web_model import web_model
-from kouxing.services.live_chain import sound_events
-from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.evaluation.system import lips_package
+from kouxing.evaluation.system.lips_package import exported_models, package_faps, server_events
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.shapes import SHAPE_SETS
@@ -27,7 +24,7 @@ from tests.system import DEMO, NODE, ROOT, VOWELS_FILE, samples_of_file
 
 SCRIPTS = ROOT / "clients" / "kouxing-lips" / "tests"
 RATE_HZ = 16_000
-DELAY_S, FRAME_RATE_HZ, EXPRESSIVENESS, FEELING = 0.06, 50.0, 1.4, 0.5
+DELAY_S, FRAME_RATE_HZ = 0.06, 50.0
 HEAD_TURN = slice(47, 50)  # FAPs 48 to 50
 TONGUE = [13, 43, 44, 45, 46]  # FAPs 14, and 44 to 47: jaw thrust and tongue
 FILES = [
@@ -41,33 +38,19 @@ Frames = NDArray[np.float32]
 
 
 @pytest.fixture(scope="module")
-def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("models")
-    for name, content in web_model().items():
-        (folder / name).write_bytes(content)
-    return folder
+def models() -> Iterator[Path]:
+    with exported_models() as folder:
+        yield folder
 
 
 def package_output(models: Path, samples: Frames, **options: Any) -> dict[str, Any]:
-    file = models / "sound.f32"
-    samples.astype("<f4").tofile(file)
-    arguments = json.dumps({"chunk": 441, "shapes": [*SHAPE_SETS], **options})
-    printed = subprocess.run(
-        [NODE, SCRIPTS / "frames.mjs", models, file, arguments],
-        capture_output=True,
-        check=True,
-        timeout=120,
+    return lips_package.package_output(
+        models, samples, **{"chunk": 441, "shapes": [*SHAPE_SETS], **options}
     )
-    output: dict[str, Any] = json.loads(printed.stdout)
-    return output
 
 
-def faps_of(output: dict[str, Any]) -> Frames:
-    return np.array([frame["faps"] for frame in output["frames"]], np.float32)
-
-
-def package_faps(models: Path, samples: Frames, **options: Any) -> Frames:
-    return faps_of(package_output(models, samples, **options))
+def faps_of(models: Path, samples: Frames, **options: Any) -> Frames:
+    return package_faps(package_output(models, samples, **options))
 
 
 @cache
@@ -75,21 +58,9 @@ def output_of(models: Path, file: Path) -> dict[str, Any]:
     return package_output(models, samples_of_file(file))
 
 
-def server_events(samples: Frames, acoustic: str = "light") -> list[SoundEvent]:
-    config = RecognizerConfig(acoustic=acoustic)
-    return sound_events(load_model(acoustic), samples, load_lip_predictor(), DELAY_S, config)
-
-
-def server_faps(events: Sequence[SoundEvent], feeling: float = FEELING) -> Frames:
+def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> Frames:
     """Return the server's frames without idle motion and tongue."""
-    face = FaceAnimator(
-        load_lip_model(),
-        frame_rate_hz=FRAME_RATE_HZ,
-        delay_s=DELAY_S,
-        expressiveness=EXPRESSIVENESS,
-        feeling=feeling,
-    )
-    faps = np.array([frame for event in events for _, frame in face.process(event)])
+    faps = lips_package.server_faps(events, feeling)
     faps[:, TONGUE] = 0.0
     return faps
 
@@ -120,7 +91,7 @@ def test_frames_and_final_phones_equal_the_servers(models: Path, file: Path) -> 
 
 
 def check_frames_and_phones(output: dict[str, Any], events: Sequence[SoundEvent]) -> None:
-    assert_equal(faps_of(output), server_faps(events))
+    assert_equal(package_faps(output), server_faps(events))
     ours = [p for p in output["phones"] if p["isFinal"] and p["durationS"] > 0]
     theirs = [e for e in events if isinstance(e, Phone) and e.final and e.duration_s > 0]
     different = edit_distance([p["symbol"] for p in ours], [phone.symbol for phone in theirs])
@@ -141,29 +112,27 @@ def test_pauses_and_loud_and_quiet_speech(models: Path) -> None:
         samples_of_file(DEMO / "fast-female.wav"),
     )
     samples = np.concatenate([np.zeros(7001, np.float32), 0.1 * speech, np.zeros(20_000), other])
-    assert_equal(
-        package_faps(models, samples), server_faps(server_events(samples.astype(np.float32)))
-    )
+    assert_equal(faps_of(models, samples), server_faps(server_events(samples.astype(np.float32))))
 
 
 def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
     samples = samples_of_file(DEMO / "bilabials-female.wav")
     without = [event for event in server_events(samples) if not isinstance(event, Phone)]
-    assert_equal(package_faps(models, samples, phones=False), server_faps(without))
+    assert_equal(faps_of(models, samples, phones=False), server_faps(without))
 
 
 @pytest.mark.parametrize("rate_hz", [8_000, 48_000])
 def test_resamples_like_the_server(models: Path, rate_hz: int) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")
     resampled = soxr.resample(samples, RATE_HZ, rate_hz)
-    ours = package_faps(models, resampled, sampleRateHz=rate_hz)
+    ours = faps_of(models, resampled, sampleRateHz=rate_hz)
     assert_equal(ours, server_faps(server_events(to_16_khz(resampled, rate_hz))))
 
 
 def test_any_chunks_give_the_same_frames(models: Path) -> None:
     file = DEMO / "lake-male.wav"
     assert np.array_equal(
-        faps_of(output_of(models, file)), package_faps(models, samples_of_file(file), chunk=97)
+        package_faps(output_of(models, file)), faps_of(models, samples_of_file(file), chunk=97)
     )
 
 

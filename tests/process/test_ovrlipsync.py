@@ -13,6 +13,7 @@ import pytest
 import soxr
 from numpy.typing import NDArray
 
+from kouxing.evaluation.system.lips_package import server_events
 from kouxing.services.cli.web_model import web_model
 from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -21,7 +22,7 @@ from kouxing.services.recognizer.voice_traits import load_voice_readout
 from kouxing.shared.face.shapes import OCULUS
 from kouxing.shared.phones.events import Phone
 from tests.documents import code_blocks
-from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, server_events, server_faps
+from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, server_faps
 from tests.system import DEMO, NODE, ROOT, samples_of_file
 
 SOURCE = ROOT / "clients" / "ovrlipsync"

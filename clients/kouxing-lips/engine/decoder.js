@@ -17,8 +17,8 @@ export class Decoder {
   #tokenOf; // by context
   #entry;
   #entryLink;
-  #logProbs;
-  #nextContexts;
+  #probabilities; // of the states, by the scores of one frame
+  #numPhones;
 
   constructor(lm, hmms, { constants }) {
     this.#c = constants.decoder;
@@ -35,8 +35,8 @@ export class Decoder {
     this.#entry = new Float32Array(maxTokens);
     this.#entryLink = new Int32Array(maxTokens);
     this.#roots = new Float32Array(numPhones);
-    this.#logProbs = new Float32Array(numPhones);
-    this.#nextContexts = new Int32Array(numPhones);
+    this.#probabilities = new Float32Array(hmms.firstState[numPhones]);
+    this.#numPhones = numPhones;
     this.reset();
   }
 
@@ -182,15 +182,21 @@ export class Decoder {
   #phonePenalty(scores) {
     const { SLOW_RATE, RATE_FRAMES, MAX_PENALTY_CHANGE } = this.#c;
     const { firstState, penalty, rateWeight } = this.#hmms;
-    const highest = scores.reduce((one, other) => Math.max(one, other));
-    const probabilities = scores.map((score) => Math.exp(score - highest));
-    const total = probabilities.reduce((one, other) => one + other);
+    const [probabilities, roots] = [this.#probabilities, this.#roots];
+    let highest = -Infinity;
+    for (let state = 0; state < scores.length; state++) if (scores[state] > highest) highest = scores[state];
+    let total = 0;
+    for (let state = 0; state < scores.length; state++) {
+      probabilities[state] = Math.exp(scores[state] - highest);
+      total += probabilities[state];
+    }
     let overlap = 0;
-    for (let phone = 0; phone < this.#roots.length; phone++) {
-      const states = probabilities.subarray(firstState[phone], firstState[phone + 1]);
-      const root = Math.sqrt(states.reduce((one, other) => one + other) / total);
-      overlap += root * this.#roots[phone];
-      this.#roots[phone] = root;
+    for (let phone = 0, state = 0; phone < roots.length; phone++) {
+      let sum = 0;
+      for (; state < firstState[phone + 1]; state++) sum += probabilities[state];
+      const root = Math.sqrt(sum / total);
+      overlap += root * roots[phone];
+      roots[phone] = root;
     }
     if (this.numFrames) this.#rate += (1 - overlap - this.#rate) / RATE_FRAMES;
     const change = rateWeight * (this.#rate - SLOW_RATE);
@@ -220,24 +226,26 @@ export class Decoder {
   #continueFrom(context, leaving, record, penalty) {
     const { BEAM, IMPOSSIBLE, MAX_TOKENS } = this.#c;
     const { lmScale, silence } = this.#hmms;
-    this.#lm.lookUp(context, this.#logProbs, this.#nextContexts);
-    if (this.numFrames === 0) this.#logProbs[silence] = 0;
-    for (let phone = 0; phone < this.#logProbs.length; phone++) {
-      const candidate = Math.fround(Math.fround(leaving + Math.fround(lmScale * this.#logProbs[phone])) + penalty);
+    const [lm, tokenOf, entry] = [this.#lm, this.#tokenOf, this.#entry];
+    const { logProbs, nextContexts } = lm;
+    const row = lm.rowOf(context);
+    for (let phone = 0; phone < this.#numPhones; phone++) {
+      const logProb = this.numFrames === 0 && phone === silence ? 0 : logProbs[row + phone];
+      const candidate = Math.fround(Math.fround(leaving + Math.fround(lmScale * logProb)) + penalty);
       if (candidate < -BEAM) continue;
-      const next = this.#nextContexts[phone];
-      if (this.#tokenOf[next] === NO_TOKEN) {
+      const next = nextContexts[row + phone];
+      if (tokenOf[next] === NO_TOKEN) {
         if (this.numTokens === MAX_TOKENS) continue;
         const token = this.numTokens++;
         this.#context[token] = next;
-        this.#tokenOf[next] = token;
+        tokenOf[next] = token;
         const begin = token * this.#maxStates;
         this.#score.fill(IMPOSSIBLE, begin, begin + this.#maxStates);
         this.#link.fill(NO_RECORD, begin, begin + this.#maxStates);
       }
-      const following = this.#tokenOf[next];
-      if (candidate > this.#entry[following]) {
-        this.#entry[following] = candidate;
+      const following = tokenOf[next];
+      if (candidate > entry[following]) {
+        entry[following] = candidate;
         this.#entryLink[following] = record;
       }
     }
@@ -247,28 +255,29 @@ export class Decoder {
   #advanceStates(scores) {
     const { IMPOSSIBLE } = this.#c;
     const { firstState, logStay, logLeave } = this.#hmms;
+    const [scoreOf, linkOf, top, maxStates] = [this.#score, this.#link, this.#top, this.#maxStates];
     let highest = IMPOSSIBLE;
     let bestToken = 0;
     let bestState = 0;
     for (let token = 0; token < this.numTokens; token++) {
       const phone = this.#phoneOf(token);
       const first = firstState[phone];
-      const begin = token * this.#maxStates;
-      this.#top[token] = IMPOSSIBLE;
+      const begin = token * maxStates;
+      let highestOfToken = IMPOSSIBLE;
       for (let state = firstState[phone + 1] - first - 1; state >= 0; state--) {
-        let value = Math.fround(this.#score[begin + state] + logStay[first + state]);
-        let link = this.#link[begin + state];
-        const moved = state ? Math.fround(this.#score[begin + state - 1] + logLeave[first + state - 1]) : this.#entry[token];
+        let value = Math.fround(scoreOf[begin + state] + logStay[first + state]);
+        let link = linkOf[begin + state];
+        const moved = state ? Math.fround(scoreOf[begin + state - 1] + logLeave[first + state - 1]) : this.#entry[token];
         if (moved > value) {
           value = moved;
-          link = state ? this.#link[begin + state - 1] : this.#entryLink[token];
+          link = state ? linkOf[begin + state - 1] : this.#entryLink[token];
         }
         const sum = Math.fround(value + scores[first + state]);
         const score = sum > IMPOSSIBLE ? sum : IMPOSSIBLE;
-        this.#score[begin + state] = score;
-        this.#link[begin + state] = link;
-        if (score > this.#top[token]) {
-          this.#top[token] = score;
+        scoreOf[begin + state] = score;
+        linkOf[begin + state] = link;
+        if (score > highestOfToken) {
+          highestOfToken = score;
           if (score > highest) {
             highest = score;
             bestToken = token;
@@ -276,6 +285,7 @@ export class Decoder {
           }
         }
       }
+      top[token] = highestOfToken;
     }
     return [bestToken, bestState];
   }
@@ -283,19 +293,22 @@ export class Decoder {
   /** Subtract the best score, so that numbers stay small; return the last phone's confidence. */
   #normalize() {
     const { BEAM, IMPOSSIBLE } = this.#c;
+    const [scoreOf, top, maxStates] = [this.#score, this.#top, this.#maxStates];
     const [bestToken, bestState] = this.best;
-    const best = this.#score[bestToken * this.#maxStates + bestState];
+    const best = scoreOf[bestToken * maxStates + bestState];
     const bestPhone = this.#phoneOf(bestToken);
     let [share, total] = [0, 0];
     for (let token = 0; token < this.numTokens; token++) {
       let before = NO_RECORD;
-      for (let place = token * this.#maxStates; place < (token + 1) * this.#maxStates; place++) {
-        if (this.#score[place] === this.#top[token]) before = this.#link[place];
-        if (this.#score[place] > IMPOSSIBLE) this.#score[place] -= best;
+      const end = (token + 1) * maxStates;
+      for (let place = token * maxStates; place < end; place++) {
+        const score = scoreOf[place];
+        if (score === top[token]) before = this.#link[place];
+        if (score > IMPOSSIBLE) scoreOf[place] = score - best;
       }
-      this.#top[token] -= best;
-      if (this.#top[token] <= -BEAM) continue;
-      const weight = Math.exp(this.#top[token]);
+      top[token] -= best;
+      if (top[token] <= -BEAM) continue;
+      const weight = Math.exp(top[token]);
       total += weight;
       if (this.#phoneOf(token) === bestPhone || this.records[before]?.phone === bestPhone) share += weight;
     }

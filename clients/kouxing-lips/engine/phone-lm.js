@@ -3,6 +3,9 @@
 
 import { floats } from "./math.js";
 
+const NUM_ROWS = 512; // of contexts that were looked up last
+const NO_CONTEXT = -1;
+
 export class PhoneLm {
   /** Node whose n-grams continue a node's. */
   contextOf;
@@ -12,6 +15,12 @@ export class PhoneLm {
   logBackoff;
   /** Last phone of a node. */
   phone;
+  /** Rows of log-probabilities of the phones after a context. */
+  logProbs;
+  /** Rows of the contexts that these phones lead to. */
+  nextContexts;
+  #contexts = new Int32Array(NUM_ROWS).fill(NO_CONTEXT); // by row
+  #numPhones;
   #firstChild;
   #logProb;
 
@@ -37,6 +46,9 @@ export class PhoneLm {
       }
     }
     this.backoff = shorter.map((node) => this.contextOf[node]);
+    this.#numPhones = phoneArrays.first_state.values.length - 1;
+    this.logProbs = new Float32Array(NUM_ROWS * this.#numPhones);
+    this.nextContexts = new Int32Array(this.logProbs.length);
   }
 
   /** Return the node of a phone after a context, or after the longest ending of it that has one. */
@@ -50,15 +62,26 @@ export class PhoneLm {
     }
   }
 
-  /** Fill in the log-probability of each phone after a context, and the context it leads to. */
-  lookUp(context, logProbs, nextContexts) {
+  /**
+   * Return the place of a context's row in logProbs and nextContexts. The row is valid until the next call.
+   */
+  rowOf(context) {
+    const row = context % NUM_ROWS;
+    const at = row * this.#numPhones;
+    if (this.#contexts[row] === context) return at;
+    const end = at + this.#numPhones;
     if (context !== 0) {
-      this.lookUp(this.backoff[context], logProbs, nextContexts);
-      for (let phone = 0; phone < logProbs.length; phone++) logProbs[phone] += this.logBackoff[context];
+      const before = this.rowOf(this.backoff[context]);
+      for (let i = at, from = before; i < end; i++, from++) {
+        this.logProbs[i] = this.logProbs[from] + this.logBackoff[context];
+        this.nextContexts[i] = this.nextContexts[from];
+      }
     }
     for (let child = this.#firstChild[context]; child < this.#firstChild[context + 1]; child++) {
-      logProbs[this.phone[child]] = this.#logProb[child];
-      nextContexts[this.phone[child]] = this.contextOf[child];
+      this.logProbs[at + this.phone[child]] = this.#logProb[child];
+      this.nextContexts[at + this.phone[child]] = this.contextOf[child];
     }
+    this.#contexts[row] = context;
+    return at;
   }
 }

@@ -1,0 +1,204 @@
+"""Compares the package ``kouxing-lips`` with the server, on the same recordings.
+
+Both have their default settings. The server's face has no idle motion. The opening and the
+closures are compared with real lips, the final phones with forced alignment. The package runs in
+Node. The tests show that frames in browsers are the same.
+"""
+
+import json
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from kouxing.corpora.scoring import ErrorCounts, count_errors
+from kouxing.evaluation.lips.agreement import Agreement, agreement_of
+from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, animate_live
+from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.references import clips_to_score
+from kouxing.evaluation.recognizer.references import Reference, align_corpus
+from kouxing.evaluation.rivals.tables import find_node
+from kouxing.evaluation.tables import format_number, percent
+from kouxing.services.cli.web_model import web_model
+from kouxing.services.live_chain import sound_events
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone, SoundEvent
+from kouxing.shared.terminal import CONSOLE, print_table
+
+Samples = NDArray[np.float32]
+Faps = NDArray[np.float32]
+
+SERVER, PACKAGE, DIFFERENCE = "server", "package", "difference"
+_SCRIPT = Path(__file__).resolve().parents[2] / "clients/kouxing-lips/demo/frames.mjs"
+_PHONES = {"light": True, "blocks": "final"}  # the package's option for each acoustic model
+_LIMIT_S = 600.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """Figures of the server and of the package, by these names."""
+
+    num_clips: int
+    opening_correlation: dict[str, float | None]
+    closure_f1: dict[str, float | None]
+    num_recordings: int
+    # by acoustic model; "difference" is that of the package from the server
+    phone_error_rate: dict[str, dict[str, float]]
+
+
+@contextmanager
+def exported_models() -> Iterator[Path]:
+    """Write the models of the package to a temporary folder."""
+    with tempfile.TemporaryDirectory() as name:
+        for file, content in web_model().items():
+            (Path(name) / file).write_bytes(content)
+        yield Path(name)
+
+
+def package_output(models: Path, samples: Samples, **options: Any) -> dict[str, Any]:
+    """Run the package in Node on samples, 16 kHz mono, or at ``sampleRateHz`` of the options.
+
+    Returns ``names``, ``frames`` and ``phones`` of the engine, or ``error``.
+    """
+    file = models / "sound.f32"
+    samples.astype("<f4").tofile(file)
+    done = subprocess.run(  # noqa: S603
+        [find_node(), _SCRIPT, models, file, json.dumps({"chunk": 320, "shapes": [], **options})],
+        capture_output=True,
+        check=False,
+        timeout=_LIMIT_S,
+    )
+    if done.returncode:
+        raise UserError(f"Node failed: {done.stderr.decode(errors='replace')[-300:]}")
+    output: dict[str, Any] = json.loads(done.stdout)
+    return output
+
+
+def package_faps(output: dict[str, Any]) -> Faps:
+    """Return the FAPs of the output's frames (F, 68)."""
+    return np.array([frame["faps"] for frame in output["frames"]], np.float32)
+
+
+def package_phones(output: dict[str, Any]) -> list[str]:
+    """Return the final phones of the output, without silence."""
+    phones = (
+        Phone(
+            index=phone["index"],
+            symbol=phone["symbol"],
+            onset_s=phone["onsetS"],
+            duration_s=phone["durationS"],
+            confidence=phone["confidence"],
+            final=phone["isFinal"],
+        )
+        for phone in output["phones"]
+    )
+    return [phone.symbol for phone in phones if phone.is_spoken]
+
+
+def server_events(samples: Samples, acoustic: str = "light") -> list[SoundEvent]:
+    """Return the events of the server's recognizer, for a face with the default delay."""
+    delay_s = SynthesizerConfig().delay_ms / 1e3
+    config = RecognizerConfig(acoustic=acoustic)
+    return sound_events(load_model(acoustic), samples, load_lip_predictor(), delay_s, config)
+
+
+def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> Faps:
+    """Return the server's frames (F, 68), without idle motion.
+
+    ``feeling`` replaces that of the default settings.
+    """
+    settings = SynthesizerConfig()
+    face = FaceAnimator(
+        load_lip_model(),
+        frame_rate_hz=FRAME_RATE_HZ,
+        delay_s=settings.delay_ms / 1e3,
+        expressiveness=settings.expressiveness,
+        feeling=settings.feeling if feeling is None else feeling,
+    )
+    return np.array([faps for _, faps in animate_live(face, events)])
+
+
+def compare(
+    clips: Path, manifest: Path | None = None, split: str = "test", audio: Path | None = None
+) -> Comparison:
+    """Compare on held-out clips with tracked lips and, if given, one split of a corpus.
+
+    Raises ``UserError`` if a folder has no recordings, or Node is not installed.
+    """
+    references = align_corpus(load_model("blocks"), manifest, split, audio) if manifest else []
+    with exported_models() as models:
+        num_clips, agreements = _compare_lips(models, clips)
+        counts = {name: _compare_phones(models, references, name) for name in _PHONES if references}
+    return Comparison(
+        num_clips=num_clips,
+        opening_correlation={
+            name: figures.correlation["opening"] for name, figures in agreements.items()
+        },
+        closure_f1={name: figures.closure_f1 for name, figures in agreements.items()},
+        num_recordings=len(references),
+        phone_error_rate={
+            model: {name: errors.rate for name, errors in by_name.items()}
+            for model, by_name in counts.items()
+        },
+    )
+
+
+def _compare_lips(models: Path, folder: Path) -> tuple[int, dict[str, Agreement]]:
+    clips = clips_to_score(folder, language=None)
+    pairs: dict[str, list[Any]] = {SERVER: [], PACKAGE: []}
+    for clip in track(clips, "clips", console=CONSOLE, transient=True):
+        real = real_mouth(clip.time_s, real_faps(clip))
+        faps = {
+            SERVER: server_faps(server_events(clip.samples)),
+            PACKAGE: package_faps(package_output(models, clip.samples)),
+        }
+        for name, predicted in faps.items():
+            pairs[name].append((predicted_mouth(predicted.astype(float)), real))
+    return len(clips), {name: agreement_of(of_name) for name, of_name in pairs.items()}
+
+
+def _compare_phones(
+    models: Path, references: Sequence[Reference], acoustic: str
+) -> dict[str, ErrorCounts]:
+    """Count the errors of server and package, and the differences between both."""
+    counts = {name: ErrorCounts() for name in (SERVER, PACKAGE, DIFFERENCE)}
+    for reference in track(references, acoustic, console=CONSOLE, transient=True):
+        samples = reference.read_audio()
+        truth = [phone.symbol for phone in reference.phones]
+        theirs = [
+            event.symbol
+            for event in server_events(samples, acoustic)
+            if isinstance(event, Phone) and event.is_spoken
+        ]
+        ours = package_phones(package_output(models, samples, phones=_PHONES[acoustic]))
+        counts[SERVER] += count_errors(truth, theirs)
+        counts[PACKAGE] += count_errors(truth, ours)
+        counts[DIFFERENCE] += count_errors(theirs, ours)
+    return counts
+
+
+def show(comparison: Comparison, console: Console) -> None:
+    """Print the figures as a table."""
+    correlation, f1 = comparison.opening_correlation, comparison.closure_f1
+    rows = [
+        ["opening r", *(format_number(correlation[name], ".3f") for name in (SERVER, PACKAGE))],
+        ["closures F1", *(format_number(f1[name], ".3f") for name in (SERVER, PACKAGE))],
+    ]
+    for model, rates in comparison.phone_error_rate.items():
+        names = SERVER, PACKAGE, DIFFERENCE
+        rows.append([f"{model}, wrong phones, %", *(percent(rates[name], ".2f") for name in names)])
+    print_table(console, "", ["figure", SERVER, PACKAGE, DIFFERENCE], rows)
