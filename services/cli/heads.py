@@ -61,7 +61,7 @@ def import_mesh(
         Path,
         typer.Option(
             help="MPEG-4 feature points: a file of lines 'point x y z' or 'point vertex' (counted"
-            " from 0)."
+            " from 0), or an XfaceEd .fdp file."
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Head to write (.npz).")],

@@ -114,6 +114,23 @@ def test_obj_with_vertex_numbers_and_seams(tmp_path: Path) -> None:
         assert np.abs(first_of[group] - values).max() < 1e-4
 
 
+def test_reads_an_fdp_file(face: Path, tmp_path: Path) -> None:
+    skin = ORIGINAL.part("skin").vertices
+    entries = "".join(
+        f'<fdp name="{name}" affects="skin" index="{vertex}"><indices>1 2 3</indices></fdp>'
+        for name, vertex in ORIGINAL.feature_points.items()
+        if skin.start <= vertex < skin.stop and name != "9.15"
+    )
+    mns = ORIGINAL.fapu["MNS"]
+    text = f'<?xml version="1.0"?><xfdp><head><fapu MNS0="{mns}" MW0="1"/></head>{entries}</xfdp>'
+    (tmp_path / "face.fdp").write_text(text, encoding="utf-8")
+    import_head(face, tmp_path / "face.fdp", tmp_path / "out.npz")
+    head = Head.load(tmp_path / "out.npz")
+    scale = head.fapu["ES"] / ORIGINAL.fapu["ES"]
+    assert head.fapu["MNS"] == pytest.approx(mns * scale, rel=0.02)
+    assert moved(head, OPEN)[head.feature_points["2.1"], 1] < -0.3 * head.fapu["MNS"]
+
+
 @pytest.fixture
 def face(tmp_path: Path) -> Path:
     return write_glb(tmp_path / "face.glb", meshes())
@@ -130,6 +147,9 @@ def face(tmp_path: Path) -> Path:
         ("2.1 0 0 0\n2.1 0 0 0", "line 2: 2.1 occurs twice"),
         ("2.1 1000000", "vertex 1000000, but the last vertex is"),
         ("2.1 0 -0.07 0.07", r"points are missing: 2.2, .* 8.8, 3.5 \(or its eyelids\)"),
+        ("<xfdp><fdp", "invalid XML"),
+        ("<!DOCTYPE x><xfdp/>", "document type"),
+        ("<xfdp><fdp name='2.1' affects='skin'/></xfdp>", "index is missing"),
     ],
 )
 def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, message: str) -> None:

@@ -48,7 +48,7 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
     ("a.gltf", lambda path: load_head(str(path))),
     ("a.ply", read_mesh),
     ("a.obj", read_mesh),
-    ("a.points", read_points),
+    ("a.fdp", read_points),
     ("a.mouth", read_mouth_profile),
     ("a.landmarks", read_speech),
     ("a.toml", lambda path: config(config=path)),

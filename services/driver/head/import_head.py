@@ -26,7 +26,7 @@ from kouxing.services.driver.head.import_fields import (
 )
 from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
 from kouxing.services.driver.head.pieces import Fields, Primitive, pack, weld
-from kouxing.services.driver.head.points_file import Position, read_points
+from kouxing.services.driver.head.points_file import FeaturePoints, read_points
 from kouxing.services.driver.head.surface import Geodesics
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
@@ -55,26 +55,32 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
     count = sum(len(piece.vertices) for piece in pieces)
     if count > MAX_VERTICES:
         raise UserError(f"{mesh} has {count} vertices; reduce it to at most {MAX_VERTICES}")
-    positions = _positions(mesh, points, pieces, read_points(points))
-    arrays, warnings = _Import(mesh, points, pieces, positions).run()
+    feature_points = read_points(points)
+    positions = _positions(mesh, points, pieces, feature_points)
+    arrays, warnings = _Import(mesh, points, pieces, positions, feature_points).run()
     with open_output(output) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     return warnings
 
 
 def _positions(
-    mesh: Path, path: Path, pieces: list[Primitive], points: dict[str, Position | int]
+    mesh: Path, path: Path, pieces: list[Primitive], points: FeaturePoints
 ) -> dict[str, Float64]:
     """Return the coordinates of every point in the mesh's own axes."""
-    vertices = numbered_vertices(mesh, pieces)
+    vertices, named = numbered_vertices(mesh, pieces)
     positions = {}
-    for name, position in points.items():
-        if isinstance(position, int) and position >= len(vertices):
-            raise UserError(
-                f"{path}: {name} is vertex {position}, but the last vertex is"
-                f" {len(vertices) - 1}; vertices count from 0"
-            )
-        positions[name] = vertices[position] if isinstance(position, int) else position
+    for name, position in points.positions.items():
+        if isinstance(position, np.ndarray):
+            positions[name] = position
+        else:
+            mesh_name, number = position
+            candidates = named.get(mesh_name, vertices)
+            if number >= len(candidates):
+                raise UserError(
+                    f"{path}: {name} is vertex {number}, but the last vertex is"
+                    f" {len(candidates) - 1}; vertices count from 0"
+                )
+            positions[name] = candidates[number]
     return positions
 
 
@@ -87,9 +93,11 @@ class _Import:
         path: Path,
         pieces: list[Primitive],
         positions: dict[str, Float64],
+        feature_points: FeaturePoints,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
         self._warnings: list[str] = []
+        self._stated_fapu = feature_points.fapu
         self._find_frame(positions)
         self._join()
         self._snap(positions)
@@ -134,7 +142,7 @@ class _Import:
                 eyes[name] = (positions[lids[0]] + positions[lids[1]]) / 2
         missing = [name for name in NEEDED if name not in positions]
         missing += [f"{name} (or its eyelids)" for name in ("3.5", "3.6") if name not in eyes]
-        if "9.15" not in positions:
+        if "9.15" not in positions and "MNS" not in self._stated_fapu:
             missing.append("9.15")
         if missing:
             raise self._fail(f"points are missing: {', '.join(missing)}")
@@ -245,9 +253,10 @@ class _Import:
         def height(name: str) -> float:
             return float(self._welded[self._points[name], 1])
 
+        stated = {name: length * self._scale for name, length in self._stated_fapu.items()}
         eyes, points = float(self._eyes.mean(axis=0)[1]), self._points
         corners = self._welded[[points["8.3"], points["8.4"]], 0]
-        nose = height("9.15")
+        nose = height("9.15") if "9.15" in points else height("2.2") + stated["MNS"]
         fapu = {
             "MNS": nose - height("2.2"),
             "MW": float(corners[0] - corners[1]),
@@ -256,7 +265,7 @@ class _Import:
             "IRISD": height("3.1") - height("3.3") if {"3.1", "3.3"} <= set(points) else 0.0,
         }
         if fapu["IRISD"] <= 0:
-            fapu["IRISD"] = 0.163 * EYE_DISTANCE_M
+            fapu["IRISD"] = stated.get("IRISD", 0.163 * EYE_DISTANCE_M)
         wrong = [name for name, length in fapu.items() if length <= 0]
         if wrong:
             raise self._fail(

@@ -124,15 +124,16 @@ def _from_trimesh(mesh: Any) -> Primitive:
     )
 
 
-def numbered_vertices(mesh: Path, pieces: list[Primitive]) -> Float64:
-    """Return the vertices (V, 3) in file order.
+def numbered_vertices(mesh: Path, pieces: list[Primitive]) -> tuple[Float64, dict[str, Float64]]:
+    """Return the vertices (V, 3) in file order: all of them, and by mesh name.
 
     Raises ``UserError`` if a vertex line of an OBJ file is invalid.
     """
     # the pieces of an OBJ file repeat a vertex for each texture coordinate
     if mesh.suffix.lower() != ".obj":
-        return np.concatenate([piece.vertices for piece in pieces])
+        return np.concatenate([p.vertices for p in pieces]), {p.name: p.vertices for p in pieces}
     rows: list[list[float]] = []
+    starts: dict[str, int] = {}
     text = read_file(mesh, MAX_MESH_BYTES).decode("utf-8", "replace")
     for line in io.StringIO(text, None):
         words = line.split()
@@ -144,4 +145,11 @@ def numbered_vertices(mesh: Path, pieces: list[Primitive]) -> Float64:
                     f"{mesh}: {line.strip()!r} is not a valid vertex; export the mesh again"
                 ) from None
             rows.append([x, y, z])
-    return np.array(rows)
+        elif words[:1] in (["o"], ["g"]) and len(words) > 1:
+            starts.setdefault(words[1], len(rows))
+    vertices = np.array(rows)
+    ends = [*starts.values(), len(rows)][1:]  # none if the file names no mesh
+    named = {
+        name: vertices[a:b] for (name, a), b in zip(starts.items(), ends, strict=True) if b > a
+    }
+    return vertices, named if len(named) > 1 else {}
