@@ -15,7 +15,7 @@ export class Blinks {
   apply(values, names, nowS) {
     this.#startS ??= nowS + drawInterval();
     if (nowS > this.#startS + FALL_S + CLOSED_S + RISE_S) this.#startS = nowS + drawInterval();
-    const closed = shareAt(nowS - this.#startS);
+    const closed = amountAt(nowS - this.#startS);
     if (names.length === 0) LIDS.forEach((fap, i) => (values[fap] += closed * (CLOSED[i] - values[fap])));
     for (const name of ["eyeBlinkLeft", "eyeBlinkRight", "blink"]) {
       const i = names.indexOf(name);
@@ -25,12 +25,12 @@ export class Blinks {
 }
 
 /** Return how far the lids are closed, 0 to 1, at a time after the start of a blink. */
-function shareAt(sinceS) {
+function amountAt(sinceS) {
   return sinceS < FALL_S + CLOSED_S ? smoothStep(sinceS / FALL_S) : 1 - smoothStep((sinceS - FALL_S - CLOSED_S) / RISE_S);
 }
 
-function smoothStep(share) {
-  const x = Math.min(1, Math.max(0, share));
+function smoothStep(value) {
+  const x = Math.min(1, Math.max(0, value));
   return x * x * (3 - 2 * x);
 }
 

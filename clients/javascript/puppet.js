@@ -133,7 +133,7 @@ function morphAvatar(scene, meshes) {
       for (const { mesh, index, shape } of targets) {
         mesh.morphTargetInfluences[index] = weightOf.get(shape) ?? 0;
       }
-      turnJaw(Object.entries(OPENINGS).reduce((sum, [shape, share]) => sum + share * (weightOf.get(shape) ?? 0), 0));
+      turnJaw(Object.entries(OPENINGS).reduce((sum, [shape, opening]) => sum + opening * (weightOf.get(shape) ?? 0), 0));
     },
     update() {},
   };

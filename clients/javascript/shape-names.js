@@ -55,12 +55,12 @@ export function chooseSet(names) {
     const found = new Set(findShapes(set, names).values());
     const needed = SETS[set].filter(({ isNeeded }) => isNeeded).map(({ shape }) => shape);
     const missing = needed.filter((shape) => !found.has(shape));
-    const share = missing.length / needed.length - found.size / 1000; // between equals, known shapes decide
-    return { set, missing, speaks: found.has(needed[0]), share };
+    const penalty = missing.length / needed.length - found.size / 1000; // between equals, known shapes decide
+    return { set, missing, speaks: found.has(needed[0]), penalty };
   });
   const speaking = options.filter(({ speaks }) => speaks);
   const complete = speaking.find(({ missing }) => missing.length === 0);
-  const nearest = (list) => list.reduce((best, other) => (other.share < best.share ? other : best));
+  const nearest = (list) => list.reduce((best, other) => (other.penalty < best.penalty ? other : best));
   if (speaking.length > 0) return (complete ?? nearest(speaking.reverse())).set;
   const { set, missing } = nearest(options);
   throw new Error(

@@ -30,13 +30,13 @@ export class FrameTrack {
 }
 
 function mix(one, other, timeS) {
-  const share = (timeS - one.timeS) / (other.timeS - one.timeS);
+  const fraction = (timeS - one.timeS) / (other.timeS - one.timeS);
   const mixed = { ...one, timeS };
   for (const name of Object.keys(one)) {
     const [from, to] = [one[name], other[name]];
     if (!(from instanceof Float32Array)) continue;
     const values = new Float32Array(from.length);
-    for (let i = 0; i < values.length; i++) values[i] = from[i] + share * (to[i] - from[i]);
+    for (let i = 0; i < values.length; i++) values[i] = from[i] + fraction * (to[i] - from[i]);
     mixed[name] = values;
   }
   return mixed;

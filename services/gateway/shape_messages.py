@@ -1,4 +1,4 @@
-"""Messages with a frame's blend-shape weights, in the set and format that a viewer asked for."""
+"""Messages with a frame's blendshape weights, in the set and format that a viewer asked for."""
 
 import json
 from collections.abc import Mapping

@@ -297,7 +297,7 @@ export class Decoder {
     const [bestToken, bestState] = this.best;
     const best = scoreOf[bestToken * maxStates + bestState];
     const bestPhone = this.#phoneOf(bestToken);
-    let [share, total] = [0, 0];
+    let [agreeing, total] = [0, 0];
     for (let token = 0; token < this.numTokens; token++) {
       let before = NO_RECORD;
       const end = (token + 1) * maxStates;
@@ -310,9 +310,9 @@ export class Decoder {
       if (top[token] <= -BEAM) continue;
       const weight = Math.exp(top[token]);
       total += weight;
-      if (this.#phoneOf(token) === bestPhone || this.records[before]?.phone === bestPhone) share += weight;
+      if (this.#phoneOf(token) === bestPhone || this.records[before]?.phone === bestPhone) agreeing += weight;
     }
-    return share / total;
+    return agreeing / total;
   }
 
   /** Return the segments after the shared ones, up to the one of a record. */

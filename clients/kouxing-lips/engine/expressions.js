@@ -1,7 +1,7 @@
 // Expressions on a speaking face, and the size of mouth movements; shared/face/expression_motion.py
 // and services/synthesizer/modifiers/expressiveness.py have the formulas.
 
-import { clamp, smoothingShare } from "./math.js";
+import { clamp, smoothingGain } from "./math.js";
 
 /** The current expressions of the face. */
 export class Expressions {
@@ -46,11 +46,11 @@ export class Expressions {
     const isHeld = this.#remainingS > 0;
     this.#remainingS -= stepS;
     if (isSpeaking) this.#free = Math.max(this.#free - stepS / BIND_S, 0);
-    else this.#free += (1 - this.#free) * smoothingShare(stepS, FREE_S);
+    else this.#free += (1 - this.#free) * smoothingGain(stepS, FREE_S);
     if (!isHeld && !this.#isShown) return;
-    const share = smoothingShare(stepS, isHeld ? this.#easeS : FADE_S);
-    this.#halfway = this.#halfway.map((x, i) => x + share * ((isHeld ? this.#goal[i] : 0) - x));
-    this.#shown = this.#shown.map((x, i) => x + share * (this.#halfway[i] - x));
+    const gain = smoothingGain(stepS, isHeld ? this.#easeS : FADE_S);
+    this.#halfway = this.#halfway.map((x, i) => x + gain * ((isHeld ? this.#goal[i] : 0) - x));
+    this.#shown = this.#shown.map((x, i) => x + gain * (this.#halfway[i] - x));
     this.#mix(faps);
     this.#isShown = this.#shown.some((x) => Math.abs(x) > this.#c.VISIBLE);
   }

@@ -2,7 +2,7 @@
 // has the values.
 
 import { applyExpressiveness } from "./expressions.js";
-import { clamp, smoothingShare } from "./math.js";
+import { clamp, smoothingGain } from "./math.js";
 
 export class Feeling {
   #model;
@@ -19,9 +19,9 @@ export class Feeling {
   apply(faps, stepS, voice) {
     const { GAIN, FILTER_S, SIZE, AROUSED, TIRED, PLEASANT, UNPLEASANT } = this.#model.constants.feeling;
     const goal = voice ? [voice.arousal ?? 0, voice.valence ?? 0] : [0, 0];
-    const share = smoothingShare(stepS, FILTER_S);
-    this.#halfway = this.#halfway.map((x, i) => x + share * (this.#amount * clamp(GAIN * goal[i], -1, 1) - x));
-    this.#shown = this.#shown.map((x, i) => x + share * (this.#halfway[i] - x));
+    const gain = smoothingGain(stepS, FILTER_S);
+    this.#halfway = this.#halfway.map((x, i) => x + gain * (this.#amount * clamp(GAIN * goal[i], -1, 1) - x));
+    this.#shown = this.#shown.map((x, i) => x + gain * (this.#halfway[i] - x));
     const [arousal, valence] = this.#shown;
     applyExpressiveness(faps, 1 + SIZE * arousal, this.#model);
     const [excited, pleased] = [arousal > 0 ? AROUSED : TIRED, valence > 0 ? PLEASANT : UNPLEASANT];

@@ -14,7 +14,7 @@ export class LearnedLips {
   #labiodentals;
   #queue = []; // lip frames that are not due yet
   #stable; // the last lip frame, stabilized
-  #shares = [0, 0]; // closure fractions of the last two lip frames
+  #closing = [0, 0]; // closure fractions of the last two lip frames
   #hasLipFrames = false;
   #isSpeaking = false;
   #track;
@@ -53,7 +53,7 @@ export class LearnedLips {
   frameAt(timeS) {
     this.#resting.followVoice(timeS);
     if (this.#hasLipFrames) this.#followTrack(timeS);
-    const ajar = this.#resting.shareAt(timeS);
+    const ajar = this.#resting.amountAt(timeS);
     this.#timeS = timeS;
     const { AJAR } = this.#model.constants.rest;
     const faps = this.#mouth.value.map((x, i) => x + ajar * (AJAR[i] - x));
@@ -99,22 +99,22 @@ export class LearnedLips {
         return change === 0 ? x : x + change ** 3 / (change ** 2 + JITTER_SQUARED[i]);
       });
     } else {
-      this.#shares = [0, 0];
+      this.#closing = [0, 0];
       this.#stable = frame.faps;
     }
     const faps = this.#stable.slice();
     separateLips(faps, closures);
-    const shareOf = (logOdds) => smoothStep(0.5 + (0.5 * logOdds) / rule.doubt);
+    const amountOf = (logOdds) => smoothStep(0.5 + (0.5 * logOdds) / rule.doubt);
     const teeth = this.#labiodentals.logOddsAt(frame.timeS) - TEETH_LOG_ODDS;
     const phones = this.#bilabials.logOddsAt(frame.timeS);
     let closure = closureLogOdds(faps, logOddsOf(frame.closure, closures), phones, rule, closures);
     closure -= this.#resting.doubtAt(frame.timeS, frame.closure, phones);
-    moveToRest(faps, shareOf(teeth), closures.LOWER, closures.LOWER_OUTER);
-    let share = shareOf(closure);
-    const [before, newest] = this.#shares;
-    if (before < CLOSED_FRACTION && CLOSED_FRACTION <= newest) share = Math.max(share, newest);
-    this.#shares = [newest, share];
-    moveToRest(faps, share, closures.INNER, closures.OUTER);
+    moveToRest(faps, amountOf(teeth), closures.LOWER, closures.LOWER_OUTER);
+    let closing = amountOf(closure);
+    const [before, newest] = this.#closing;
+    if (before < CLOSED_FRACTION && CLOSED_FRACTION <= newest) closing = Math.max(closing, newest);
+    this.#closing = [newest, closing];
+    moveToRest(faps, closing, closures.INNER, closures.OUTER);
     return faps;
   }
 }
@@ -137,9 +137,9 @@ function separateLips(faps, { UPPER, LOWER, BOTH }) {
 }
 
 /** Move inner lips towards rest, and the outer lips by the same distance, in place. */
-function moveToRest(faps, share, inner, outer) {
+function moveToRest(faps, amount, inner, outer) {
   inner.forEach((column, i) => {
-    const moved = share * faps[column];
+    const moved = amount * faps[column];
     faps[column] -= moved;
     faps[outer[i]] -= moved;
   });

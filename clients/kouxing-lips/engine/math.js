@@ -9,13 +9,13 @@ export function clamp(x, lowest, highest) {
 }
 
 /** Map 0 to 1 onto 0 to 1 with a slope of 0 at both ends; other values are clipped. */
-export function smoothStep(share) {
-  share = clamp(share, 0, 1);
-  return share * share * (3 - 2 * share);
+export function smoothStep(x) {
+  x = clamp(x, 0, 1);
+  return x * x * (3 - 2 * x);
 }
 
 /** Return the fraction of a change that a one-pole low-pass filter makes in a time, 0 to 1. */
-export function smoothingShare(elapsedS, timeConstantS) {
+export function smoothingGain(elapsedS, timeConstantS) {
   return -Math.expm1(-elapsedS / timeConstantS);
 }
 

@@ -61,8 +61,8 @@ export class RestingLips {
     return isSilent ? c.DOUBT : 0;
   }
 
-  /** Return the share at the time of a frame. */
-  shareAt(timeS) {
+  /** Return the amount at the time of a frame. */
+  amountAt(timeS) {
     const c = this.#c;
     const nextS = this.#nextSoundS();
     if (this.#hasEnded) this.#setGoal(0, c.END_S);
@@ -72,7 +72,7 @@ export class RestingLips {
     else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#setGoal(1, c.PART_S);
     this.#elapsedS += Math.max(timeS - this.#timeS, 0);
     this.#timeS = timeS;
-    return this.#share();
+    return this.#amount();
   }
 
   #isSound(levelDb) {
@@ -85,15 +85,15 @@ export class RestingLips {
 
   #setGoal(goal, durationS) {
     if (goal === this.#goal) return;
-    this.#transition = transitionTo(goal, this.#share(), this.#transition.at(this.#elapsedS).velocity[0], durationS);
+    this.#transition = transitionTo(goal, this.#amount(), this.#transition.at(this.#elapsedS).velocity[0], durationS);
     [this.#goal, this.#elapsedS] = [goal, 0];
   }
 
-  #share() {
+  #amount() {
     return this.#goal + this.#transition.at(this.#elapsedS).value[0];
   }
 }
 
-function transitionTo(goal, share, velocity, durationS) {
-  return new Transition({ value: [share - goal], velocity: [velocity] }, durationS);
+function transitionTo(goal, amount, velocity, durationS) {
+  return new Transition({ value: [amount - goal], velocity: [velocity] }, durationS);
 }

@@ -33,7 +33,7 @@ export class VoiceTraits {
       const value = state[i];
       for (let output = 0; output < numOutputs; output++, at++) outputs[output] += value * values[at];
     }
-    const towards = (values_, share) => values_.map((value, i) => value + share * (outputs[i] - value));
+    const towards = (values_, gain) => values_.map((value, i) => value + gain * (outputs[i] - value));
     if (voice[this.#voices.SPEECH] + voice[this.#voices.SUNG] > MIN_VOICE) {
       this.#numVoiced++;
       this.#mean = towards(this.#mean, 1 / Math.min(this.#numVoiced + PRIOR_POSITIONS, MAX_POSITIONS));

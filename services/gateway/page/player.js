@@ -74,8 +74,8 @@ export class Player {
     this.#sync(nowMs);
     const mediaTime = this.playout.mediaAt(nowMs + imageDelayMs);
     const frameTime = mediaTime === null ? null : this.#track.sample(mediaTime, this.#streamFaps);
-    const share = this.activity.update(nowMs, frameTime !== null);
-    return { mediaTime, frameTime, hasChanged: this.#mix(share) };
+    const weight = this.activity.update(nowMs, frameTime !== null);
+    return { mediaTime, frameTime, hasChanged: this.#mix(weight) };
   }
 
   /** Record that the image of a frame became visible. faceMs: when its face was computed. */
@@ -113,11 +113,11 @@ export class Player {
   }
 
   /** Mix the stream's face with the face at rest; return whether the result has changed. */
-  #mix(share) {
+  #mix(weight) {
     const [faps, stream, rest] = [this.faps, this.#streamFaps, this.restFaps];
     let hasChanged = false;
     for (let i = 0; i < faps.length; i++) {
-      const value = Math.fround(rest[i] + share * (stream[i] - rest[i]));
+      const value = Math.fround(rest[i] + weight * (stream[i] - rest[i]));
       hasChanged ||= value !== faps[i];
       faps[i] = value;
     }

@@ -191,8 +191,8 @@ export class StatusBar {
 
 /** Show a level on the meter, dB of full scale. */
 export function showLevel(decibels) {
-  const share = (1 - decibels / SILENT_DB).toFixed(3);
-  element("meter").firstElementChild.style.transform = `scaleX(${share})`;
+  const level = (1 - decibels / SILENT_DB).toFixed(3);
+  element("meter").firstElementChild.style.transform = `scaleX(${level})`;
   element("meter").setAttribute("aria-valuenow", Math.round(decibels));
 }
 

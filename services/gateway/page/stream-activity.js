@@ -8,7 +8,7 @@ export class StreamActivity {
   #lastFrameMs = -Infinity;
   #lastSoundMs = -Infinity;
   #updatedMs = null;
-  #share = 0; // fraction of the stream's face, 0 to 1; the rest is the face at rest
+  #weight = 0; // fraction of the stream's face, 0 to 1; the rest is the face at rest
 
   frameArrived(nowMs) {
     this.#lastFrameMs = nowMs;
@@ -32,8 +32,8 @@ export class StreamActivity {
       this.#lastSoundMs = Math.min(nowMs, this.#lastSoundMs + elapsedMs);
     }
     const target = hasFace && nowMs - this.#lastFrameMs < STALL_MS ? 1 : 0;
-    this.#share += (target - this.#share) * (1 - Math.exp(-elapsedMs / FADE_MS));
-    if (Math.abs(this.#share - target) < 0.001) this.#share = target;
-    return this.#share;
+    this.#weight += (target - this.#weight) * (1 - Math.exp(-elapsedMs / FADE_MS));
+    if (Math.abs(this.#weight - target) < 0.001) this.#weight = target;
+    return this.#weight;
   }
 }
