@@ -22,6 +22,7 @@ export class FaceRecording {
   #startMs = Infinity; // page's clock at the first sample
   #frames = []; // { ms, landmarks }
   #numImages = 0;
+  #lastImageMs = null;
   #lastFaceMs = null;
   #lastLoudMs = null;
 
@@ -44,6 +45,7 @@ export class FaceRecording {
   /** Add the landmarks of an image (x, y, z each), or null if it shows no face. */
   addFace(takenMs, allLandmarks) {
     this.#numImages++;
+    this.#lastImageMs = takenMs;
     this.#lastFaceMs ??= takenMs;
     if (allLandmarks === null) return;
     this.#lastFaceMs = takenMs;
@@ -53,14 +55,15 @@ export class FaceRecording {
 
   /** Return the key of an advice for the speaker, or null. */
   advice(nowMs) {
-    if (nowMs - this.#lastFaceMs > NO_FACE_MS) return "noFace";
-    return nowMs - this.#lastLoudMs > QUIET_MS ? "tooQuiet" : null;
+    if (this.#lastImageMs - this.#lastFaceMs > NO_FACE_MS) return "noFace";
+    const isQuiet = this.#lastLoudMs !== null && nowMs - this.#lastLoudMs > QUIET_MS;
+    return isQuiet ? "tooQuiet" : null;
   }
 
   /** Return the key of the text why nothing can be learned from the recording, or null. */
   problem() {
     if (this.#numImages === 0 || this.#frames.length < MIN_FACES * this.#numImages) return "noFace";
-    if (this.#numLoud < MIN_LOUD * this.#chunks.length) return "tooQuiet";
+    if (this.#numLoud <= MIN_LOUD * this.#chunks.length) return "tooQuiet";
     const isSlow = this.#numImages < (FaceRecording.minRateHz * this.#numSamples) / this.#rateHz;
     return isSlow ? "tooSlow" : null;
   }

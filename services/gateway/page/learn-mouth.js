@@ -11,10 +11,10 @@ import { curvePath, extent, figures, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
-const GOOD_RATE_HZ = 10; // rate of the images; below it, the reading is longer
+const SLOW_MS = 100; // a tracker that needs longer for an image runs only after the reading
+const MIN_SLOW = 2; // such images in a row; the first one takes long on any computer
+const SLOW_IMAGE = { everyMs: 110, widthPx: 320 }; // images that wait until the reading is over
 const SLOW_FACTOR = 1.5; // multiple of the usual time
-const RATE_CHECK_MS = { from: 1000, to: 3000 }; // after the tracker is loaded
-const SLOW_START_MS = 2500; // a longer start is reported
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
 const CURVES = ["tracked", "before", "after"];
 const BOX = { width: 600, height: 150 };
@@ -32,7 +32,7 @@ export class MouthLesson {
   #handlers;
   #abort = new AbortController(); // for the current step
   #finish = () => {}; // ends the reading
-  #isSlow = false; // the computer analyzes few images per second
+  #numSlow = 0; // images in a row that the tracker needed long for
   #recording = null; // landmark file that was not used yet
   #learned = null; // profile that the user has neither kept nor discarded
 
@@ -110,42 +110,45 @@ export class MouthLesson {
     }
   }
 
+  get #isSlow() {
+    return this.#numSlow >= MIN_SLOW;
+  }
+
   /** Return the recording; null if it was aborted or failed. A failure is shown. */
   async #recordFace(signal) {
     const tracker = new FaceTracker();
     let stream = null;
     let context = null;
-    let slowStart = null; // timer
+    const stop = () => {
+      for (const track of stream?.getTracks() ?? []) track.stop();
+      if (context?.state !== "closed") context?.close();
+    };
     try {
       stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
         video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 } },
       });
-      slowStart = setTimeout(() => {
-        element("lesson-advice").textContent = say("lessonSlowStart");
-      }, SLOW_START_MS);
       const video = element("lesson-video");
       video.srcObject = stream;
       [context] = await Promise.all([openCaptureContext(), tracker.load(), video.play()]);
-      clearTimeout(slowStart);
       signal.throwIfAborted();
       const recording = new FaceRecording(context.sampleRate);
-      await this.#read(recording, { video, tracker, context, stream, signal });
+      const images = await this.#read(recording, { video, tracker, context, stream, signal });
+      stop();
+      await this.#findFaces(images, recording, tracker, signal);
       return signal.aborted ? null : recording;
     } catch (error) {
       if (!signal.aborted) this.#fail(errorText(error));
       return null;
     } finally {
-      clearTimeout(slowStart);
-      for (const track of stream?.getTracks() ?? []) track.stop();
-      context?.close();
+      stop();
       tracker.close();
     }
   }
 
   #prepare() {
     this.#recording = null;
-    this.#isSlow = false;
+    this.#numSlow = 0;
     const language = element("lesson-text").value;
     element("lesson-reading").lang = language;
     element("lesson-reading").textContent = READING_TEXTS[language];
@@ -157,12 +160,14 @@ export class MouthLesson {
     this.#show("reading");
   }
 
-  /** Record from the first face until the time is over, or fail early if images come too slowly. */
+  /**
+   * Record from the first face until the time is over. If the tracker is slow, it does not run while
+   * the user reads. Return the images that it must still analyze, as { takenMs, image }.
+   */
   async #read(recording, { video, tracker, context, stream, signal }) {
     let startMs = null;
     let isOver = false;
-    let numImages = 0;
-    const timers = [];
+    const images = [];
     const over = new Promise((resolve, reject) => {
       this.#finish = () => {
         isOver = true;
@@ -170,36 +175,51 @@ export class MouthLesson {
       };
       signal.addEventListener("abort", this.#finish);
       for (const track of stream.getTracks()) track.onended = () => reject(new UserError(say("cameraUnplugged")));
-      const { from, to } = RATE_CHECK_MS;
-      const checkRate = () => {
-        const rateHz = (1000 * numImages) / (to - from);
-        if (rateHz < FaceRecording.minRateHz) reject(new UserError(say("tooSlow")));
-        this.#isSlow = rateHz < GOOD_RATE_HZ;
-      };
-      timers.push(setTimeout(() => (numImages = 0), from)); // the first images take longer
-      timers.push(setTimeout(checkRate, to));
     });
-    try {
-      let next = nextImage(video);
-      while (!isOver) {
-        const { takenMs, image } = await Promise.race([next, over]);
-        if (isOver) break;
-        next = nextImage(video); // taken while the face in this one is being found
+    const take = (previousMs) => nextImage(video, this.#isSlow ? { previousMs, ...SLOW_IMAGE } : {});
+    let next = take();
+    let numImages = 0; // since the first face
+    let isRateChecked = false;
+    while (!isOver) {
+      const { takenMs, image } = await Promise.race([next, over]);
+      if (isOver) break;
+      next = take(takenMs); // taken while the face in this one is being found
+      if (this.#isSlow && startMs !== null) {
+        images.push({ takenMs, image });
+      } else {
+        const beginMs = performance.now();
         const landmarks = await Promise.race([tracker.find(image), over]);
         if (isOver) break;
-        numImages++;
+        this.#numSlow = performance.now() > beginMs + SLOW_MS ? this.#numSlow + 1 : 0;
         drawLips(video, tracker.lips, landmarks);
         if (startMs === null && landmarks !== null) {
           startMs = performance.now();
-          capture(context, stream, (chunk, rms, recordedMs) =>
-            recording.addSound(recordedMs, chunk, rms),
-          );
+          capture(context, stream, (chunk, rms, recordedMs) => recording.addSound(recordedMs, chunk, rms));
         }
         if (startMs !== null) recording.addFace(takenMs, landmarks);
-        this.#showTime(startMs, recording);
       }
-    } finally {
-      timers.forEach(clearTimeout);
+      if (startMs !== null) {
+        numImages++;
+        const sinceMs = performance.now() - startMs;
+        const minImages = (FaceRecording.minRateHz * sinceMs) / 1000 / 2; // slower at first
+        if (!isRateChecked && sinceMs > CLOSED_LIPS_MS && numImages < minImages) {
+          throw new UserError(say("tooSlow"));
+        }
+        isRateChecked ||= sinceMs > CLOSED_LIPS_MS;
+      }
+      this.#showTime(startMs, recording);
+    }
+    return images;
+  }
+
+  /** Find the faces in images that were not analyzed during the reading. */
+  async #findFaces(images, recording, tracker, signal) {
+    if (images.length > 0 && !signal.aborted) this.#show("learning");
+    for (const [index, { takenMs, image }] of images.entries()) {
+      if (signal.aborted) return;
+      const percent = Math.floor((100 * index) / images.length);
+      element("lesson-learning").textContent = say("lessonTracking", { percent });
+      recording.addFace(takenMs, await tracker.find(image));
     }
   }
 
@@ -226,6 +246,7 @@ export class MouthLesson {
   async #learn() {
     this.#abort = new AbortController();
     const { signal } = this.#abort;
+    element("lesson-learning").textContent = say("lessonLearning");
     this.#show("learning");
     let answer;
     try {
@@ -269,12 +290,17 @@ export class MouthLesson {
   }
 }
 
-/** Wait for the video's next image; return it and when it was taken, on the page's clock. */
-async function nextImage(video) {
+/**
+ * Wait for the video's next image, `everyMs` after the previous one or later, and scale it to a width.
+ * Return it and when it was taken, on the page's clock.
+ */
+async function nextImage(video, { previousMs = -Infinity, everyMs = 0, widthPx }) {
+  const waitMs = previousMs + everyMs - performance.now();
+  if (waitMs > 0) await new Promise((resolve) => setTimeout(resolve, waitMs));
   const takenMs = await new Promise((resolve) => {
     video.requestVideoFrameCallback((nowMs, { captureTime }) => resolve(captureTime ?? nowMs));
   });
-  return { takenMs, image: await createImageBitmap(video) };
+  return { takenMs, image: await createImageBitmap(video, { resizeWidth: widthPx }) };
 }
 
 function errorText(error) {

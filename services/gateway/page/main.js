@@ -65,7 +65,11 @@ const senders = new SendersPanel(element("settings"));
 const statusBar = new StatusBar({ gateway, player, speech, sound, notice, senders });
 const lesson = new MouthLesson(mouthProfiles, {
   opened: () => speech.pause(),
-  closed: () => speech.resume(),
+  closed: () => {
+    speech.resume();
+    cancelAnimationFrame(nextDraw);
+    nextDraw = requestAnimationFrame(draw);
+  },
   profileChanged: showMouthProfile,
 });
 const socket = new ViewerSocket(
@@ -164,12 +168,15 @@ function showMouthProfile() {
 
 let statusMs = 0; // when the status was shown last
 
+let nextDraw = 0; // id of the requested call
+
 function draw(nowMs) {
-  requestAnimationFrame(draw);
+  // During a lesson the machine is needed to find the user's face.
+  if (lesson.step !== "closed") return;
+  nextDraw = requestAnimationFrame(draw);
   const { mediaTime, frameTime, hasChanged } = player.update(nowMs, stage.visibleDelayMs);
   const shown = { mediaTime: frameTime, faps: player.faps.slice() };
-  // During a lesson the machine is needed to find the user's face.
-  stage.draw(nowMs, hasChanged && lesson.step === "closed", (seenMs) => {
+  stage.draw(nowMs, hasChanged, (seenMs) => {
     player.imageVisible(nowMs, seenMs, frameTime);
     window.kouxing.onImage?.({ seenMs, ...shown });
   });

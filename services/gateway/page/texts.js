@@ -180,6 +180,10 @@ export const TEXTS = {
   time: { en: "time", zh: "时间" },
   lessonFinish: { en: "I'm done reading", zh: "读完了" },
   lessonLearning: { en: "Learning your mouth. This takes a few seconds …", zh: "正在学习，请稍候…" },
+  lessonTracking: {
+    en: "You can stop reading. This computer is slow, so the lips in the images are found now: {percent} %.",
+    zh: "可以停止朗读了。这台电脑较慢，正在查找画面中的嘴唇：{percent} %。",
+  },
   learning: { en: "learning", zh: "学习中" },
   lessonCurves: { en: "lip opening over time", zh: "张口随时间的变化" },
   yourLips: { en: "your lips", zh: "你的" },
@@ -194,10 +198,9 @@ export const TEXTS = {
   keep: { en: "Keep", zh: "保留" },
   recordAgain: { en: "Record again", zh: "重录" },
   sendAgain: { en: "Send again", zh: "重发" },
-  lessonStarting: { en: "Starting camera and microphone …", zh: "正在启动摄像头和麦克风…" },
-  lessonSlowStart: {
-    en: "Starting is taking longer than usual: this computer or its connection is slow. Please close other programs.",
-    zh: "启动较慢：这台电脑或网络较慢，请关闭其他程序。",
+  lessonStarting: {
+    en: "Starting camera, microphone and face tracking. On a slow computer or connection, this takes up to a minute. Closing other programs helps.",
+    zh: "正在启动摄像头、麦克风和面部跟踪。电脑或网络较慢时最多需要一分钟，可关闭其他程序。",
   },
   lessonShowFace: { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" },
   lessonLipsClosed: { en: "Keep your lips closed …", zh: "请先闭上嘴…" },
