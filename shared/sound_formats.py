@@ -41,7 +41,7 @@ _FRAMED = (
     ("sbc", 0xFF00, 0x9C00),
 )
 # Free and invalid bit rates are excluded, because quiet samples often look like them.
-_MP3_FRAME = re.compile(rb"\xff[\xe2\xe3\xf2\xf3\xfa\xfb][\x10-\xef]")
+_FRAME = re.compile(rb"\xff(?:[\xe2\xe3\xf2\xf3\xfa\xfb][\x10-\xef]|[\xf0\xf1\xf8\xf9])")  # or ADTS
 _TS_SYNC = 0x47
 _TS_PACKETS = ((0, 188), (4, 192))  # the offset of the first byte, and the packet's size
 MAX_OGG_PAGE_BYTES = 27 + 255 + 255 * 255
@@ -84,11 +84,11 @@ def is_sound(begin: bytes) -> bool:
 def find_sound_start(begin: bytes) -> int | None:
     """Return the offset at which sound starts in the first bytes of a pipe; None if not found.
 
-    Zeros may precede it. An MP3 stream may begin within a frame.
+    Zeros may precede it. An MP3 or ADTS stream may begin within a frame.
     """
     num_zeros = len(begin) - len(begin.lstrip(b"\0"))
     offsets = [0, *range(max(1, num_zeros - _MAX_LEADING_ZEROS), num_zeros + 1)]
-    offsets += [match.start() for match in _MP3_FRAME.finditer(begin, num_zeros)]
+    offsets += [match.start() for match in _FRAME.finditer(begin, num_zeros)]
     return next((start for start in offsets if is_sound(begin[start:][:NUM_BEGIN_BYTES])), None)
 
 

@@ -9,7 +9,8 @@ from kouxing_client import KouxingError
 
 from kouxing.services.gateway.audio_sessions import AudioSession
 from kouxing.services.gateway.limits import COMMAND_S, RealTimeLimit
-from kouxing.services.gateway.pcm_format import HEADER_BYTES, NoiseCheck, PcmFormat
+from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
+from kouxing.shared.encoding_check import EncodingCheck
 
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
@@ -31,7 +32,8 @@ class AudioInput:
         self._format = pcm_format
         self._is_ahead = is_ahead
         self._is_first = True
-        self._noise = NoiseCheck(pcm_format)
+        is_pcm16 = pcm_format.encoding == "s16le"
+        self._encoding = EncodingCheck(pcm_format.num_channels) if is_pcm16 else None
         self._incomplete = b""  # part of a sample, or of a file's header
         self._drained: asyncio.Task[None] | None = None  # done when all audio is passed on
         self._rate_limit = RealTimeLimit()
@@ -52,18 +54,19 @@ class AudioInput:
         Raises ``UserError`` if the data does not have the announced format.
         """
         self._format.check_message(pcm)
-        pcm = self._incomplete + pcm
-        if self._is_first and len(pcm) < HEADER_BYTES:
-            self._incomplete = pcm
+        received = self._incomplete + pcm
+        if self._is_first and len(received) < HEADER_BYTES:
+            self._incomplete = received
             return
-        await self._pass_on(pcm)
+        await self._pass_on(received, message=received if self._is_first else pcm)
 
-    async def _pass_on(self, pcm: bytes) -> None:
+    async def _pass_on(self, pcm: bytes, message: bytes = b"") -> None:
         num_frames = len(pcm) // self._format.frame_bytes
         end = num_frames * self._format.frame_bytes
         pcm, self._incomplete = pcm[:end], pcm[end:]
         self._format.check_samples(pcm, is_first=self._is_first)
-        self._noise.check(pcm)
+        if self._encoding is not None:
+            self._encoding.check(message)
         self._is_first = False
         duration_s = num_frames / self._format.sample_rate_hz
         if self._is_ahead or duration_s > MAX_LIVE_S or not self._queue.is_empty:

@@ -11,10 +11,6 @@ from kouxing.shared.user_file import parse_json
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
 RATES_HZ = (8000, 48000)
-NOISE_BLOCK = 2000  # samples of each channel that are judged together
-_MIN_LOUD_FRACTION = 0.15  # of samples beyond half of full scale; more than in natural noise
-_MAX_NOISE_CORRELATION, _MIN_SOUND_CORRELATION = 0.15, 0.3  # of neighboring samples
-_SILENT_POWER, _SOUND_POWER = 1e-4, 1e-3  # of full scale
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file
 _FILES = {  # by their first bytes
@@ -87,48 +83,6 @@ class PcmFormat:
             raise UserError(
                 f"expected {self}, between -1 and 1, got {peak:g}: divide integers by 32768, "
                 "or set encoding to s16le"
-            )
-
-
-class NoiseCheck:
-    """Detects data that is not PCM of the announced format. Checks only up to the first sound.
-
-    Compressed data, 24-bit, float or big-endian samples sound like loud white noise if they are
-    read as 16-bit samples.
-    """
-
-    def __init__(self, pcm_format: PcmFormat) -> None:
-        self._format = pcm_format
-        self._is_sound = pcm_format.encoding != "s16le"
-        self._waiting = np.zeros((0, pcm_format.num_channels), np.float32)
-        self._num_noisy = 0
-
-    def check(self, pcm: bytes) -> None:
-        """Check complete samples.
-
-        Raises ``UserError`` if they are noise.
-        """
-        if self._is_sound:
-            return
-        samples = np.frombuffer(pcm, "<i2").reshape(-1, self._format.num_channels)
-        self._waiting = np.concatenate([self._waiting, samples / np.float32(32768)])
-        while len(self._waiting) >= NOISE_BLOCK and not self._is_sound:
-            block, self._waiting = self._waiting[:NOISE_BLOCK], self._waiting[NOISE_BLOCK:]
-            self._judge(block)
-
-    def _judge(self, block: np.ndarray) -> None:
-        power = (block**2).mean(axis=0)
-        heard = power > _SILENT_POWER
-        correlation = (block[1:] * block[:-1]).mean(axis=0)[heard] / power[heard]
-        is_loud = (np.abs(block) > 0.5).mean(axis=0)[heard] > _MIN_LOUD_FRACTION
-        if (is_loud & (np.abs(correlation) < _MAX_NOISE_CORRELATION)).any():
-            self._num_noisy += 1
-        elif (correlation > _MIN_SOUND_CORRELATION).all() and power.max() > _SOUND_POWER:
-            self._is_sound = True
-        if self._num_noisy == 2:
-            raise UserError(
-                f"expected {self._format}; this looks like noise: decode it if it is compressed,"
-                " or convert it if it has another encoding"
             )
 
 

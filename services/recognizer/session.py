@@ -14,6 +14,7 @@ from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumpti
 from kouxing.services.recognizer.sound_packets import SoundPackets
 from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
+from kouxing.shared.encoding_check import EncodingCheck
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
@@ -117,6 +118,8 @@ class RecognizerSession:
         self.is_laughing = False  # the speaker
         self._published_acoustic = AcousticModelName.FULL
         self._sound = SoundPackets(face_delay_s)
+        is_checked = start.encoding == "s16le" and start.epoch <= 1
+        self._encoding = EncodingCheck(start.num_channels) if is_checked else None
         self.output_sequence = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
@@ -183,7 +186,9 @@ class RecognizerSession:
         rate_hz, media_time = self.start.sample_rate_hz, chunk.media_time
         try:
             samples = samples_of(chunk.pcm, self.start.encoding, self.start.num_channels)
-        except BadAudio as error:
+            if self._encoding is not None:
+                self._encoding.check(chunk.pcm)
+        except (BadAudio, UserError) as error:
             raise AudioRejected(ErrorCode.BAD_AUDIO, str(error)) from None
         duration_s = len(samples) / rate_hz
         if self.start.paced and not self._lead_limit.allows(

@@ -70,6 +70,10 @@ def test_rejects_impossible_audio_and_audio_after_the_end() -> None:
         session.check_open(chunk(media_time=MAX_MEDIA_TIME + 1))
     with pytest.raises(AudioRejected, match="are not a multiple of"):
         session.read_chunk(chunk(pcm=b"123"), 0.0)
+    float_pcm = (0.5 * samples_of_file(VOWELS_FILE)).astype("<f4").tobytes()
+    with pytest.raises(AudioRejected, match="perhaps 32-bit float samples") as rejection:
+        session.read_chunk(chunk(pcm=float_pcm[: 16 * RATE_HZ]), 0.0)
+    assert rejection.value.code == ErrorCode.BAD_AUDIO
     session.end = chunk(last=True)
     with pytest.raises(AudioRejected, match="has ended"):
         session.check_open(chunk(2))

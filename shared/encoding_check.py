@@ -1,0 +1,174 @@
+"""Detects data that is not 16-bit PCM, though a client announced it.
+
+Such data sounds like loud noise. Real noise may be just as loud, so data is refused only if another
+reading of the same bytes is sound, or if it has the frames of a codec.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.shared.errors import UserError
+from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, find_sound_start
+
+Array = NDArray[np.float64]
+Measure = tuple[float, float, float]  # spectral flatness, correlation of neighbors, RMS
+
+BLOCK = 2400  # samples of each channel that are judged together: whole samples of any encoding
+_MAX_BLOCKS = 60  # that are not silent; then the check ends
+_MAX_REFUSED = 2  # blocks that are not PCM
+_MIN_SOUND = 3  # blocks of sound that end the check
+_SEGMENT = 200  # samples of a spectrum
+_FULL_SCALE = 32768
+_MAX_SAMPLE = 1.5  # of another reading
+_SILENCE, _QUIET, _AUDIBLE = 0.01, 0.003, 0.05  # root mean square, of full scale
+# Ranges of misread data, and of the reading with the right encoding.
+_MIN_WIDE_RMS, _MIN_WIDE_FLATNESS, _MAX_SOUND_FLATNESS = 0.3, 0.45, 0.3
+_MIN_NARROW_RMS, _MIN_NARROW_FLATNESS, _MAX_NARROW_CORRELATION = 0.4, 0.2, 0.9
+_MIN_DISTINCT = 60  # values of a block; clipped sound and square waves have fewer
+_MIN_GAIN = 4.0  # ratio of the two flatnesses
+_MIN_SOUND_CORRELATION, _MIN_READ_CORRELATION = 0.3, 0.4  # of neighbors in sound
+_NUM_PACKETS = 10  # messages that start with the same 4 bits: packets of a codec
+
+
+def _decode_mulaw(data: NDArray[np.uint8]) -> Array:
+    code = (~data).astype(np.int64)
+    size = (((code & 15) << 3) + 132 << ((code >> 4) & 7)) - 132
+    return np.where(code & 128, -size, size) / _FULL_SCALE
+
+
+def _decode_alaw(data: NDArray[np.uint8]) -> Array:
+    code = (data ^ 0x55).astype(np.int64)
+    exponent, mantissa = (code >> 4) & 7, ((code & 15) << 4) + 8
+    size = np.where(exponent == 0, mantissa, mantissa + 256 << np.maximum(exponent - 1, 0))
+    return np.where(code & 128, size, -size) / _FULL_SCALE
+
+
+def _decode_24_bit(data: NDArray[np.uint8]) -> Array:
+    return np.pad(data.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").ravel() / 2**31
+
+
+_WIDE: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.floating]]] = {
+    "16-bit big-endian samples": lambda data: data.view(">i2") / _FULL_SCALE,
+    "24-bit samples": _decode_24_bit,
+    "32-bit samples": lambda data: data.view("<i4") / 2**31,
+    "32-bit float samples": lambda data: data.view("<f4"),
+    "64-bit float samples": lambda data: data.view("<f8"),
+}
+_NARROW: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.floating]]] = {
+    "mu-law": _decode_mulaw,
+    "A-law": _decode_alaw,
+    "unsigned 8-bit samples": lambda data: data / 128.0 - 1.0,
+}
+_READINGS = _WIDE | _NARROW
+
+
+class EncodingCheck:
+    """Checks a client's messages of ``s16le`` samples up to the first sound."""
+
+    def __init__(self, num_channels: int) -> None:
+        self._num_channels = num_channels
+        self._is_done = False
+        self._error = ""
+        self._begin = b""
+        self._waiting = b""
+        self._num_blocks = 0  # that are not silent
+        self._num_sound = 0
+        self._refused: list[str] = []  # what the refused blocks look like
+        self._packet_starts: list[int] = []
+
+    def check(self, message: bytes) -> None:
+        """Check a message of any length.
+
+        Raises ``UserError`` if the data has another encoding; the text names the likely one. All
+        later messages are then refused, too.
+        """
+        if self._is_done or not message:
+            return
+        if self._error:
+            raise UserError(self._error)
+        self._packet_starts.append(message[0] >> 4)
+        self._begin += message[: NUM_BEGIN_BYTES - len(self._begin)]
+        self._waiting += message
+        num_bytes = 2 * BLOCK * self._num_channels
+        while len(self._waiting) >= num_bytes and not self._is_done:
+            block, self._waiting = self._waiting[:num_bytes], self._waiting[num_bytes:]
+            self._judge(np.frombuffer(block, np.uint8))
+
+    def _judge(self, data: NDArray[np.uint8]) -> None:
+        channels = (data.view("<i2") / _FULL_SCALE).reshape(-1, self._num_channels).T
+        measures = [_measure(channel) for channel in channels]
+        flatness, correlation, rms = max(measures, key=lambda measure: measure[2])
+        if rms < _SILENCE:
+            self._packet_starts.clear()
+            return
+        self._num_blocks += 1
+        self._is_done = self._num_blocks >= _MAX_BLOCKS
+        white = [
+            other
+            for other, _, rms in measures
+            if rms > _MIN_WIDE_RMS and other > _MIN_WIDE_FLATNESS
+        ]
+        flatness = max(white, default=flatness)
+        is_white = white != []
+        if not is_white:
+            self._packet_starts.clear()
+        is_narrow = (
+            rms > _MIN_NARROW_RMS
+            and flatness > _MIN_NARROW_FLATNESS
+            and correlation < _MAX_NARROW_CORRELATION
+            and len(np.unique(data.view("<i2"))) > _MIN_DISTINCT
+        )
+        readings = {name: self._measure_loudest(decode(data)) for name, decode in _READINGS.items()}
+        likely = [
+            (other, name)
+            for name, (other, other_correlation, other_rms) in readings.items()
+            if (is_narrow if name in _NARROW else is_white and other < _MAX_SOUND_FLATNESS)
+            and flatness > _MIN_GAIN * other
+            and other_correlation > _MIN_READ_CORRELATION
+            and other_rms > _QUIET
+        ]
+        if likely:
+            self._refuse(min(likely)[1])
+        elif is_white and self._is_compressed():
+            self._refuse("compressed data")
+        elif not is_white and (
+            correlation > _MIN_SOUND_CORRELATION
+            and rms > _AUDIBLE
+            and flatness < min(other for other, _, _ in readings.values())
+        ):
+            self._num_sound += 1
+            self._is_done = self._num_sound == _MIN_SOUND
+
+    def _refuse(self, kind: str) -> None:
+        self._refused.append(kind)
+        if len(self._refused) == _MAX_REFUSED:
+            kinds = " or ".join(sorted(set(self._refused)))
+            self._error = (
+                f"expected s16le samples; this looks like noise, perhaps {kinds}: decode it if it"
+                " is compressed, or convert it if it has another encoding"
+            )
+            raise UserError(self._error)
+
+    def _is_compressed(self) -> bool:
+        starts = self._packet_starts[:_NUM_PACKETS]
+        has_packets = len(starts) == _NUM_PACKETS and len(set(starts)) == 1
+        return has_packets or find_sound_start(self._begin) is not None
+
+    def _measure_loudest(self, samples: NDArray[np.floating]) -> Measure:
+        """Measure the loudest channel. Far beyond full scale, the flatness is infinite."""
+        if not (np.abs(samples) < _MAX_SAMPLE).all():  # also for NaN
+            return np.inf, 0.0, 0.0
+        channels = samples.astype(np.float64).reshape(-1, self._num_channels)
+        return _measure(channels[:, channels.std(axis=0).argmax()])
+
+
+def _measure(samples: Array) -> Measure:
+    samples = samples - samples.mean()
+    segments = np.lib.stride_tricks.sliding_window_view(samples, _SEGMENT)[:: _SEGMENT // 2]
+    power = (np.abs(np.fft.rfft(segments * np.hanning(_SEGMENT))) ** 2).mean(axis=0)[1:]
+    power += 1e-9 * power.mean() + 1e-12
+    flatness = np.exp(np.log(power).mean()) / power.mean()
+    variance = (samples**2).mean() + 1e-12
+    return flatness, (samples[1:] * samples[:-1]).mean() / variance, float(samples.std())
