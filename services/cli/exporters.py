@@ -19,8 +19,8 @@ from kouxing.services.driver.video import film
 from kouxing.services.driver.video.writer import (
     VIDEO_SUFFIXES,
     check_name,
+    existing_pictures,
     is_sequence,
-    picture_name,
 )
 from kouxing.shared.errors import UserError
 
@@ -109,8 +109,8 @@ def is_output(path: Path) -> bool:
 
 def existing_output(output: Path) -> Path | None:
     """Return the file that must not exist: the first of a sequence of pictures, or the output."""
-    if is_sequence(output) and (first := picture_name(output, 0)).exists():
-        return first
+    if is_sequence(output) and (pictures := existing_pictures(output)):
+        return pictures[0]
     return None if output.is_dir() else output
 
 

@@ -17,6 +17,7 @@ from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
 from kouxing.services.driver.video.film import Frame
+from kouxing.services.driver.video.writer import PictureSequence
 from kouxing.shared.errors import UserError
 from kouxing.shared.output_file import open_output
 from kouxing.shared.terminal import check_output
@@ -209,10 +210,20 @@ def test_a_sequence_of_pictures_is_overwritten_only_with_force(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("pictures").mkdir()
-    Path("pictures/00000.png").touch()
-    Path("face000.png").touch()
-    with pytest.raises(UserError, match=r"000\.png exists; add --force"):
+    Path("pictures/00007.png").touch()
+    Path("face007.png").touch()
+    with pytest.raises(UserError, match=r"007\.png exists; add --force"):
         app(["render", "my.wav", output], standalone_mode=False)
+
+
+def test_a_sequence_of_pictures_replaces_a_longer_one(tmp_path: Path) -> None:
+    others = {"face.png", "face1.png", "face0001.jpg", "face00002.png", "myface0003.png"}
+    for name in (*others, "face0000.png", "face0005.png", "face10000.png"):
+        (tmp_path / name).touch()
+    sequence = PictureSequence(tmp_path / "face%04d.png")
+    sequence.write_image(np.zeros((2, 2, 3), np.uint8))
+    assert {path.name for path in tmp_path.iterdir()} == {*others, "face0000.png"}
+    assert (tmp_path / "face0000.png").stat().st_size > 0
 
 
 def test_an_error_names_the_folder_to_create(tmp_path: Path) -> None:

@@ -131,6 +131,16 @@ def picture_name(path: Path, number: int) -> Path:
     return path.with_name(_NUMBER.sub(lambda match: match[0] % number, path.name, count=1))
 
 
+def existing_pictures(path: Path) -> list[Path]:
+    """Return the existing files of a sequence, in the order of their names."""
+    first = picture_name(path, 0)
+    before, after = _NUMBER.split(path.name if path.suffix == ".png" else "%05d.png", maxsplit=1)
+    name = re.compile(f"{re.escape(before)} *([0-9]+){re.escape(after)}")
+    files = sorted(first.parent.iterdir()) if first.parent.is_dir() else []
+    matches = [(file, match) for file in files if (match := name.fullmatch(file.name))]
+    return [file for file, match in matches if picture_name(path, int(match[1])) == file]
+
+
 class VideoWriter:
     """A video that appears under its name when it is complete.
 
@@ -284,21 +294,23 @@ class VideoWriter:
 
 
 class PictureSequence:
-    """One PNG file per picture; existing files are replaced.
+    """One PNG file per picture; an existing sequence of the same name is deleted first.
 
     ``path`` is a folder for ``00000.png`` and so on, or a name such as ``face%05d.png``.
 
-    Raises ``UserError`` if the folder cannot be created.
+    Raises ``UserError`` if the folder cannot be created, or old pictures cannot be deleted.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._num_images = 0
-        if path.suffix != ".png":
-            try:
+        try:
+            if path.suffix != ".png":
                 path.mkdir(exist_ok=True)
-            except OSError as error:
-                raise write_error(path, error) from error
+            for picture in existing_pictures(path):
+                picture.unlink()
+        except OSError as error:
+            raise write_error(path, error) from error
 
     def write_image(self, image: UInt8) -> None:
         """Write a picture (H, W, 3) or (H, W, 4), sRGB."""
