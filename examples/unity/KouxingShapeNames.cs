@@ -31,9 +31,12 @@ arkit *jawOpen=mouthOpen jawForward jawLeft jawRight mouthClose mouthLeft mouthR
 oculus *aa=V_Open=vAA *PP=V_Explosive=vM FF=V_Dental_Lip=vF TH=vTH DD=V_Tongue_Up=vT kk=vK
  CH=V_Affricate=vSH SS=vS nn=vL RR=vER sil E=viseme_E=v_E=vEH
  *ih=viseme_I=V_Wide=vIH *oh=viseme_O=V_Tight_O=vOW *ou=viseme_U=V_Tight=vUW
-vrm *aa=A=MTH_A=Mouth_A=あ *ih=I=MTH_I=Mouth_I=い *ou=U=MTH_U=Mouth_U=う
- *ee=E=MTH_E=Mouth_E=え *oh=O=MTH_O=Mouth_O=お blink=EYE_Close=まばたき
- blinkLeft=EYE_Close_L blinkRight=EYE_Close_R lookUp lookDown lookLeft lookRight
+vrm *aa=A=MTH_A=Mouth_A=Vowel_A=Lip_A=Ah=あ=ア=ｱ *ih=I=MTH_I=Mouth_I=Vowel_I=Lip_I=い=イ=ｲ
+ *ou=U=MTH_U=Mouth_U=Vowel_U=Lip_U=Oo=う=ウ=ｳ *ee=E=MTH_E=Mouth_E=Vowel_E=Lip_E=Eh=え=エ=ｴ
+ *oh=O=MTH_O=Mouth_O=Vowel_O=Lip_O=お=オ=ｵ blink=EYE_Close=EYE_DEF_C=Eyes_Closed=まばたき=瞬き
+ blinkLeft=EYE_Close_L=Wink_L=ウィンク２=ウィンク2=ｳｨﾝｸ２=ｳｨﾝｸ2=ウィンク=ウインク=ｳｨﾝｸ
+ blinkRight=EYE_Close_R=Wink_R=ウィンク２右=ウィンク2右=ｳｨﾝｸ２右=ｳｨﾝｸ2右=ウィンク右=ウインク右=ｳｨﾝｸ右
+ lookUp lookDown lookLeft lookRight
 ";
 
     sealed class Entry

@@ -21,6 +21,9 @@ MESHES = [
     "jawOpen.001 bsMouthPucker mouthSmile_L_2 headAa",
     "mouthOpen mouthSmile A_1 eyeBlinkLeft",
     "0 1 2",
+    "あ い う え お まばたき ウィンク２右",
+    "ア イ Face.ウ エ ｵ 笑い ウィンク ウィンク右",
+    "vowel_a Vowel_I VOWEL_U Face_Vowel_E vowel_o wink_left Wink.R EYE_DEF_C",
 ]
 SETS = ("arkit", "oculus", "vrm")
 
