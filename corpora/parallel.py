@@ -38,7 +38,7 @@ def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator
         while results:
             yield results.popleft().result()
     except BaseException:
-        for process in multiprocessing.active_children():
+        for process in [*pool._processes.values()]:
             process.kill()
         raise
     finally:

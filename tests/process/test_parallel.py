@@ -1,5 +1,6 @@
 """Work in several processes."""
 
+import multiprocessing
 import os
 
 import numpy as np
@@ -49,6 +50,18 @@ def test_an_error_reaches_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [next(results) for _ in range(3)] == [0, 0, 1]
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+def test_an_error_ends_no_other_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "_MIN_CORES", 1)
+    here, there = multiprocessing.Pipe()
+    other = multiprocessing.get_context("fork").Process(target=there.recv)
+    other.start()
+    with pytest.raises(ZeroDivisionError):
+        list(process_in_order(lambda item: 1 // item, range(3)))
+    here.send("end")
+    other.join(LIMIT_S)
+    assert other.exitcode == 0
 
 
 @pytest.mark.parametrize("receivers", ["all", "first"])

@@ -168,7 +168,7 @@ class Sockets:
         address = endpoint.partition(" ")[0]
         host, _, port = address.removeprefix("tcp://").rpartition(":")
 
-        def run() -> None:  # looking up a name takes seconds if no name server answers
+        def run() -> None:
             reason = reach_error(host, port, _REACH_S, is_zeromq=True) if port.isdigit() else ""
             self.call(lambda: on_reason(reason))
 

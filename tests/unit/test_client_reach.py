@@ -1,0 +1,50 @@
+"""Why an address cannot be reached."""
+
+import socket
+import threading
+from typing import Any
+
+import pytest
+from kouxing_client.reach import reach_error
+
+LIMIT_S = 60.0
+
+
+def test_a_silent_name_server_is_reported() -> None:
+    is_over = threading.Event()
+
+    def look_up(*_: Any, **__: Any) -> list[tuple[Any, ...]]:
+        is_over.wait()
+        return []
+
+    reason = reach_error("lab", "7700", 0.0, look_up=look_up)
+    is_over.set()
+    assert "no name server answers for the host name 'lab'; check the network" in reason
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (socket.gaierror(-2, "unknown"), "the host name 'lab' is unknown"),
+        (UnicodeError("label too long"), "the host name 'lab' is unknown"),
+        (OSError(24, "Too many open files"), "Too many open files; check the address"),
+    ],
+)
+def test_a_failed_look_up_is_explained(error: Exception, reason: str) -> None:
+    def look_up(*_: Any, **__: Any) -> list[tuple[Any, ...]]:
+        raise error
+
+    assert reason in reach_error("lab", "7700", LIMIT_S, look_up=look_up)
+
+
+def test_all_addresses_of_a_host_are_tried() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        addresses = [closed.getsockname(), server.getsockname()]
+
+        def look_up(*_: Any, **__: Any) -> list[tuple[Any, ...]]:
+            return [(socket.AF_INET, socket.SOCK_STREAM, 0, "", address) for address in addresses]
+
+        assert reach_error("lab", "7700", LIMIT_S, look_up=look_up) == ""
+        addresses.pop()
+        assert "nothing listens there" in reach_error("lab", "7700", LIMIT_S, look_up=look_up)
