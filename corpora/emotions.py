@@ -1,6 +1,6 @@
 """Reads recordings of speech that name an emotion.
 
-A folder has a ``manifest.tsv`` with the columns ``path``, ``speaker``, ``licence``, ``seconds`` and
+A folder has a ``manifest.tsv`` with the columns ``path``, ``speaker``, ``license``, ``seconds`` and
 ``note``. The note of such a recording contains ``emotion NAME``, for example *emotion anger*. The
 optional column ``phones_path`` names a table with the columns ``start_s`` and ``marks``. The marks
 1, 2 and 3 denote stressed vowels.
@@ -25,7 +25,7 @@ FEELINGS = {
     "sadness": (-0.3, -0.6),
     "boredom": (-0.6, -0.4),
 }
-_COLUMNS = ("path", "speaker", "licence", "seconds", "note")
+_COLUMNS = ("path", "speaker", "license", "seconds", "note")
 _EMOTION = re.compile(r"emotion (\w+)")
 _STRESS_MARKS = {"1", "2", "3"}
 
@@ -56,7 +56,7 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[EmotionRecord
             recording = EmotionRecording(
                 folder / row["path"],
                 row["speaker"],
-                row["licence"],
+                row["license"],
                 float(row["seconds"]) / 60,
                 emotion,
                 _stressed(folder / row["phones_path"]) if row.get("phones_path") else (),

@@ -1,7 +1,7 @@
 """Clips of lip motion with audio: tracked video, or an animator's rig.
 
 A folder contains for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame with
-``t`` in seconds) and ``<clip>.json`` (kind, licence, speaker, language, transcript). Columns are
+``t`` in seconds) and ``<clip>.json`` (kind, license, speaker, language, transcript). Columns are
 FAPs of a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig
 (``mouth_stretch_c``). A clip's source is the first part of its name: ``cmlr`` of ``cmlr_s1_3``.
 
@@ -179,7 +179,8 @@ def _read_clip(
         clip_language = str(about.get("language", "zh"))[:2]
         if language not in (None, clip_language):
             return None
-        license_name, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
+        license_name = str(about.get("license", about.get("licence", "")))
+        speaker = str(about.get("speaker", ""))
         table = path.with_suffix(".csv")
         lines = split_lines(table, read_text(table, _MAX_BYTES))
         rows = list(itertools.islice(csv.DictReader(lines), _MAX_ROWS + 1))

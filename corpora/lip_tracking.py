@@ -104,7 +104,7 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
     about = {
         "clip": clip.stem,
         "kind": "tracked video (MediaPipe face mesh)",
-        "licence": "",
+        "license": "",
         "speaker": clip.stem,
         "language": "",
         "transcript": "",

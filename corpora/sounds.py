@@ -1,6 +1,6 @@
 """Sounds without speech: music, noise, babble, laughter, breath.
 
-A folder of sounds has a ``manifest.tsv`` with the columns ``path``, ``kind`` and ``licence``. About
+A folder of sounds has a ``manifest.tsv`` with the columns ``path``, ``kind`` and ``license``. About
 a quarter of the music and noise files are held out, by the CRC-32 of their names. The other kinds
 have few files, so the second half of each file is held out.
 """
@@ -40,12 +40,12 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
     sounds = []
     for folder in folders:
         manifest = folder / "manifest.tsv"
-        rows = read_rows(manifest, ("path", "kind", "licence"))
+        rows = read_rows(manifest, ("path", "kind", "license"))
         if not rows:
             raise UserError(f"{manifest} lists no sounds")
         try:
             for row in rows:
-                if may_ship(row["licence"]) or not shipping:
+                if may_ship(row["license"]) or not shipping:
                     sounds += _parts(row["kind"], folder / row["path"])
         except OSError as error:
             raise UserError(f"cannot read {error.filename}: {error.strerror}") from error

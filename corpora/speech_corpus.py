@@ -2,7 +2,7 @@
 
 The files in the folder determine the layout:
 
-- ``manifest.tsv``: columns ``utt_id path speaker source licence split seconds text pinyin``. Only
+- ``manifest.tsv``: columns ``utt_id path speaker source license split seconds text pinyin``. Only
   one of ``text`` and ``pinyin`` is required; ``pinyin`` takes precedence.
 - A Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``). If its name is ``dev`` or ``test``, it
   is that split.
@@ -185,7 +185,7 @@ def _utterance(
         utterance_id=row["utt_id"],
         path=path,
         speaker=row.get("speaker") or row["utt_id"],
-        license=row.get("licence", ""),
+        license=row.get("license", ""),
         language=row.get("language", ""),
         split=_split_of(row),
         seconds=seconds,
@@ -246,7 +246,7 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
                     "utt_id": utterance_id,
                     "path": str(path),
                     "speaker": path.parent.name,
-                    "licence": "Apache-2.0",
+                    "license": "Apache-2.0",
                     # The split of a missing file is unknown; it is reported once, under train.
                     "split": path.relative_to(folder / "wav").parts[0]
                     if utterance_id in audio

@@ -9,17 +9,20 @@ from kouxing.shared.user_file import read_text, split_lines
 
 _MAX_BYTES = 256 << 20
 _MAX_ROWS = 1_000_000
+_SPELLINGS = {"licence": "license"}
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     """Return the rows of a table by column; missing cells are empty.
 
     Raises ``UserError`` if the file is missing, is not text, is too large, or lacks one of
-    ``columns``. A column may have several names: ``pinyin or text``.
+    ``columns``. A column may have several names: ``pinyin or text``. The British spelling of the
+    column ``license`` is also read.
     """
     lines = split_lines(path, read_text(path, _MAX_BYTES))
     table = csv.DictReader(lines, restval="", delimiter="\t", quoting=csv.QUOTE_NONE)
-    known = set(table.fieldnames or ())
+    table.fieldnames = [_SPELLINGS.get(name, name) for name in table.fieldnames or ()]
+    known = set(table.fieldnames)
     missing = [column for column in columns if known.isdisjoint(column.split(" or "))]
     if missing:
         raise UserError(f"{path} lacks the columns {', '.join(missing)}")

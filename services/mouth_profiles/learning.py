@@ -258,7 +258,7 @@ class LearnedProfile:
         }
         return {
             "speech_s": self.speech_s,
-            "held_back_s": gain.speech_s,
+            "held_out_s": gain.speech_s,
             "delay_ms": 1e3 * gain.delay_s,
             "before": dict(zip(MEASURES, _plain(gain.before), strict=True)),
             "after": dict(zip(MEASURES, _plain(gain.after), strict=True)),

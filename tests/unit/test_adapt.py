@@ -84,7 +84,7 @@ def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     lips = load_lip_predictor()
     assert lips.with_mouth_profile(profile.read_bytes()).digest != lips.digest
     found = json.loads(figures.read_text(encoding="utf-8"))
-    assert found["held_back_s"] == pytest.approx(found["speech_s"] / 4, abs=0.05)
+    assert found["held_out_s"] == pytest.approx(found["speech_s"] / 4, abs=0.05)
     assert found["after"]["opening"] > found["before"]["opening"] + 0.05
     assert found["before"]["width"] is None
     curve = found["curves"]["opening"]

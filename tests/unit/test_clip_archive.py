@@ -18,11 +18,11 @@ def test_packs_the_clips_that_may_be_shared(tmp_path: Path) -> None:
     write_clip(folder)
     about = folder / "cam_1.json"
     for name in ("MIT; footage by third parties", "CC BY-NC 4.0"):
-        about.write_text(json.dumps({"language": "zh", "licence": name}))
+        about.write_text(json.dumps({"language": "zh", "license": name}))
         with pytest.raises(UserError, match="no clip has a license that allows sharing"):
             write_clip_archive(folder, archive)
     assert not archive.exists()
-    about.write_text(json.dumps({"speaker": "ann", "language": "zh", "licence": "CC BY 4.0"}))
+    about.write_text(json.dumps({"speaker": "ann", "language": "zh", "license": "CC BY 4.0"}))
     assert write_clip_archive(folder, archive) == 1
     with zipfile.ZipFile(archive) as file:
         file.extractall(tmp_path / "copy")

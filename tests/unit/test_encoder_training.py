@@ -83,7 +83,7 @@ def test_exported_steps_follow_pytorch() -> None:
 def write_sounds(folder: Path) -> Path:
     folder.mkdir()
     rng = np.random.default_rng(0)
-    lines = ["path\tkind\tlicence"]
+    lines = ["path\tkind\tlicense"]
     for kind in ("babble", "laughter"):
         soundfile.write(folder / f"{kind}.wav", rng.normal(0, 0.1, 32_000), 16_000)
         lines.append(f"{kind}.wav\t{kind}\tCC0")

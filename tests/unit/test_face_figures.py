@@ -15,7 +15,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
 
-COLUMNS = "path\tspeaker\tlicence\tseconds\tnote\tphones_path\n"
+COLUMNS = "path\tspeaker\tlicense\tseconds\tnote\tphones_path\n"
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
     with pytest.raises(UserError, match="names no emotion"):
         read_emotions(folder)
     manifest.write_text("path\tspeaker\ncalm.wav\tann\n", encoding="utf-8")
-    with pytest.raises(UserError, match="lacks the columns licence, seconds, note"):
+    with pytest.raises(UserError, match="lacks the columns license, seconds, note"):
         read_emotions(folder)
     manifest.write_text(COLUMNS + "calm.wav\tann\tCC0\tlong\temotion fear\t\n", encoding="utf-8")
     with pytest.raises(UserError, match="write the seconds as a number"):

@@ -144,7 +144,7 @@ def corpus(tmp_path: Path) -> Path:
         f"e\ta.wav\tA\tCC0-1.0\tdev\t9\t{sentence} zao3",
         f"f\tnone.wav\tA\tCC0-1.0\ttrain\t9\t{sentence} zao3",
     ]
-    header = "utt_id\tpath\tspeaker\tlicence\tsplit\tseconds\tpinyin"
+    header = "utt_id\tpath\tspeaker\tlicense\tsplit\tseconds\tpinyin"
     (folder / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return folder
 

@@ -17,7 +17,7 @@ from tests.unit.test_block_training import interrupt
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-COLUMNS = "utt_id path language speaker licence split seconds text ipa phones_path".split()
+COLUMNS = "utt_id path language speaker license split seconds text ipa phones_path".split()
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def write_corpus(folder: Path, *, with_labels: bool = True) -> Path:
     labels = [("0", "0.2", "<p:>"), ("0.2", "0.6", "a"), ("0.6", "1.4", "aI"), ("1.4", "1.5", "n")]
     table = ["start_s\tend_s\tsymbol", *map("\t".join, labels)]
     (folder / "labels.tsv").write_text("\n".join(table) + "\n")
-    common = {"path": "a.wav", "licence": "CC0", "seconds": "1.5", "text": "-"}
+    common = {"path": "a.wav", "license": "CC0", "seconds": "1.5", "text": "-"}
     rows: list[dict[str, str]] = [
         {"utt_id": "b", "language": "fr", "speaker": "b", "ipa": "nina sa"},
         {"utt_id": "c", "language": "it", "speaker": "c", "ipa": "mama"},  # held out

@@ -58,7 +58,7 @@ def test_estimates_the_parameters_behind_curves() -> None:
 
 
 def write_clip(folder: Path, name: str, language: str, header: str, row: str) -> None:
-    about = {"language": language, "speaker": "one", "licence": "MIT", "energy_r": math.nan}
+    about = {"language": language, "speaker": "one", "license": "MIT", "energy_r": math.nan}
     (folder / f"{name}.json").write_text(json.dumps(about))  # the last one is not used
     (folder / f"{name}.csv").write_text(f"{header}\n{row}\n")
     soundfile.write(folder / f"{name}.flac", np.zeros(1600), 16_000)

@@ -34,7 +34,7 @@ PER_S = 50  # slices
 @pytest.fixture
 def sounds(tmp_path: Path) -> list[Sound]:
     """Return two pieces of music, of which the loud one is held out, and laughter."""
-    rows = ["path\tkind\tlicence"]
+    rows = ["path\tkind\tlicense"]
     for name, kind, level in (("a", "music", 0.5), ("b", "music", 0.1), ("ha", "laughter", 0.2)):
         soundfile.write(tmp_path / f"{name}.flac", np.full(RATE_HZ, level), RATE_HZ)
         rows.append(f"{name}.flac\t{kind}\tCC0")
@@ -109,12 +109,12 @@ def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> No
     ("rows", "problem"),
     [
         ("", "lists no sounds"),
-        ("a.flac\t\n", "lacks the columns licence"),
+        ("a.flac\t\n", "lacks the columns license"),
         ("short row", "cannot read a sound in"),
     ],
 )
 def test_reports_an_unusable_list_of_sounds(tmp_path: Path, rows: str, problem: str) -> None:
-    columns = "path\tkind" if "licence" in problem else "kind\tlicence\tpath"
+    columns = "path\tkind" if "license" in problem else "kind\tlicense\tpath"
     (tmp_path / "manifest.tsv").write_text(f"{columns}\n{rows}", encoding="utf-8")
     with pytest.raises(UserError, match=problem):
         read_sounds([tmp_path], shipping=False)

@@ -74,7 +74,7 @@ def test_rejects_files_of_other_kinds_and_sizes(tmp_path: Path) -> None:
 def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
     """Recordings of one text; those whose name begins with d are for dev."""
     folder.mkdir(exist_ok=True)
-    header = "utt_id\tpath\tspeaker\tlicence\tsplit\tseconds\tpinyin\n"
+    header = "utt_id\tpath\tspeaker\tlicense\tsplit\tseconds\tpinyin\n"
     rows = ""
     for name, sound in sounds.items():
         soundfile.write(folder / f"{name}.wav", sound, 16_000)

@@ -353,7 +353,7 @@ def _description(head: Head) -> dict[str, Any]:
         "visemes": _shapes(VISEME_NAMES, VISEMES),
         "expressions": _shapes(EXPRESSION_NAMES, EXPRESSIONS),
         "arkit": _shapes(ARKIT.names, ARKIT.basis),
-    } | ({"licence": "CC0-1.0"} if _is_built_in(head) else {})
+    } | ({"license": "CC0-1.0"} if _is_built_in(head) else {})
 
 
 def _shapes(names: tuple[str, ...], values: NDArray[np.float32]) -> list[dict[str, Any]]:
