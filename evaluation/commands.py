@@ -41,7 +41,7 @@ Acoustic = Annotated[
 ]
 Sounds = Annotated[
     list[Path] | None,
-    typer.Option(help="Folder of sounds; only held-out ones are used. Default: synthesized."),
+    typer.Option(help="Folder of sounds; only held-out sounds are used. Default: synthesized."),
 ]
 Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
 Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]

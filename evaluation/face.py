@@ -246,7 +246,7 @@ def _blinks(faps: Floats, rate_hz: float) -> Times:
 
 
 def _is_still(faps: Floats) -> NDArray[np.bool_]:
-    """Return whether each frame but the first looks like the one before."""
+    """Return whether each frame, except the first, looks like the previous frame."""
     limits = np.full(faps.shape[1], _STILL_UNITS)
     limits[_ANGLES] = _STILL_DEG * _DEGREE
     still: NDArray[np.bool_] = np.all(np.abs(np.diff(faps, axis=0)) <= limits, axis=1)

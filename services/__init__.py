@@ -1,1 +1,1 @@
-"""The services of kouxing; each runs on its own as ``python -m kouxing.services.<name>``."""
+"""The services of kouxing; each runs separately as ``python -m kouxing.services.<name>``."""

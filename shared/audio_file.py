@@ -190,7 +190,7 @@ class _Pipe:
         return self._begin
 
     def skip(self, num_bytes: int) -> bytes:
-        """Drop the first bytes; return the next ones, as ``peek`` does."""
+        """Drop the first bytes; return the next bytes like ``peek``."""
         self._begin = self._begin[num_bytes:]
         return self._begin
 

@@ -384,7 +384,7 @@ class ConnectionLimiter:
             trim_heap()
 
     def _forget_ended(self, now_s: float) -> bool:
-        """Forget ended connections; return whether any connection has ended."""
+        """Remove ended connections; return whether any connection has ended."""
         ended = [c for c in list(self._connections.values()) if not _exists(c)]
         for connection in ended:
             del self._connections[connection.inode]

@@ -118,7 +118,7 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
 
 
 def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
-    """Check the keys of a system on this machine against each other, and create missing ones.
+    """Check that the keys of a system on this machine match, and create missing keys.
 
     ``kinds`` has the roles of each kind of service. Raises ``UserError`` with the command that
     fixes the key, or as ``load_key``.

@@ -1,4 +1,4 @@
-"""Publishes a session's results, and repeats the first ones for subscribers that join late.
+"""Publishes a session's results, and repeats the first results for subscribers that join late.
 
 When a session opens or moves, its subscribers need time to connect to the new worker. Results that
 are published in the meantime are repeated for each of them. Subscribers ignore repeated messages.

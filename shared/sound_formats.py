@@ -172,7 +172,7 @@ def is_cut_ogg(end: bytes) -> bool:
 def codec_of_padded_wav(begin: bytes) -> str | None:
     """Return the codec of a WAV file whose samples have unused bits, such as 24 bits of 32.
 
-    FFmpeg takes such samples for smaller ones.
+    FFmpeg reads such samples as smaller samples.
     """
     header = begin[begin.find(b"fmt ") + 8 :]
     kind, valid, subtype = (

@@ -11,7 +11,7 @@ const EVENTS = [
  *
  * @param gateway address of the gateway, such as "http://localhost:8080"
  * @param path "/viewer" or "/microphone"
- * @param fields of the query; empty ones are left out
+ * @param fields of the query, without empty fields
  */
 export function socketUrl(gateway, path, fields) {
   const url = new URL(path, gateway);

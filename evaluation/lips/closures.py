@@ -1,4 +1,4 @@
-"""Closures of lips: which real ones a mouth reproduces, and which of its closures are real.
+"""Closures of lips: recall of the real closures, and precision of a mouth's closures.
 
 Lips that touch near an opening are a contact. Lips that touch elsewhere are at rest.
 """

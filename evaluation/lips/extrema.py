@@ -39,7 +39,7 @@ def misalignment_s(predicted: Mouth, real: Mouth) -> float | None:
 
 
 def match_extrema(predicted: Array, real: Array) -> list[int]:
-    """Return the lag of predicted extrema behind the real ones that they match, frames.
+    """Return the lag of predicted extrema behind the matching real extrema, frames.
 
     >>> match_extrema(np.array([0.0, 0, 1, 4, 1, 0, 2, 2]), np.array([0.0, 1, 4, 1, 0, 2, 2, 1]))
     [1, 1]
@@ -73,7 +73,7 @@ def warping_path(first: Array, second: Array) -> list[tuple[int, int]]:
     total = np.full((rows + 1, columns + 1), np.inf)
     total[0, 0] = 0.0
     cost = np.abs(first[:, None] - second)
-    for diagonal in range(2, rows + columns + 1):  # all cells of one depend only on earlier ones
+    for diagonal in range(2, rows + columns + 1):  # a diagonal depends only on earlier diagonals
         row = np.arange(max(1, diagonal - columns), min(rows, diagonal - 1) + 1)
         column = diagonal - row
         best = np.minimum(total[row - 1, column], total[row, column - 1])

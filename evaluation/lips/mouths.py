@@ -1,4 +1,4 @@
-"""Mouths to compare: tracked ones, and those that a lip model makes."""
+"""Mouths to compare: tracked mouths, and the mouths of lip models."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

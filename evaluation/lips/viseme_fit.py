@@ -2,8 +2,8 @@
 
 Source: Wang & Cai 2003, section 4; their figure 4 shows measured and modeled curves. Here the full
 model runs over the phones of each clip. The phones are aligned if the text is known, and recognized
-otherwise. The model runs with the learned parameters and with the initial ones, which were set by
-hand. Each frame counts for the nearest viseme. The level of the voice is not used.
+otherwise. The model runs with the learned parameters and with the initial parameters, which were
+set by hand. Each frame counts for the nearest viseme. The level of the voice is not used.
 """
 
 from collections.abc import Sequence

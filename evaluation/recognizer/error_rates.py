@@ -127,7 +127,7 @@ class Score:
 
 
 def mouth_shapes(phones: Iterable[str], inventory: PhoneInventory) -> list[str]:
-    """Return the shapes that the mouth goes through (Li 2011, table 1), equal neighbors once."""
+    """Return the sequence of mouth shapes (Li 2011, table 1), without repeats."""
     shapes = [
         viseme
         for phone in phones

@@ -9,7 +9,7 @@ _VISEMES = {"b", "f"}  # visemes of b p m and of f
 
 
 class Labials:
-    """Counts spoken labials, recognized ones, and those that are both."""
+    """Counts spoken labials, recognized labials, and labials that are both."""
 
     def __init__(self, inventory: PhoneInventory) -> None:
         visemes = inventory.visemes

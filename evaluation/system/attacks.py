@@ -2,7 +2,7 @@
 
 The services run as under ``kouxing run``, with keys, on free ports. During each attack a session
 is streamed in real time: before, during and after it. The attacker is a separate process, which
-starts over whenever it is cut off. It has a process session of its own, like any other program.
+starts over whenever it is cut off. It has its own process session, like any other program.
 In the caller's session, it would have the caller's priority, which can exceed the services'. The
 first row is a process that only keeps a core busy, because an attacker also takes processor time.
 

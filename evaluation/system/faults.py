@@ -332,7 +332,7 @@ def _outcome(
 
 
 def _open_all(client: Client, num: int) -> tuple[list[Session], int]:
-    """Open sessions; return them and the number of refused ones. The first is not refused."""
+    """Open sessions; return them and the number of refusals. The first session is not refused."""
     sessions = [client.open_session(encoding="f32le")]
     num_refused = 0
     for _ in range(num - 1):

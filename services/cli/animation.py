@@ -78,7 +78,7 @@ def has_motion(source: Path) -> bool:
 
 
 def read_motion(source: Path, sound: Path | None) -> FaceMotion:
-    """Read a ``.fap`` file or a table, with the sound that goes with it, if any."""
+    """Read a ``.fap`` file or a table, with its sound, if any."""
     animation = read_fap(source) if source.suffix.lower() == ".fap" else read_table(source)
     return FaceMotion(
         film.expand_frames(animation),

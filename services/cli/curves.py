@@ -221,7 +221,7 @@ def _live_link_cells(row: Row) -> list[str]:
     return [time_code, str(len(values)), *(f"{value:.6f}" for value in values)]
 
 
-# The app's tables have the right jaw and mouth before the left ones, unlike its packets.
+# The app's tables list the right jaw and mouth before the left, unlike its packets.
 _SWAPPED = {"jawLeft": "jawRight", "mouthLeft": "mouthRight"}
 _SWAPPED |= {right: left for left, right in _SWAPPED.items()}
 _LIVE_LINK_SHAPES = [_SWAPPED.get(name, name) for name in live_link.ORDER]

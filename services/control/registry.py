@@ -248,7 +248,7 @@ class Registry:
         return self._loads.setdefault(instance, WorkerLoad())
 
     def forget_load(self, instance: str) -> None:
-        """Forget the load of a worker without sessions, if it is lost."""
+        """Drop the load of a lost worker without sessions."""
         if instance not in self._services:
             self._loads.pop(instance, None)
 

@@ -83,7 +83,7 @@ class Sessions:
         return record if same else None
 
     def numbered_from(self, number: int) -> list[SessionRecord]:
-        """Return the sessions from a number on; newer sessions have greater numbers."""
+        """Return the sessions with this number or more; newer sessions have greater numbers."""
         records = list(self._records.values())
         return records[bisect_left(records, number, key=attrgetter("number")) :]
 
@@ -197,7 +197,7 @@ class Sessions:
         return record
 
     def remove(self, record: SessionRecord, now_s: float) -> None:
-        """Forget a session."""
+        """Remove a session."""
         del self._records[record.name]
         self._pending.pop(record.name, None)
         self._num_per_key[record.client.key] -= 1

@@ -1,4 +1,4 @@
-"""Microphones: each WebSocket streams audio into a session of its own."""
+"""Microphones: each WebSocket streams audio into a separate session."""
 
 import contextlib
 

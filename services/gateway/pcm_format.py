@@ -68,7 +68,7 @@ class PcmFormat:
             raise UserError(f"expected {self}; this is JSON: send it as a text message")
 
     def check_samples(self, pcm: bytes, *, is_first: bool) -> None:
-        """Check whole samples. The first ones may be the header of a file.
+        """Check whole samples. The data may start with the header of a file.
 
         Raises ``UserError`` if they do not have this format; the text says what was expected.
         """

@@ -1,4 +1,4 @@
-"""The sample sentence: a recording that the gateway speaks in a session of its own."""
+"""The sample sentence: a recording that the gateway plays in a separate session."""
 
 import asyncio
 import secrets

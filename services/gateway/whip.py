@@ -1,6 +1,6 @@
 """WHIP (RFC 9725): a WebRTC client connects with one POST request.
 
-The client's audio track streams into a session of its own. Its data channel receives the messages
+The client's audio track streams into a separate session. Its data channel receives the messages
 of a viewer of that session, except the sound, and accepts a microphone's commands.
 """
 

@@ -72,9 +72,9 @@ _FAPS = {
 }  # fmt: skip
 
 LANDMARKS = tuple(sorted({*_STEADY, _UNDER_NOSE, *(point for point, _, _ in _FAPS.values())}))
-"""Indices of the needed ones among MediaPipe's 468 landmarks, ascending."""
+"""Indices of the needed landmarks among MediaPipe's 468, ascending."""
 
-_QUIET_DB = 30.0  # silent frames are this far below the loud ones
+_QUIET_DB = 30.0  # level of silent frames below loud frames
 _LOUD_PERCENTILE = 95.0
 _CLOSED_FRACTION = 0.35  # fraction of the frames whose lips count as closed
 _CLOSED_FRACTION_SPEAKING = 0.08  # the same fraction, without silent frames

@@ -1,4 +1,4 @@
-"""Checks the audio messages of clients, and reports rejected ones."""
+"""Checks the audio messages of clients, and reports rejections."""
 
 import logging
 import time

@@ -176,7 +176,7 @@ class RecognizerService(Service):
         return True
 
     def stop_session(self, session: str) -> None:
-        """Forget a session."""
+        """Remove a session."""
         self._starting.remove(session)
         if self._sessions.pop(session, None) is not None:
             free_at_s = time.monotonic() + FREE_MEMORY_AFTER_S

@@ -6,7 +6,7 @@ Frames are clocked by media time, so they do not depend on the arrival times of 
 decides when a stream has stalled and requests frames that return to rest (`FaceAnimator.relax`).
 
 The face moves continuously when another recognizer takes over (`change_recognizer`), when this face
-replaces the one of another process (`resume`), and when the lip model changes (`set_lip_model`). A
+replaces the face of another process (`resume`), and when the lip model changes (`set_lip_model`). A
 *transition* of all FAPs then leads the difference between old and new frames to zero. Lips that
 must close for speech close during the transition as well.
 """
@@ -118,7 +118,7 @@ class FaceAnimator:
         self._changes: deque[SpeechChange] = deque()  # changes in future frames
         self._levels: list[tuple[float, float]] = []  # since the last frame
         self._pitches: list[tuple[float, float]] = []  # since the last frame
-        self._voice: deque[Progress] = deque()  # the current one and later ones
+        self._voice: deque[Progress] = deque()  # current and later progress
         self._recent: deque[SoundEvent] = deque()
         self._lip_stream = self._lip_model.stream(
             self._time_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s

@@ -233,7 +233,7 @@ class SynthesizerService(Service):
         }
 
     def on_drain(self) -> bool:
-        """Wait until other synthesizers have taken the sessions; end the remaining ones."""
+        """Wait until other synthesizers have taken over the sessions; end the rest."""
         unfinished = [session for session in self._sessions.values() if not session.finished]
         if unfinished and self.is_handing_over:
             return False

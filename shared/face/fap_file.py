@@ -37,7 +37,7 @@ _GRETA_MASK_DIGITS = NUM_FAPS + 1
 _ANY = 2**31
 _VISEME_LIMITS = (14, 14, 63, _ANY)
 _EXPRESSION_LIMITS = (6, 63, 6, 63, _ANY, _ANY)
-# numbers that follow a selection on its own
+# numbers that follow a selection by itself
 _VISEME_ALONE = (0, 63, 0)
 _EXPRESSION_ALONE = (63, 0, 0, 0, 0)
 # inner lip FAP: outer lip FAP

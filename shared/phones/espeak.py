@@ -16,7 +16,7 @@ _INSTALL = (
 def transcribe_phrases(phrases: Sequence[Sequence[str]], voice: str) -> list[list[str]]:
     """Return the IPA of each word of each phrase; phones of more than one letter are tied.
 
-    A word is read within its phrase, or on its own if espeak-ng joins words of the phrase. A
+    A word is read within its phrase, or alone if espeak-ng joins words of the phrase. A
     silent word has an empty text. ``voice`` is an espeak-ng voice.
 
     Raises ``UserError`` if espeak-ng is missing or fails.

@@ -125,7 +125,7 @@ def _tier(number: int, name: str, intervals: list[_Interval], total_s: float) ->
 
 
 def _without_gaps(given: Sequence[_Interval], total_s: float) -> list[_Interval]:
-    """Return intervals that cover the whole time: empty ones fill gaps, overlaps are cut."""
+    """Return intervals that cover the whole time: empty intervals fill gaps, overlaps are cut."""
     intervals: list[_Interval] = []
     now_s = 0.0
     for number, (onset_s, offset_s, text) in enumerate(given):

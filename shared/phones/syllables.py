@@ -41,7 +41,7 @@ class SyllableTrack:
         self._syllables: dict[int, tuple[_Source, Syllable]] = {}
 
     def reset(self) -> None:
-        """Forget all phones when a session restarts."""
+        """Drop all phones when a session restarts."""
         self._phones.clear()
         self._syllables.clear()
         self._num_dropped = 0

@@ -107,7 +107,7 @@ class SessionMoved(Message, frozen=True, kw_only=True):
 
 
 class CloseSession(Message, frozen=True, kw_only=True):
-    """The session is over; the services forget it.
+    """The session is over; the services delete its state.
 
     Sent by a client to control, and by control to the services.
     """

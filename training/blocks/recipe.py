@@ -48,7 +48,7 @@ from kouxing.training.networks.whisper import init_encoder, load_whisper
 from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_examples
 
 # Live, in positions. A short block gives early hypotheses. Its positions have less right context
-# than the first ones of a long block, so R is longer than in training.
+# than the first positions of a long block, so R is longer than in training.
 BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
 _ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY, _RATE_WEIGHT = 3.2, 120.0  # chosen on speech of many rates, for `light` too

@@ -59,7 +59,7 @@ _MIN_PEAK_DB = -36.0  # relative to full scale
 def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples, float]:
     """Augment samples, (n,) at 16 kHz, at random.
 
-    Return the new ones, (n / speed,), and the speed.
+    Return the new samples, (n / speed,), and the speed.
     """
     sound, speed = change_speed(samples, rng)
     return disturb(sound, rng), speed

@@ -1,4 +1,4 @@
-"""Estimate a phone language model: count n-grams, smooth them, keep the most informative ones.
+"""Estimates a phone language model: counts n-grams, smooths them, and keeps the most informative.
 
 Sources: Witten and Bell 1991, "The zero-frequency problem", as interpolation (Chen and Goodman
 1999, section 2.6); Seymore and Rosenfeld 1996, "Scalable backoff language models" (pruning).

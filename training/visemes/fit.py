@@ -1,8 +1,8 @@
 """Fit the dynamic visemes' parameters to tracked lips by least squares.
 
 Source: Wang & Cai 2003, section 4. Two stages of gradient descent minimize the squared error
-between the model's curves and measured ones: first the vowels, with the silences and the exponent,
-then the consonants with those fixed. The stages are repeated.
+between the model's curves and the measured curves: first the vowels, with the silences and the
+exponent, then the consonants with those fixed. The stages are repeated.
 
 ======  =============================================  =========  ================
 symbol  name                                           unit       shape
@@ -17,7 +17,7 @@ Deviations from the paper:
 
 - The speech consists of words and sentences instead of single finals and syllables. A stage
   therefore changes only its own visemes.
-- Each FAP is fitted on its own. Ridge regularization keeps parameters with little data close to
+- Each FAP is fitted separately. Ridge regularization keeps parameters with little data close to
   their initial values.
 - The closure rule is not fitted, nor the lips of labials, which are closed by definition, nor the
   tongue, which is not visible.
@@ -123,7 +123,7 @@ _SPREAD = {"alpha": 0.7, "theta": 0.5, "offset": 0.04, "target": 1.0}
 # largest distance from the initial values, in spreads
 _ALPHA_RANGE, _THETA_RANGE, _OFFSET_RANGE = 4.0, 2.0, 2.0
 _MAX_GAIN = 2.0
-_EXPONENTS = (1.3, 1.5, 1.8)  # lower ones give visible corners at the apexes
+_EXPONENTS = (1.3, 1.5, 1.8)  # lower exponents give visible corners at the apexes
 _ROUNDS = 2
 _SILENCE_STEP = 1e-4  # step of the finite differences, in spreads
 _UNKNOWNS = ("alpha", "theta_minus", "theta_plus", "offset_s", "target")

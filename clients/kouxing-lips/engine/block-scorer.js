@@ -47,7 +47,7 @@ export class BlockScorer {
     this.#startTable();
   }
 
-  /** Take the last frames of some positions; return the new settled scores, and the provisional ones. */
+  /** Take the last frames of some positions; return the new settled scores and the provisional scores. */
   accept(positions, numFrames) {
     const size = this.#numMels;
     const frames = positions.flatMap(({ features }) => [features.slice(0, size), features.slice(size, 2 * size)]);

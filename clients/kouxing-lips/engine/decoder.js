@@ -315,7 +315,7 @@ export class Decoder {
     return agreeing / total;
   }
 
-  /** Return the segments after the shared ones, up to the one of a record. */
+  /** Return the segments after the shared segments, up to a record's segment. */
   #trace(record) {
     const segments = [];
     while (record !== NO_RECORD && record !== this.lastShared) {

@@ -15,7 +15,7 @@ export class Face {
   #expressions;
   #nonverbal;
   #feeling;
-  #voice = []; // the current progress and later ones
+  #voice = []; // current and later progress
   #levels = []; // progress since the last frame
   #nextFrame = 0;
   #isSpeaking = false; // at the last frame

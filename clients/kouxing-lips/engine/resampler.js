@@ -48,7 +48,7 @@ export class Resampler {
     this.#first = -this.#half;
   }
 
-  /** Accept samples, mono in [-1, 1]; return the resampled ones that are ready. */
+  /** Accept samples, mono in [-1, 1]; return the resampled samples that are ready. */
   accept(samples) {
     this.#numIn += samples.length;
     return this.#up === this.#down ? samples : this.#resample(samples);

@@ -1,4 +1,4 @@
-"""Follows the messages of one session through moves and reconnections; no I/O of its own."""
+"""Follows the messages of one session through moves and reconnections, without I/O."""
 
 import math
 from collections import deque

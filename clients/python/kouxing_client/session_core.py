@@ -1,4 +1,4 @@
-"""One session: its audio, its subscriptions and its moves; no I/O of its own."""
+"""One session: its audio, its subscriptions and its moves, without I/O."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ class Glb:
         } | decoded
 
     def accessor(self, index: object) -> Float64:
-        """Return an accessor's values (N, components); normalized values are -1 to 1."""
+        """Return an accessor's values (N, components); normalized values are in [-1, 1]."""
         item = self.item("accessors", index)
         width, count = _COMPONENTS[item["type"]], int(item["count"])
         kind = np.dtype(_TYPES[item["componentType"]])
@@ -252,7 +252,7 @@ class Glb:
 
 
 def _to_float(values: NDArray[Any], accessor: dict[str, Any]) -> Float64:
-    """Return numbers of an accessor; normalized ones are -1 to 1."""
+    """Return numbers of an accessor; normalized numbers are in [-1, 1]."""
     out = values.astype(np.float64)
     if accessor.get("normalized") and values.dtype.kind in "iu":
         out = np.maximum(out / np.iinfo(values.dtype).max, -1.0)

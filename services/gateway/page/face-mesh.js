@@ -1,4 +1,4 @@
-// Finds the face in images with MediaPipe's face mesh, in a frame of its own (face-mesh.html).
+// Finds the face in images with MediaPipe's face mesh, in a separate frame (face-mesh.html).
 // Images arrive as messages, landmarks are sent back. It runs on the CPU, so that all browsers
 // compute the same landmarks.
 

@@ -1,4 +1,4 @@
-// Finds the face in images. The work is done in a frame of its own; see face-mesh.js.
+// Finds the face in images. The work is done in a separate frame; see face-mesh.js.
 
 import { UserError, say } from "./language.js";
 

@@ -1,4 +1,4 @@
-// Streams the microphone, or a file in its place, into a session of its own.
+// Streams the microphone, or a file in its place, into a separate session.
 
 import { socketUrl } from "./address.js";
 import { AudioUplink } from "./audio-uplink.js";

@@ -62,12 +62,12 @@ class AcousticStream(ABC):
     """State scores of one speaker's speech, segment by segment.
 
     The scores that a stream returns are settled: each frame gets them once. A stream may also have
-    provisional scores of the next frames, computed from less audio than the settled ones will be.
+    provisional scores of the next frames, computed from less audio than the settled scores.
     """
 
     uses_encoder = False  # whether its frames are the encoder's phones instead of the front end's
     look_ahead_frames: int  # maximum delay of a frame's settled scores, frames
-    provisional: Floats  # (k, states) of the frames after the settled ones; a change is a new array
+    provisional: Floats  # (k, states) of the next frames; a change is a new array
 
     def __init__(self, model: AcousticModel) -> None:
         self.model = model
@@ -82,7 +82,7 @@ class AcousticStream(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Forget the segment and the speaker."""
+        """Reset the state of the segment and the speaker."""
 
 
 def empty_scores(num_states: int) -> Floats:

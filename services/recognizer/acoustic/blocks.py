@@ -24,7 +24,7 @@ acoustic_scale weight of the log scores, chosen on development data   1
 
 Position ``p`` of a segment has the frames ``2 p`` and ``2 p + 1``. It sees the frames from
 ``2 p - 2`` to ``2 p + 2`` (zeros precede the first). Whenever ``H`` more positions are complete,
-the network runs on up to ``B + R`` positions, the newest ones. It settles the scores of the first
+the network runs on the newest positions, up to ``B + R``. It settles the scores of the first
 positions, to make room for ``H`` more in the next run, and keeps their keys and values.
 The scores of the other positions, the right context, are provisional. ``H`` is ``B``, and on a
 busy machine a multiple of ``B``: there are fewer runs, and right contexts are shorter. When speech
@@ -166,8 +166,8 @@ class Block(Record, frozen=True):
     frames: Floats  # (2 positions + 3, 80), from two before the first position's
     row: int  # row of the first position in the table
     num_positions: int
-    num_settled: int  # the first ones, whose scores are settled
-    num_kept: int  # the first ones, whose keys and values are kept; 0 if nothing follows
+    num_settled: int  # number of first positions, whose scores are settled
+    num_kept: int  # number of first positions, whose keys and values are kept; 0 if nothing follows
     past: NetworkState
 
 

@@ -166,7 +166,7 @@ class GmmStream(AcousticStream):
         return scores * np.float32(self.model.acoustic_scale)
 
     def reset(self) -> None:
-        """Forget the segment and the speaker."""
+        """Reset the state of the segment and the speaker."""
         self._differences = DeltaFeatures(self.model.half_width)
         self._vtln.reset()
         self._mean.reset()

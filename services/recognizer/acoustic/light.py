@@ -13,7 +13,7 @@ prior    prior of the phones, to a power below one                      (phones,
     log b(x) = acoustic_scale * (q - log prior), the same for all states of a phone
 
 After frame ``t``, the encoder outputs the posteriors of frame ``t - PHONES_LAG_FRAMES``. At the end
-of a segment, the last ones are repeated.
+of a segment, the last posteriors are repeated.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class LightStream(AcousticStream):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the segment."""
+        """Reset the state of the segment."""
         self.start(0)
 
     def start(self, num_missing: int) -> None:

@@ -221,7 +221,7 @@ class RunningMean:
         return out
 
     def reset(self) -> None:
-        """Forget the speaker."""
+        """Reset the speaker's statistics."""
         # sums of the features, their number, the peak of the log energy
         self._state = np.array([*[0.0] * len(self._prior), 0.0, -np.inf])
 

@@ -63,7 +63,7 @@ class Resampler:
         self._num_out = 0
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Accept samples, (n,) or (n, channels); return the new ones at 16 kHz, (m,).
+        """Accept samples, (n,) or (n, channels); return the new samples at 16 kHz, (m,).
 
         Raises ``UserError`` if the shape does not match the channels, or a sample is not finite.
         """

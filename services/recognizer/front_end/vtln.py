@@ -159,7 +159,7 @@ class VocalTractNormalizer:
         return frames
 
     def reset(self) -> None:
-        """Forget the speaker."""
+        """Reset the speaker's statistics."""
         self._state = np.zeros(2)  # sum of ln(f_ref / pitch) over voiced frames; their number
 
 

@@ -240,7 +240,7 @@ class Decoder:
         self._num_records = num_kept
 
     def _trace(self, record: int) -> list[PathSegment]:
-        """Return the phones after the shared ones, up to the one of a record."""
+        """Return the phones after the shared phones, up to a record's phone."""
         segments: list[PathSegment] = []
         while record not in (NO_RECORD, self._last_shared):
             end, phone, before = self._records[record].tolist()

@@ -11,7 +11,7 @@ IMPOSSIBLE = np.float32(-1e30)  # score of a state that no path reaches
 
 
 class Tokens(NamedTuple):
-    """The tokens; only the first ones are in use."""
+    """The tokens; only the first tokens are in use."""
 
     context: NDArray[np.int32]  # (tokens,)
     top: NDArray[np.float32]  # (tokens,)

@@ -117,7 +117,7 @@ class VisemeParameters:
 
 
 def load_parameters(path: Path | None = None) -> VisemeParameters:
-    """Read parameters from a file, or the built-in ones.
+    """Read parameters from a file, or the built-in parameters.
 
     Raises ``UserError`` if the file cannot be read, or its contents are invalid.
     """

@@ -52,7 +52,7 @@ class LipTrack:
         self._knots.append(_Knot(time_s, FapState(faps, velocity)))
 
     def forget_before(self, time_s: float) -> None:
-        """Forget frames that are not needed from a time on."""
+        """Drop frames that are not needed after a time."""
         first = bisect_right(self._knots, time_s, key=lambda knot: knot.time_s) - 1
         del self._knots[: max(0, first)]
 
