@@ -7,9 +7,17 @@ import socket
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from kouxing.shared.config import COMMON, BindAddress, Settings, bound_keys, variable
+from kouxing.shared.config import (
+    COMMON,
+    BindAddress,
+    ServiceConfig,
+    Settings,
+    bound_keys,
+    variable,
+)
 from kouxing.shared.endpoints import WILDCARDS
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.config import CommonConfig
 from kouxing.shared.service_kind import ServiceKind
 
 _PACKAGES = ("control", "recognizer", "synthesizer", "driver", "gateway")  # in order of start
@@ -17,6 +25,11 @@ _PACKAGES = ("control", "recognizer", "synthesizer", "driver", "gateway")  # in 
 KINDS: dict[str, ServiceKind] = {
     package: pkgutil.resolve_name(f"kouxing.services.{package}.kind:KIND") for package in _PACKAGES
 }
+CONFIG_TYPES: dict[str, type[ServiceConfig]] = {
+    COMMON: CommonConfig,
+    **{kind.name: kind.config_type for kind in KINDS.values()},
+}
+"""The configuration classes by table."""
 WORKERS = tuple(kind.name for kind in KINDS.values() if kind.role == "worker")
 PROVIDERS = {endpoint: kind.name for kind in KINDS.values() for endpoint in kind.provides}
 
@@ -25,8 +38,7 @@ def read_settings(
     file: Path | None = None, assignments: Mapping[str, str] | None = None
 ) -> Settings:
     """Return the settings of all services; raises as ``kouxing.shared.config.Settings``."""
-    types = {kind.name: kind.config_type for kind in KINDS.values()}
-    return Settings(types, file=file, assignments=assignments)
+    return Settings(CONFIG_TYPES, file=file, assignments=assignments)
 
 
 def free_port_environment(

@@ -27,7 +27,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from annotated_types import Ge, Le, MultipleOf
+from annotated_types import Ge, Le
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -125,6 +125,12 @@ def _check_hosts_of(values: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(map(_check_host, values))
 
 
+def _check_metrics(value: str) -> str:
+    if value:
+        _check_endpoint(f"tcp://{value}")
+    return value
+
+
 def _check_boolean(value: object) -> object:
     # pydantic would also accept "yes", "on" and others
     if isinstance(value, str) and value.lower() not in {"true", "false", "1", "0"}:
@@ -173,11 +179,12 @@ class ServiceConfig(BaseModel):
     """Lowest level of log messages to write."""
     instance: Annotated[str, Field(max_length=128), ValueHint("text of up to 128 letters")] = ""
     """Name of this process. If empty, a name is generated."""
-    metrics_port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """Port for Prometheus metrics (/metrics) and the health check (/healthz), over plain HTTP.
-    0 turns both off. Services on one machine need different ports."""
-    metrics_host: Host = "127.0.0.1"
-    """Address to bind for the metrics. With 0.0.0.0, other machines can read them."""
+    metrics: Annotated[
+        str, AfterValidator(_check_metrics), ValueHint("HOST:PORT such as 127.0.0.1:9100, or empty")
+    ] = ""
+    """Address to bind for Prometheus metrics (/metrics) and the health check (/healthz), over plain
+    HTTP. Empty turns both off. Services on one machine need different ports. With 0.0.0.0, other
+    machines can read them."""
 
     @property
     def own_host(self) -> str:
@@ -237,8 +244,9 @@ class Setting:
 class Settings:
     """The values of all keys of all services, from every source.
 
-    ``types`` has the configuration class of each service. ``assignments`` are the values from the
-    command line, by ``service.key``. ``environment`` defaults to the environment of this process.
+    ``types`` has the configuration class of each service, and of ``[common]``. ``assignments`` are
+    the values from the command line, by ``service.key``. ``environment`` defaults to the
+    environment of this process.
 
     Raises ``UserError`` if the file cannot be read, or a table, key or variable is unknown.
     """
@@ -251,7 +259,7 @@ class Settings:
         environment: Mapping[str, str] | None = None,
         assignments: Mapping[str, str] | None = None,
     ) -> None:
-        self._tables: dict[str, type[ServiceConfig]] = {COMMON: ServiceConfig, **types}
+        self._tables: dict[str, type[ServiceConfig]] = dict(types)
         environment = os.environ if environment is None else environment
         addresses = [(table, key) for table in self._tables for key in self._keys(table)]
         variables = {variable(*address): address for address in addresses}
@@ -290,7 +298,7 @@ class Settings:
     def _resolve(
         self, config_type: type[Config], overrides: Mapping[str, str]
     ) -> tuple[Config, dict[str, _RawValue]]:
-        table = next(name for name, known in self._tables.items() if known is config_type)
+        table = next((n for n, known in self._tables.items() if known is config_type), COMMON)
         assigned = self._assigned({f"{table}.{key}": text for key, text in overrides.items()})
         values = {
             key: layer[name, key]
@@ -362,8 +370,6 @@ def allowed(field: FieldInfo) -> str:
     if kind is str:
         return "text"
     number = "a number" if kind is float else "an integer"
-    if MultipleOf in marks:
-        number = f"a multiple of {marks[MultipleOf].multiple_of}"
     return f"{number} from {marks[Ge].ge} to {marks[Le].le}"
 
 

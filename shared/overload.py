@@ -102,15 +102,15 @@ class SkipPolicy:
 
     Parameters
     ----------
-    max_behind_s
+    max_lag_s
         Maximum delay of the session. It may be exceeded for ``MAX_LATE_FOR_S``.
     start_s
         Time from which the session may skip audio. A moved session catches up before.
     """
 
-    def __init__(self, max_behind_s: float, start_s: float = -math.inf) -> None:
+    def __init__(self, max_lag_s: float, start_s: float = -math.inf) -> None:
         self.skipped_s = 0.0  # duration of the audio that was skipped
-        self._max_behind_s = max_behind_s
+        self._max_lag_s = max_lag_s
         self._start_s = start_s
         self._due_s: float | None = None  # when the newest audio was due; None: on arrival
         self._late_since_s = math.inf  # when the session exceeded its limit
@@ -135,7 +135,7 @@ class SkipPolicy:
 
     def is_late(self, now_s: float, *, for_s: float = 0.0) -> bool:
         """Return whether the newest audio exceeds the limit by more than ``for_s``."""
-        return self._late_s(0.0, now_s) > self._max_behind_s + for_s
+        return self._late_s(0.0, now_s) > self._max_lag_s + for_s
 
     def adapt(self, now_s: float) -> None:
         """Record that no newer audio was found, so the newest audio may be in time."""
@@ -152,13 +152,13 @@ class SkipPolicy:
             return False
         late_s = self._late_s(waiting_s, now_s)
         behind_s = min(waiting_s, late_s)
-        self.is_behind = behind_s > SLOWDOWN_FRACTION * self._max_behind_s
-        if behind_s > LIGHT_FROM * self._max_behind_s:
+        self.is_behind = behind_s > SLOWDOWN_FRACTION * self._max_lag_s
+        if behind_s > LIGHT_FROM * self._max_lag_s:
             self._light_until_s = now_s + LIGHT_FOR_S
-        if behind_s <= self._max_behind_s:
+        if behind_s <= self._max_lag_s:
             self._late_since_s = math.inf
         else:  # after a stop of this process, the session has been late for some time
-            since_s = now_s - (late_s - self._max_behind_s)
+            since_s = now_s - (late_s - self._max_lag_s)
             self._late_since_s = min(since_s, self._late_since_s)
         if now_s - self._late_since_s <= MAX_LATE_FOR_S:
             return False

@@ -112,7 +112,7 @@ class MetricsServer(ThreadingHTTPServer):
             super().__init__((host, port), _Handler)
         except OSError as error:
             raise UserError(
-                f"metrics_port: cannot bind {host} port {port}: {error.strerror}; choose another"
+                f"metrics: cannot bind {host} port {port}: {error.strerror}; choose another"
             ) from None
         threading.Thread(target=self.serve_forever, daemon=True).start()
 

@@ -209,16 +209,13 @@ class Service(MessageLoop):
     def startup(self) -> None:
         """Register with control. Raises ``UserError`` if the metrics' port cannot be bound."""
         self.on_startup()
-        if self.config.metrics_port:
+        if self.config.metrics:
             from kouxing.shared.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used
 
             self._heartbeat_due_s = time.monotonic()
+            host, _, port = self.config.metrics.rpartition(":")
             self._metrics_server = MetricsServer(
-                self.config.metrics_host,
-                self.config.metrics_port,
-                self.metrics,
-                self.name,
-                is_alive=self.check_health,
+                host.strip("[]"), int(port), self.metrics, self.name, is_alive=self.check_health
             )
         self._warn_if_open_to_others()
         self._send_heartbeat()

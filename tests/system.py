@@ -32,8 +32,7 @@ SERVICE = ("-m", "kouxing.services.process")
 NODE = Path(sys.executable).with_name("node")
 LIMIT_S = 60.0  # for anything that takes no time on an idle machine
 NOTHING_SKIPPED = {  # on a busy machine
-    "KOUXING_RECOGNIZER_MAX_BEHIND_S": "3600",
-    "KOUXING_SYNTHESIZER_MAX_BEHIND_S": "3600",
+    "KOUXING_MAX_LAG_S": "3600",
 }
 PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
 ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
@@ -90,8 +89,7 @@ def headless(folder: Path) -> dict[str, str]:
     return {
         "KOUXING_DRIVER_VIEW": "none",
         "KOUXING_DRIVER_OUT": str(folder),
-        "KOUXING_DRIVER_WIDTH_PX": "320",
-        "KOUXING_DRIVER_HEIGHT_PX": "240",
+        "KOUXING_DRIVER_SIZE": "320x240",
     }
 
 
@@ -251,7 +249,7 @@ class Gateway:
 
     def __init__(self, control: str, *program: str, **settings: str) -> None:
         port = free_port()
-        scheme = "https" if "certificate" in settings else "http"
+        scheme = "https" if "https" in settings else "http"
         self.page = f"{scheme}://127.0.0.1:{port}/"
         settings = {
             "port": str(port),

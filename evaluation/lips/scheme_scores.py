@@ -119,7 +119,7 @@ def _pairs_with_tracked(
 
 def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array | None:
     config = SynthesizerConfig(
-        lips=condition.lips, idle_motion_seed=0, expressiveness=1.0, feeling=0.0
+        lips=condition.lips, idle_motion=False, expressiveness=1.0, feeling=0.0
     )
     frames = make_frames(condition, sentence, config)
     return None if frames is None else np.array([faps for _, faps in frames], dtype=float)

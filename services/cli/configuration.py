@@ -8,14 +8,10 @@ from typing import Annotated
 import typer
 
 from kouxing.services.cli.options import Assignments, ConfigFile
-from kouxing.services.kinds import KINDS, read_settings
-from kouxing.shared.config import COMMON, ServiceConfig, Setting, Settings, parse_assignments
+from kouxing.services.kinds import CONFIG_TYPES, read_settings
+from kouxing.shared.config import COMMON, Setting, Settings, parse_assignments
 from kouxing.shared.errors import UserError
 
-TABLES: dict[str, type[ServiceConfig]] = {
-    COMMON: ServiceConfig,
-    **{kind.name: kind.config_type for kind in KINDS.values()},
-}
 PAGE_HEAD = """\
 # Configuration
 
@@ -28,8 +24,9 @@ The sources of a value, from weakest to strongest:
 3. the environment: `KOUXING_<SERVICE>_<KEY>`, such as `KOUXING_RECOGNIZER_MIN_CONFIDENCE`
 4. the command line: `--set KEY=VALUE` of a service, `--set SERVICE.KEY=VALUE` of `kouxing run`
 
-Every service also has the keys of `[common]`. To set such a key for all services, use the table
-`[common]` or the variable `KOUXING_<KEY>`.
+Services also have the keys of `[common]`. To set such a key for all services, use the table
+`[common]` or the variable `KOUXING_<KEY>`. Only the synthesizer, the driver and the gateway have
+`idle_motion`, and only the recognizer and the synthesizer have `max_lag_s`.
 Within one source, a value for one service overrides the value for all services.
 An unknown key, table or variable is an error.
 
@@ -42,7 +39,7 @@ command line, separate the items of a list with spaces.
 
 
 def config(
-    service: Annotated[str, typer.Argument(help=f"One of {', '.join(TABLES)}. Default: all.")] = "",
+    service: Annotated[str, typer.Argument(help=f"{', '.join(CONFIG_TYPES)}. Default: all.")] = "",
     config: ConfigFile = None,
     assignments: Assignments = None,
     markdown: Annotated[
@@ -50,15 +47,15 @@ def config(
     ] = False,
 ) -> None:
     """Print all keys with their meaning, allowed values, default, current value and its origin."""
-    if service and service not in TABLES:
-        raise UserError(f"unknown service {service!r}; choose one of {', '.join(TABLES)}")
+    if service and service not in CONFIG_TYPES:
+        raise UserError(f"unknown service {service!r}; choose one of {', '.join(CONFIG_TYPES)}")
     if markdown and (service or config or assignments):
         raise UserError("--markdown prints all defaults; leave out the service, --config and --set")
     values = parse_assignments(assignments or [])
     if markdown:
         text = markdown_page()
     elif service:
-        text = _toml_table(service, read_settings(config).describe(TABLES[service], values))
+        text = _toml_table(service, read_settings(config).describe(CONFIG_TYPES[service], values))
     else:
         tables = _all_settings(read_settings(config, values))
         text = "\n".join(_toml_table(name, settings) for name, settings in tables)
@@ -68,7 +65,7 @@ def config(
 def markdown_page() -> str:
     """Return the documentation of all keys, ``docs/configuration.md``."""
     tables = []
-    for name, settings in _all_settings(Settings(TABLES, environment={})):
+    for name, settings in _all_settings(Settings(CONFIG_TYPES, environment={})):
         rows = [
             f"| `{setting.key}` | `{_as_toml(setting.default)}` | {setting.allowed} |"
             f" {setting.meaning} |\n"
@@ -81,8 +78,8 @@ def markdown_page() -> str:
 
 def _all_settings(settings: Settings) -> Iterable[tuple[str, list[Setting]]]:
     """Yield each table with its keys; a common key only where it differs from ``[common]``."""
-    common = settings.describe(ServiceConfig)
-    for name, config_type in TABLES.items():
+    common = settings.describe(CONFIG_TYPES[COMMON])
+    for name, config_type in CONFIG_TYPES.items():
         keys = settings.describe(config_type)
         yield name, common if name == COMMON else [key for key in keys if key not in common]
 

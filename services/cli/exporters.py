@@ -11,6 +11,7 @@ from kouxing.services.cli.animation import FaceMotion, slow_down
 from kouxing.services.cli.captions import make_captions
 from kouxing.services.cli.curves import CURVE_EXPORTERS
 from kouxing.services.cli.options import ExportOptions
+from kouxing.services.driver.config import check_even, parse_size
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.captions import band_height_px
 from kouxing.services.driver.render.renderer import Renderer
@@ -166,12 +167,10 @@ def _make_renderer(
 
 
 def _parse_size(text: str, *, even: bool) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise UserError(f"--size {text}: write WIDTHxHEIGHT, for example 1280x720")
-    width_px, height_px = int(width), int(height)
-    if not (16 <= width_px <= 7680 and 16 <= height_px <= 4320):
-        raise UserError(f"--size {text}: choose a size from 16x16 to 7680x4320")
-    if even and (width_px % 2 or height_px % 2):
-        raise UserError(f"--size {text}: both numbers must be even for a video")
-    return width_px, height_px
+    try:
+        size_px = parse_size(text)
+        if even:
+            check_even(size_px)
+    except ValueError as error:
+        raise UserError(f"--size {text}: {error}") from None
+    return size_px

@@ -1,10 +1,11 @@
 """The driver's configuration."""
 
+import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from kouxing.shared.config import KnownNames, Switch, ValueHint
 from kouxing.shared.face.config import FaceConfig
@@ -27,6 +28,31 @@ class Framing(StrEnum):
     FACE = "face"
     HEAD = "head"
     MOUTH = "mouth"
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return width and height of ``WIDTHxHEIGHT``, pixels; ``ValueError`` if the text is not one.
+
+    Limits are 16x16 and 7680x4320.
+    """
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text, re.ASCII)
+    if match is None:
+        raise ValueError("write WIDTHxHEIGHT, for example 1280x720")
+    width_px, height_px = int(match[1]), int(match[2])
+    if not (16 <= width_px <= 7680 and 16 <= height_px <= 4320):
+        raise ValueError("choose a size from 16x16 to 7680x4320")
+    return width_px, height_px
+
+
+def check_even(size_px: tuple[int, int]) -> None:
+    """Raise ``ValueError`` for a size that H.264 does not allow."""
+    if any(number % 2 for number in size_px):
+        raise ValueError("both numbers must be even for a video")
+
+
+def _check_size(text: str) -> str:
+    check_even(parse_size(text))
+    return text
 
 
 class DriverConfig(FaceConfig):
@@ -58,9 +84,14 @@ class DriverConfig(FaceConfig):
     """The part of the head that fills the picture."""
     virtual_camera: Switch = False
     """Whether to offer the picture to other programs as a camera."""
-    width_px: Annotated[int, Field(ge=16, le=7680, multiple_of=2)] = 1280
-    """Width of the window and of videos. H.264 requires an even number."""
-    height_px: Annotated[int, Field(ge=16, le=4320, multiple_of=2)] = 720
-    """Height of the window and of videos. H.264 requires an even number."""
+    size: Annotated[
+        str, AfterValidator(_check_size), ValueHint("an even WIDTHxHEIGHT from 16x16 to 7680x4320")
+    ] = "1280x720"
+    """Size of the window and of videos, in pixels."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 25.0
     """Images per second."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the window and of videos."""
+        return parse_size(self.size)

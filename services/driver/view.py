@@ -73,8 +73,7 @@ def _open_window(config: DriverConfig, on_switch: Callable[[int], None]) -> Wind
     try:
         return Window(
             head,
-            config.width_px,
-            config.height_px,
+            *config.size_px,
             background=background(config.background),
             camera=camera(head, config.camera),
             on_switch=on_switch,

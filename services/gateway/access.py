@@ -25,7 +25,7 @@ class AccessPolicy:
     """Returns whether a host name or address belongs to the gateway."""
     token: str = ""
     """Secret that private paths require. If empty, they require no token."""
-    allowed_origins: Collection[str] = ()
+    trusted_origins: Collection[str] = ()
     """Origins of other pages that may connect."""
     proxy_schemes: Collection[str] = ()
     """Schemes of the page's origin that a proxy may use, in addition to the connection's."""
@@ -70,19 +70,19 @@ class AccessPolicy:
 
     def _check_origin(self, request: web.Request) -> None:
         origin = request.headers.get("Origin")
-        if origin is None or origin in self.allowed_origins:  # None: not a browser
+        if origin is None or origin in self.trusted_origins:  # None: not a browser
             return
         schemes = {request.scheme, *self.proxy_schemes}
         if origin not in {f"{scheme}://{request.headers.get('Host')}" for scheme in schemes}:
             text = (
                 f"connections from {origin!r} are not allowed;"
-                " add the origin to gateway.allowed_origins\n"
+                " add the origin to gateway.trusted_origins\n"
             )
             raise web.HTTPForbidden(text=text)
 
     def _cors(self, request: web.Request) -> dict[str, str]:
         origin = request.headers.get("Origin", "")
-        if origin not in self.allowed_origins:
+        if origin not in self.trusted_origins:
             return {}
         return {"Access-Control-Allow-Origin": origin, "Vary": "Origin", **_READABLE}
 

@@ -34,7 +34,7 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
         context.load_cert_chain(certificate)
     except (OSError, ssl.SSLError) as error:
         raise UserError(
-            f"gateway.certificate: {certificate}: {error.strerror or error}; use a PEM file with "
+            f"gateway.https: {certificate}: {error.strerror or error}; use a PEM file with "
             "a certificate and its private key, or the path of a file to create"
         ) from None
     return context

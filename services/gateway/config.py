@@ -1,11 +1,12 @@
 """The gateway's configuration."""
 
 import re
+from pathlib import Path
 from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator
 
-from kouxing.shared.config import BoundHost, BoundPort, HostNames, Switch, Texts, ValueHint
+from kouxing.shared.config import BoundHost, BoundPort, HostNames, Texts, ValueHint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 
@@ -49,8 +50,8 @@ class GatewayConfig(FaceConfig):
     """Configuration keys of the gateway."""
 
     safe_alternative: ClassVar[str] = (
-        "bind a loopback address, serve https with gateway.certificate=kouxing.pem (the file is "
-        "created), or serve plain http to a proxy with gateway.plain_http = true"
+        "bind a loopback address, serve https with gateway.https=kouxing.pem (the file is "
+        "created), or serve http to an encrypting proxy with gateway.https=proxy"
     )
 
     host: BoundHost = "127.0.0.1"
@@ -59,21 +60,18 @@ class GatewayConfig(FaceConfig):
     """Port at which the page is served; 0 uses any free port."""
     head: str = ""
     """GLB file with the page's head, written by 'kouxing head export'."""
-    certificate: str = ""
-    """PEM file with a certificate and its private key, for https. If the file does not exist, the
-    gateway creates it with a self-signed certificate."""
+    https: Annotated[str, ValueHint("empty, proxy, or the path of a PEM file")] = ""
+    """Path of a PEM file with a certificate and its private key. If the file does not exist, the
+    gateway creates it with a self-signed certificate. "proxy" serves http at an address that only
+    an encrypting proxy or this machine can reach. Empty serves http only on this machine."""
     token: str = ""
     """Secret that the page's address must contain. If empty, the gateway creates a token when
-    certificate or plain_http is set."""
-    plain_http: Switch = False
-    """Serve unencrypted http at an address that other machines can reach. Use this only behind an
-    encrypting proxy, or for a port that is published only to this machine."""
+    https is set."""
     names: HostNames = ()
     """Additional host names of the page, such as a proxy's."""
-    allowed_origins: Origins = ()
-    """Origins of other pages that may connect to the gateway's sessions."""
-    frame_ancestors: Origins = ()
-    """Origins of other pages that may embed this page in a frame."""
+    trusted_origins: Origins = ()
+    """Origins of other pages that may connect to the gateway's sessions and embed this page in a
+    frame."""
     senders: Targets = ()
     """Programs to send the face to: vmc://, livelink://, osc:// and vts:// addresses, as for
     'kouxing send'."""
@@ -81,9 +79,19 @@ class GatewayConfig(FaceConfig):
     @property
     def is_encrypted(self) -> bool:
         """Whether traffic from other machines is encrypted, here or by a proxy."""
-        return bool(self.certificate) or self.plain_http
+        return bool(self.https)
+
+    @property
+    def is_behind_proxy(self) -> bool:
+        """Whether a proxy encrypts the traffic from other machines."""
+        return self.https == "proxy"
+
+    @property
+    def certificate(self) -> Path | None:
+        """The PEM file for https; None for http."""
+        return Path(self.https) if self.https and not self.is_behind_proxy else None
 
     @property
     def address_share(self) -> float:
         """Maximum fraction of a connection quota for one address; 1 if it is a proxy's."""
-        return 1.0 if self.plain_http else ADDRESS_SHARE
+        return 1.0 if self.is_behind_proxy else ADDRESS_SHARE

@@ -4,7 +4,6 @@ import secrets
 import socket
 import ssl
 from dataclasses import dataclass
-from pathlib import Path
 from urllib.parse import quote
 
 from kouxing.services.gateway.access import AccessPolicy
@@ -35,7 +34,7 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     names = {host, local_name, f"{local_name}.local", *config.names}
     tls = None
     if config.certificate:
-        tls = tls_context(Path(config.certificate), [*sorted(names), "localhost", "127.0.0.1"])
+        tls = tls_context(config.certificate, [*sorted(names), "localhost", "127.0.0.1"])
     address = f"{f'[{host}]' if ':' in host else host}:{port}"
     fragment = f"#token={quote(token)}" if token else ""
     access = AccessPolicy(
@@ -45,7 +44,7 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
             or (not is_loopback(config.host) and is_address(name))
         ),
         token=token,
-        allowed_origins=config.allowed_origins,
-        proxy_schemes=("https",) if config.plain_http else (),
+        trusted_origins=config.trusted_origins,
+        proxy_schemes=("https",) if config.is_behind_proxy else (),
     )
     return PageEndpoint(f"{'https' if tls else 'http'}://{address}/{fragment}", tls, access)

@@ -116,7 +116,7 @@ class GatewayService(Service):
         self._application = http.make_application(
             head_file=config.head,
             access=endpoint.access,
-            frame_ancestors=" ".join(config.frame_ancestors),
+            frame_ancestors=" ".join(config.trusted_origins),
             routes=self._routes,
         )
         self._server = WebServer(listening, endpoint.tls, share)

@@ -5,13 +5,14 @@ from typing import Annotated
 from pydantic import Field
 
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
-from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames, ServiceConfig
+from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames
+from kouxing.shared.face.config import LiveConfig
 
 _DEFAULT_RULE = OutputRuleConfig()
 MODEL_NAMES = ("blocks", "light", "gmm", "universal")
 
 
-class RecognizerConfig(ServiceConfig):
+class RecognizerConfig(LiveConfig):
     """The keys of the recognizer."""
 
     audio: BoundEndpoint = "tcp://127.0.0.1:5560"
@@ -44,9 +45,6 @@ class RecognizerConfig(ServiceConfig):
         )
     )
     """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011."""
-    max_behind_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
-    """Maximum lag of a live session, in seconds. A session that exceeds it for 0.4 s skips audio.
-    From three quarters of the limit, it uses the light acoustic model."""
 
     @property
     def output_rule(self) -> OutputRuleConfig:

@@ -61,7 +61,7 @@ class RecognizerService(Service):
         super().__init__(config)
         self._sessions: dict[str, RecognizerSession] = {}
         self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
-        self._max_behind_s = config.max_behind_s
+        self._max_lag_s = config.max_lag_s
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
         self._stepped_s = 0.0
@@ -162,7 +162,7 @@ class RecognizerService(Service):
                 socket,
                 self._phones,
                 time.monotonic(),
-                self._max_behind_s,
+                self._max_lag_s,
             )
             self._sessions[start.session] = session
         if is_new or session.start.epoch != start.epoch:

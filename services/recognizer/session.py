@@ -67,7 +67,7 @@ class RecognizerSession:
         socket: Socket,
         publisher: Socket,
         now_s: float,
-        max_behind_s: float = math.inf,
+        max_lag_s: float = math.inf,
     ) -> None:
         self.start = start
         self.replay = Replay(publisher, now_s)
@@ -96,7 +96,7 @@ class RecognizerSession:
             silence = recognizer.model.inventory.silence
             self.resumption = Resumption(to_seconds(start.media_time), silence)
         overload = SkipPolicy(
-            max_behind_s if start.paced else math.inf,
+            max_lag_s if start.paced else math.inf,
             now_s + CATCH_UP_S if start.epoch > 1 else now_s,
         )
         self.audio = AudioQueue(start.sample_rate_hz, overload)  # not decoded yet

@@ -7,7 +7,7 @@ from pydantic import Field
 from kouxing.services.lip_models import lip_model_info, lip_model_names
 from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.config import FaceConfig
+from kouxing.shared.face.config import FaceConfig, LiveConfig
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 
 _DEFAULT_DELAY_MS = lip_model_info(DEFAULT_LIP_MODEL).delay_ms
@@ -20,7 +20,7 @@ def _delay_ms(lip_model: str) -> float:
         return _DEFAULT_DELAY_MS
 
 
-class SynthesizerConfig(FaceConfig):
+class SynthesizerConfig(FaceConfig, LiveConfig):
     """The synthesizer's configuration keys."""
 
     phone_input: BoundEndpoint = "tcp://127.0.0.1:5570"
@@ -44,5 +44,3 @@ class SynthesizerConfig(FaceConfig):
     """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""
     feeling: Annotated[float, Field(ge=0, le=1)] = 0.5
     """How strongly the face shows the feeling in the voice. 0 turns it off."""
-    max_behind_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
-    """Maximum lag of a live face, in seconds. If it exceeds this for 0.4 s, it skips frames."""

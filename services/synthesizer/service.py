@@ -109,7 +109,7 @@ class SynthesizerService(Service):
             settings = self._known_settings(start.session, start.face)
             face = self._new_face(start, settings)
             session = SynthesizerSession(
-                start, face, self._input, self._faps, self._config.max_behind_s
+                start, face, self._input, self._faps, self._config.max_lag_s
             )
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session

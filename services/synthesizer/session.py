@@ -34,7 +34,7 @@ class SynthesizerSession:
         face: FaceAnimator,
         input_socket: Socket,
         publisher: Socket,
-        max_behind_s: float,
+        max_lag_s: float,
     ) -> None:
         self.start = start
         self.replay = Replay(publisher, time.monotonic())
@@ -47,7 +47,7 @@ class SynthesizerSession:
         self.final = FinalTime()
         self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
         self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
-        self.overload = SkipPolicy(max_behind_s)
+        self.overload = SkipPolicy(max_lag_s)
         self.newest_s = 0.0  # media time of the newest received event
         self.finished = False
         self.lateness = LatenessMeter()

@@ -1,14 +1,34 @@
-"""Configuration that all services with a face share."""
+"""Configuration keys that several services share."""
 
 from typing import Annotated
 
 from pydantic import Field
 
-from kouxing.shared.config import ServiceConfig
+from kouxing.shared.config import ServiceConfig, Switch
+
+_IDLE_MOTION_SEED = 3
 
 
 class FaceConfig(ServiceConfig):
     """The keys of services that make or show a face."""
 
-    idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
-    """Random seed of the idle motion: blinks, gaze, brows and head motion. 0 turns it off."""
+    idle_motion: Switch = True
+    """Whether the face blinks and moves its gaze, brows and head."""
+
+    @property
+    def idle_motion_seed(self) -> int:
+        """Random seed of the idle motion; 0 without idle motion."""
+        return _IDLE_MOTION_SEED if self.idle_motion else 0
+
+
+class LiveConfig(ServiceConfig):
+    """The keys of workers of live sessions."""
+
+    max_lag_s: Annotated[float, Field(ge=0.1, le=3600)] = 0.2
+    """Maximum lag of a live session, in seconds. If it is exceeded for 0.4 s, the recognizer skips
+    audio, or the synthesizer skips frames. From three quarters of it, the recognizer uses the light
+    acoustic model."""
+
+
+class CommonConfig(FaceConfig, LiveConfig):
+    """The keys of the table ``[common]``."""

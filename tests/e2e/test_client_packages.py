@@ -117,7 +117,7 @@ def site(project: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def gateway(system: System, site: str) -> Iterator[Gateway]:
-    gateway = Gateway(system.control, allowed_origins=site)
+    gateway = Gateway(system.control, trusted_origins=site)
     yield gateway
     gateway.stop()
 

@@ -22,7 +22,7 @@ CONTROLS = [
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     certificate = tmp_path_factory.mktemp("https") / "kouxing.pem"
-    settings = {"certificate": str(certificate), "token": "a+secret"}
+    settings = {"https": str(certificate), "token": "a+secret"}
     with FakeControl() as control:
         gateway = Gateway(control.address, **settings)
         yield gateway

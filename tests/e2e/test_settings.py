@@ -24,12 +24,12 @@ from tests.e2e.following import Stream, stream
 from tests.system import LIMIT_S, VOWELS_FILE, System, samples_of_file, wait_until
 
 FACE = SynthesizerConfig(
-    lips="dynamic-visemes", delay_ms=160.0, frame_rate_hz=30.0, idle_motion_seed=0
+    lips="dynamic-visemes", delay_ms=160.0, frame_rate_hz=30.0, idle_motion=False
 )
 SETTINGS = {
     **{
         variable("synthesizer", key): str(getattr(FACE, key))
-        for key in ("lips", "delay_ms", "frame_rate_hz", "idle_motion_seed")
+        for key in ("lips", "delay_ms", "frame_rate_hz", "idle_motion")
     },
     "KOUXING_CONTROL_MAX_LOAD": "0.1",  # less than one session needs
     "KOUXING_CONTROL_IDLE_LIMIT_S": "15",

@@ -34,8 +34,7 @@ class Stage:
                 insecure=True,
                 view="none",
                 out=str(folder),
-                width_px=64,
-                height_px=48,
+                size="64x48",
                 max_videos=4,
             )
         )

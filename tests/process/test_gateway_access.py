@@ -38,7 +38,7 @@ class Site:
 
     def __init__(self, certificate: Path | None = None, **settings: str) -> None:
         if certificate is not None:
-            settings["certificate"] = str(certificate)
+            settings["https"] = str(certificate)
         self.certificate = certificate
         self.gateway = Gateway(NO_CONTROL, insecure="false", **settings)
         wait_until(lambda: certificate is None or certificate.is_file())
@@ -74,8 +74,7 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         host="0.0.0.0",  # noqa: S104 - with https and a token
         token="secret",
         names="face.example",
-        allowed_origins="https://tool.example",
-        frame_ancestors="https://tool.example https://other.example:8443",
+        trusted_origins="https://tool.example https://other.example:8443",
         senders=f"vmc://192.0.2.7 vts://127.0.0.1:{free_port()}",
     )
     yield site
@@ -146,7 +145,7 @@ def test_the_token_opens_sessions_and_the_page_requires_none(public: Site) -> No
     assert page.headers["Content-Security-Policy"].endswith(ancestors)
 
 
-def test_whip_accepts_bearer_tokens_from_allowed_origins(public: Site) -> None:
+def test_whip_accepts_bearer_tokens_from_trusted_origins(public: Site) -> None:
     preflight = public.ask("whip", "OPTIONS", Origin="https://tool.example")
     assert preflight.status == 204
     assert "Authorization" in preflight.headers["Access-Control-Allow-Headers"]
@@ -159,7 +158,7 @@ def test_whip_accepts_bearer_tokens_from_allowed_origins(public: Site) -> None:
 @pytest.mark.parametrize(
     ("origin", "status"), [("https://tool.example", 101), ("https://evil.example", 403)]
 )
-def test_only_allowed_origins_may_connect(public: Site, origin: str, status: int) -> None:
+def test_only_trusted_origins_may_connect(public: Site, origin: str, status: int) -> None:
     assert public.ask("viewer?token=secret", Origin=origin, **UPGRADE).status == status
 
 
@@ -210,10 +209,10 @@ def gateway_process(control: str = NO_CONTROL, **settings: str) -> subprocess.Po
     return start_python(*SERVICE, "gateway", control=control, **names)
 
 
-def test_plain_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> None:
+def test_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> None:
     settings = {
         "gateway_host": "0.0.0.0",  # noqa: S104
-        "gateway_plain_http": "true",
+        "gateway_https": "proxy",
         "advertise": "127.0.0.1",
     }
     with contextlib.ExitStack() as stack:
@@ -235,12 +234,12 @@ def test_plain_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("certificate", "text"),
     [
-        (__file__, "gateway.certificate: "),
+        (__file__, "gateway.https: "),
         ("/no/such/folder/new.pem", "No such file or directory"),
     ],
 )
 def test_a_wrong_certificate_ends_the_gateway_with_a_message(certificate: str, text: str) -> None:
-    process = gateway_process(gateway_certificate=certificate)
+    process = gateway_process(gateway_https=certificate)
     _, log = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2
     assert text in log

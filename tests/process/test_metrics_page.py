@@ -71,7 +71,7 @@ def test_sends_no_version(server: MetricsServer, request_line: bytes) -> None:
 
 def test_a_port_in_use_is_an_error_that_names_it(server: MetricsServer) -> None:
     port = server.server_port
-    with pytest.raises(UserError, match=f"metrics_port: cannot bind 127.0.0.1 port {port}"):
+    with pytest.raises(UserError, match=f"metrics: cannot bind 127.0.0.1 port {port}"):
         start(port)
 
 
@@ -84,7 +84,7 @@ SUFFIXES = ("_total", "_bucket", "_count", "_sum")
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    settings = {variable(name, "metrics_port"): str(free_port()) for name in CHAIN}
+    settings = {variable(name, "metrics"): f"127.0.0.1:{free_port()}" for name in CHAIN}
     with System(CHAIN, tmp_path_factory.mktemp("system"), settings) as running:
         yield running
 
@@ -92,7 +92,9 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 @pytest.fixture(scope="module")
 def families(system: System) -> dict[str, list[Metric]]:
     """Metrics of each service while a session is open."""
-    ports = [int(system.environment[variable(name, "metrics_port")]) for name in CHAIN]
+    ports = [
+        int(system.environment[variable(name, "metrics")].rpartition(":")[2]) for name in CHAIN
+    ]
     with Client(system.control) as client:
         samples, rate_hz = read_audio(VOWELS_FILE)
         session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz)

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.cli.configuration import TABLES, config, markdown_page
+from kouxing.services.cli.configuration import config, markdown_page
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import HEAD_NAMES, DriverConfig
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.kinds import KINDS, read_settings
+from kouxing.services.kinds import CONFIG_TYPES, read_settings
 from kouxing.services.lip_models import lip_model_names
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -18,7 +18,6 @@ from kouxing.shared.errors import UserError
 from tests.documents import code_blocks
 
 ROOT = Path(__file__).parents[2]
-TYPES = {kind.name: kind.config_type for kind in KINDS.values()}
 ANYWHERE = "0.0.0.0"  # noqa: S104
 
 
@@ -26,7 +25,7 @@ def settings(
     file: Path | None = None, environment: dict[str, str] | None = None, **assigned: str
 ) -> Settings:
     assignments = {name.replace("__", "."): text for name, text in assigned.items()}
-    return Settings(TYPES, file=file, environment=environment or {}, assignments=assignments)
+    return Settings(CONFIG_TYPES, file=file, environment=environment or {}, assignments=assignments)
 
 
 def write(folder: Path, text: str) -> Path:
@@ -35,7 +34,7 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("config_type", [ServiceConfig, *TYPES.values()])
+@pytest.mark.parametrize("config_type", [ServiceConfig, *CONFIG_TYPES.values()])
 def test_every_default_is_allowed_and_every_key_is_described(
     config_type: type[ServiceConfig],
 ) -> None:
@@ -116,15 +115,13 @@ def test_a_default_may_depend_on_another_key() -> None:
             "fergusen",
             f"one of {', '.join(lip_model_names())}; did you mean ferguson?",
         ),
-        (DriverConfig, "width_px", "641", "a multiple of 2 from 16 to 7680"),
-        *(
-            (
-                GatewayConfig,
-                key,
-                "https://a.example; *",
-                "a list of origins such as https://example.org",
-            )
-            for key in ("allowed_origins", "frame_ancestors")
+        (DriverConfig, "size", "641x480", "an even WIDTHxHEIGHT from 16x16 to 7680x4320"),
+        (RecognizerConfig, "metrics", "9100", "HOST:PORT such as 127.0.0.1:9100, or empty"),
+        (
+            GatewayConfig,
+            "trusted_origins",
+            "https://a.example; *",
+            "a list of origins such as https://example.org",
         ),
         (
             GatewayConfig,
@@ -176,7 +173,7 @@ def test_an_unknown_key_is_an_error_with_the_nearest_name(
     environment: dict[str, str], assignments: dict[str, str], error: str
 ) -> None:
     with pytest.raises(UserError, match=error):
-        Settings(TYPES, environment=environment, assignments=assignments)
+        Settings(CONFIG_TYPES, environment=environment, assignments=assignments)
 
 
 @pytest.mark.parametrize("name", ["docker-compose.yml", "docs/hosts.md"])
@@ -189,8 +186,8 @@ def test_the_variables_in_documents_are_known(name: str) -> None:
 def test_a_host_that_others_can_reach_must_be_encrypted() -> None:
     with pytest.raises(UserError, match=r"gateway.host: other machines can reach 0\.0\.0\.0"):
         settings().load(GatewayConfig, {"host": ANYWHERE})
-    for extra in ("plain_http", "insecure"):
-        assert settings().load(GatewayConfig, {"host": ANYWHERE, extra: "true"}).host == ANYWHERE
+    for key, text in (("https", "proxy"), ("https", "face.pem"), ("insecure", "true")):
+        assert settings().load(GatewayConfig, {"host": ANYWHERE, key: text}).host == ANYWHERE
 
 
 def test_the_file_for_all_hosts_in_the_docs_is_valid(tmp_path: Path) -> None:
@@ -238,7 +235,7 @@ def test_the_output_is_a_file_with_the_same_values(
     file = tmp_path / "first.toml"
     text = "[driver]\nout = 'a \"b\" 口'\n[gateway]\nport = 0\nsenders = ['vmc://']\n"
     file.write_text(text, encoding="utf-8")
-    expected = [read_settings(file).load(config_type) for config_type in TABLES.values()]
+    expected = [read_settings(file).load(config_type) for config_type in CONFIG_TYPES.values()]
     config("driver", config=file, assignments=["camera=mouth"])
     printed = capsys.readouterr().out
     assert "[gateway]" not in printed
@@ -250,7 +247,7 @@ def test_the_output_is_a_file_with_the_same_values(
     assert "default 8080." in printed
     monkeypatch.undo()
     file.write_text(printed, encoding="utf-8")
-    assert [read_settings(file).load(kind) for kind in TABLES.values()] == expected
+    assert [read_settings(file).load(kind) for kind in CONFIG_TYPES.values()] == expected
 
 
 def test_an_unknown_service_or_key_is_an_error() -> None:

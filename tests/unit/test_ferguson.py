@@ -88,7 +88,7 @@ def test_no_jump_at_revisions_and_interruptions() -> None:
 def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
     samples = to_16_khz(*read_audio(DEMO / "hello-female.wav"))[:32_000]
     settings = SynthesizerConfig(
-        lips="ferguson", idle_motion_seed=0, expressiveness=1.0, feeling=0.0
+        lips="ferguson", idle_motion=False, expressiveness=1.0, feeling=0.0
     )
     made = []
     for chunk in (32_000, 333):

@@ -7,7 +7,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from kouxing.services.kinds import KINDS
+from kouxing.services.kinds import CONFIG_TYPES, KINDS
 from kouxing.shared.config import BindAddress, Settings, bound_keys
 from tests.system import ROOT
 
@@ -49,11 +49,10 @@ def test_the_objects_are_valid_and_all_services_except_the_driver_run() -> None:
 def test_the_settings_of_a_service_are_valid(name: str) -> None:
     variables = dict(OBJECTS["ConfigMap", "kouxing"]["data"])
     variables |= {item["name"]: item.get("value", "") for item in container(name)["env"]}
-    types = {kind.name: kind.config_type for kind in KINDS.values()}
-    config = Settings(types, environment=variables).load(types[name])
+    config = Settings(CONFIG_TYPES, environment=variables).load(CONFIG_TYPES[name])
     assert container(name)["args"] == [name]
     assert not config.insecure
-    assert config.metrics_port == ports(name)["metrics"]
+    assert config.metrics == f"0.0.0.0:{ports(name)['metrics']}"
     for key, bound in bound_keys(type(config)).items():
         value = getattr(config, "bound_control" if key == "control" else key)
         if bound is BindAddress.ENDPOINT:

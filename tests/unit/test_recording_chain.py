@@ -18,7 +18,7 @@ from kouxing.shared.audio_file import read_audio
 from tests.system import VOWELS_FILE
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
-STILL = SynthesizerConfig(idle_motion_seed=0, expressiveness=1.0, feeling=0.0)
+STILL = SynthesizerConfig(idle_motion=False, expressiveness=1.0, feeling=0.0)
 
 
 def test_dynamic_visemes_are_the_full_model() -> None:

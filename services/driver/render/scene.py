@@ -79,8 +79,7 @@ def open_renderer(config: DriverConfig, context: moderngl.Context | None = None)
     head = load_head(config.head)
     return Renderer(
         head,
-        config.width_px,
-        config.height_px,
+        *config.size_px,
         background=background(config.background),
         camera=camera(head, config.camera),
         context=context,
