@@ -7,7 +7,7 @@ import numpy as np
 
 from kouxing.evaluation.lips.closures import WINDOW_S, Detections, is_closed_at
 from kouxing.evaluation.lips.references import PAUSE, Reference
-from kouxing.evaluation.lips.take import Takes
+from kouxing.evaluation.lips.scored_clip import ScoredClips
 
 # Visemes of the classes in which closures are counted. All other visemes are consonants.
 CLOSURE_CLASSES = {
@@ -18,18 +18,18 @@ CLOSURE_CLASSES = {
 }
 
 
-def closure_detections(takes: Takes) -> Detections:
+def closure_detections(clips: ScoredClips) -> Detections:
     """Compare the closures of all clips."""
-    return sum((take.closures for take in takes), Detections())
+    return sum((clip.closures for clip in clips), Detections())
 
 
-def class_precision(takes: Takes, name: str) -> float | None:
+def class_precision(clips: ScoredClips, name: str) -> float | None:
     """Return the fraction of the closures at a class of phones at which real lips are closed."""
     hits = [
         contact.is_true
-        for take in takes
-        for contact in take.contacts
-        if closure_class(take.reference, contact.time_s) == name
+        for clip in clips
+        for contact in clip.contacts
+        if closure_class(clip.reference, contact.time_s) == name
     ]
     return sum(hits) / len(hits) if hits else None
 
@@ -43,20 +43,20 @@ def closure_class(reference: Reference, time_s: float) -> str:
     return next((name for name, members in CLOSURE_CLASSES.items() if viseme in members), "other")
 
 
-def labials_shut(takes: Takes) -> float | None:
+def labials_shut(clips: ScoredClips) -> float | None:
     """Return the fraction of b p m whose lips are closed within 40 ms of the quietest moment."""
     shut = [
-        is_closed_at(take.reference.quietest_moments(take.reference.labials()), take.predicted)
-        for take in takes
+        is_closed_at(clip.reference.quietest_moments(clip.reference.labials()), clip.predicted)
+        for clip in clips
     ]
     flags = np.concatenate([np.zeros(0, bool), *shut])
     return float(flags.mean()) if len(flags) else None
 
 
-def share_shut(takes: Takes) -> float | None:
+def share_shut(clips: ScoredClips) -> float | None:
     """Return the fraction of the frames in speech in which the lips are closed."""
     flags = [
-        take.predicted.is_closed[take.reference.is_speech(take.predicted.time_s)] for take in takes
+        clip.predicted.is_closed[clip.reference.is_speech(clip.predicted.time_s)] for clip in clips
     ]
     together = np.concatenate([np.zeros(0, bool), *flags])
     return float(together.mean()) if len(together) else None

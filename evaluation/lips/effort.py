@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.mouths import Mouth
-from kouxing.evaluation.lips.take import Takes
+from kouxing.evaluation.lips.scored_clip import ScoredClips
 
 Array = NDArray[np.float64]
 
@@ -62,21 +62,21 @@ def lip_intensity(mouth: Mouth) -> float:
     return float(np.sqrt(np.mean(speed**2)))
 
 
-def effort_correlation(takes: Takes) -> float | None:
+def effort_correlation(clips: ScoredClips) -> float | None:
     """Correlate the range of the opening in speech with the level of the clip, over clips."""
-    used = [take for take in takes if len(take.opening_in_speech) > 1]
+    used = [clip for clip in clips if len(clip.opening_in_speech) > 1]
     return correlate_by_speaker(
-        [take.reference.clip.speaker for take in used],
-        [20.0 * np.log10(take.reference.rms + 1e-9) for take in used],
-        [opening_range(take.opening_in_speech) for take in used],
+        [clip.reference.clip.speaker for clip in used],
+        [20.0 * np.log10(clip.reference.rms + 1e-9) for clip in used],
+        [opening_range(clip.opening_in_speech) for clip in used],
     )
 
 
-def speech_lip_intensity(takes: Takes) -> float | None:
+def speech_lip_intensity(clips: ScoredClips) -> float | None:
     """Return the speech-lip intensity correlation coefficient (SLCC) over clips."""
-    used = [take for take in takes if len(take.predicted.time_s) > 1]
+    used = [clip for clip in clips if len(clip.predicted.time_s) > 1]
     return correlate_by_speaker(
-        [take.reference.clip.speaker for take in used],
-        [take.reference.rms for take in used],
-        [lip_intensity(take.predicted) for take in used],
+        [clip.reference.clip.speaker for clip in used],
+        [clip.reference.rms for clip in used],
+        [lip_intensity(clip.predicted) for clip in used],
     )

@@ -1,4 +1,4 @@
-"""The measures of ``kouxing evaluate lips`` by name: functions of the takes of several clips."""
+"""The measures of ``kouxing evaluate lips`` by name: functions of several scored clips."""
 
 from functools import partial
 
@@ -17,28 +17,28 @@ from kouxing.evaluation.lips.in_speech import correlation_in_speech, turns_per_s
 from kouxing.evaluation.lips.mouths import CURVES
 from kouxing.evaluation.lips.phone_spread import phone_correlation, phone_spread
 from kouxing.evaluation.lips.rest import closing_time_ms, rest_opening
-from kouxing.evaluation.lips.take import Measure, Takes
+from kouxing.evaluation.lips.scored_clip import Measure, ScoredClips
 
 
-def pairs_of(takes: Takes) -> list[Pair]:
-    """Return the predicted and the real mouth of each take."""
-    return [(take.predicted, take.real) for take in takes]
+def pairs_of(clips: ScoredClips) -> list[Pair]:
+    """Return the predicted and the real mouth of each clip."""
+    return [(clip.predicted, clip.real) for clip in clips]
 
 
-def misalignment_ms(takes: Takes) -> float | None:
+def misalignment_ms(clips: ScoredClips) -> float | None:
     """Return the mean temporal misalignment (MTM), mean of the clips, ms."""
-    known = [take.misalignment_s for take in takes if take.misalignment_s is not None]
+    known = [clip.misalignment_s for clip in clips if clip.misalignment_s is not None]
     return 1e3 * float(np.mean(known)) if known else None
 
 
 MEASURES: dict[str, Measure] = {
     **{f"r_{name}": partial(correlation_in_speech, curve=name) for name in CURVES},
-    "r_opening_everywhere": lambda takes: moments(pairs_of(takes), "opening").correlation,
-    "error": lambda takes: moments(pairs_of(takes), "opening").rmse,
-    "lag_ms": lambda takes: lag_ms(pairs_of(takes)),
-    "closure_f1": lambda takes: closure_detections(takes).f1,
-    "closure_precision": lambda takes: closure_detections(takes).precision,
-    "closure_recall": lambda takes: closure_detections(takes).recall,
+    "r_opening_everywhere": lambda clips: moments(pairs_of(clips), "opening").correlation,
+    "error": lambda clips: moments(pairs_of(clips), "opening").rmse,
+    "lag_ms": lambda clips: lag_ms(pairs_of(clips)),
+    "closure_f1": lambda clips: closure_detections(clips).f1,
+    "closure_precision": lambda clips: closure_detections(clips).precision,
+    "closure_recall": lambda clips: closure_detections(clips).recall,
     **{f"precision_{name}": partial(class_precision, name=name) for name in CLOSURE_CLASSES},
     "labials_shut": labials_shut,
     "share_shut": share_shut,

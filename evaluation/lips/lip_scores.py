@@ -17,7 +17,7 @@ from kouxing.evaluation.lips.live_faces import Samples, live_events, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth
 from kouxing.evaluation.lips.other_programs import MouthOf, load_programs
 from kouxing.evaluation.lips.references import read_parts, reference_of
-from kouxing.evaluation.lips.take import Take
+from kouxing.evaluation.lips.scored_clip import ScoredClip
 from kouxing.evaluation.recognizer.disturbances import (
     BABBLE,
     CLEAN,
@@ -112,13 +112,13 @@ def score_lips(
         disturbances[BABBLE] = lambda samples: add_sound(samples, voices, _BELOW_DB)
     if faces and MUSIC in conditions:
         disturbances[MUSIC] = lambda samples: add_sound(samples, music, _BELOW_DB)
-    takes: dict[tuple[str, str, str], list[Take]] = {}
+    scored_clips: dict[tuple[str, str, str], list[ScoredClip]] = {}
     for clip in track(clips, description="clips", transient=True):
-        for title, condition, take in takes_of(model, clip, faces, disturbances, programs):
+        for title, condition, scored in scored_clips_of(model, clip, faces, disturbances, programs):
             for group in groups_of(clip, known):
-                takes.setdefault((title, condition, group), []).append(take)
+                scored_clips.setdefault((title, condition, group), []).append(scored)
     results: Results = {}
-    for (title, condition, group), members in takes.items():
+    for (title, condition, group), members in scored_clips.items():
         scores = {
             name: measure(members)
             for name, measure in MEASURES.items()
@@ -129,14 +129,14 @@ def score_lips(
     return results
 
 
-def takes_of(
+def scored_clips_of(
     model: AcousticModel,
     clip: LipClip,
     faces: Mapping[str, Face],
     disturbances: Mapping[str, Disturb],
     programs: Mapping[str, MouthOf],
-) -> Iterator[tuple[str, str, Take]]:
-    """Yield title, condition and take of the real mouth, and of each face in each condition.
+) -> Iterator[tuple[str, str, ScoredClip]]:
+    """Yield title, condition and scored clip of the real mouth and of each face.
 
     The first condition must be CLEAN. Other programs follow in this condition.
     """
@@ -155,12 +155,12 @@ def takes_of(
             aligned = aligned_phones(model, clip)
             first_events = next(iter(events.values()))[delays_s[0]]
             reference = reference_of(clip, first_events, model.inventory, aligned)
-            yield REAL, condition, Take(reference, reference.mouth)
+            yield REAL, condition, ScoredClip(reference, reference.mouth)
             for title, mouth_of in programs.items():
-                yield title, condition, Take(reference, mouth_of(clip))
+                yield title, condition, ScoredClip(reference, mouth_of(clip))
         for title, face in faces.items():
             received = events[id(face.predictor)][face.delay_ms / 1e3]
-            yield title, condition, Take(reference, face.mouth(received))
+            yield title, condition, ScoredClip(reference, face.mouth(received))
 
 
 def groups_of(clip: LipClip, known: set[str]) -> list[str]:

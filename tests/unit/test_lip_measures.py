@@ -26,7 +26,7 @@ from kouxing.evaluation.lips.closures import Detections, closures, contacts, is_
 from kouxing.evaluation.lips.extrema import match_extrema, misalignment_s, warping_path
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_mouth
 from kouxing.evaluation.lips.references import Reference
-from kouxing.evaluation.lips.take import Take
+from kouxing.evaluation.lips.scored_clip import ScoredClip
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.lips import INVENTORY, clip_of, phone
@@ -118,40 +118,40 @@ def test_closures_count_for_the_phones_around_them() -> None:
     real = mouth((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
     made = mouth((0.5, 0.5), (1.0, 1.0), (2.5, 2.5), (3.5, 3.5))
     phones = [phone(0, "b", 0.48), phone(1, "a", 0.6, 0.9), phone(2, "u", 2.4), phone(3, "m", 3.0)]
-    takes = [Take(reference(real, phones), made)]
-    assert closure_measures.class_precision(takes, "bpm") == 1.0
-    assert closure_measures.class_precision(takes, "aei") == 0.0
-    assert closure_measures.class_precision(takes, "uo") == 1.0
-    assert closure_measures.class_precision(takes, "pause") == 0.0
-    assert closure_measures.labials_shut(takes) == 0.5  # the lips are open in m
-    assert closure_measures.share_shut(takes) == 4 / 200
+    clips = [ScoredClip(reference(real, phones), made)]
+    assert closure_measures.class_precision(clips, "bpm") == 1.0
+    assert closure_measures.class_precision(clips, "aei") == 0.0
+    assert closure_measures.class_precision(clips, "uo") == 1.0
+    assert closure_measures.class_precision(clips, "pause") == 0.0
+    assert closure_measures.labials_shut(clips) == 0.5  # the lips are open in m
+    assert closure_measures.share_shut(clips) == 4 / 200
 
 
 def test_lips_rest_and_close_after_the_sound() -> None:
     # sound from 1 to 2 s; the margin of speech is 0.1 s
     made = mouth((0.0, 0.88), (2.44, 4.0))
     quiet = reference(mouth(), loud=(1.0, 2.0))
-    takes = [Take(quiet, made)]
-    assert rest.closing_time_ms(takes) == pytest.approx(440.0)
+    clips = [ScoredClip(quiet, made)]
+    assert rest.closing_time_ms(clips) == pytest.approx(440.0)
     # of 141 frames without speech, those at 0.9 s and from 2.1 to 2.42 s are open
-    assert rest.rest_opening(takes) == pytest.approx(300 * 18 / 141)
+    assert rest.rest_opening(clips) == pytest.approx(300 * 18 / 141)
     rig = replace(quiet, clip=replace(quiet.clip, is_rig=True))
-    assert rest.rest_opening([Take(rig, made)]) is None
-    never = rest.closing_time_ms([Take(quiet, mouth())])
+    assert rest.rest_opening([ScoredClip(rig, made)]) is None
+    never = rest.closing_time_ms([ScoredClip(quiet, mouth())])
     assert never == pytest.approx(1980.0, abs=25.0)  # the whole pause
 
 
 def test_spread_within_phones_ignores_differences_between_them() -> None:
     curve = np.select([TIME_S < 1, TIME_S < 2, TIME_S < 3], [100.0, 300.0, 500.0], 900.0)
     phones = [phone(k, symbol, k + 0.4, 0.2) for k, symbol in enumerate("aaei")]
-    takes = [Take(reference(mouth_of(2 * curve), phones), mouth_of(curve))]
-    assert phone_spread.phone_spread(takes) == pytest.approx(100.0)  # of a: 100 and 300
-    assert phone_spread.phone_correlation(takes) == pytest.approx(1.0)
+    clips = [ScoredClip(reference(mouth_of(2 * curve), phones), mouth_of(curve))]
+    assert phone_spread.phone_spread(clips) == pytest.approx(100.0)  # of a: 100 and 300
+    assert phone_spread.phone_correlation(clips) == pytest.approx(1.0)
 
 
 def test_turns_per_second_of_speech() -> None:
-    takes = [Take(reference(mouth()), mouth_of(30.0 * np.arange(200.0) % 300.0))]
-    assert in_speech.turns_per_s(takes) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
+    clips = [ScoredClip(reference(mouth()), mouth_of(30.0 * np.arange(200.0) % 300.0))]
+    assert in_speech.turns_per_s(clips) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
 
 
 def test_matched_extrema_of_a_late_mouth() -> None:

@@ -1,7 +1,7 @@
-"""Takes: a *take* is a clip with a mouth to evaluate.
+"""A clip with a mouth to evaluate.
 
-The mouth is predicted by a lip model, or it is the clip's real one, which shows what to aim for. A
-measure pools the takes of a group of clips.
+A lip model predicts the mouth, or it is the clip's real mouth, as the reference. A measure pools a
+group of scored clips.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +21,8 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Take:
-    """A clip and the mouth to evaluate. Figures are cached, because groups of clips share takes."""
+class ScoredClip:
+    """A clip and the mouth to evaluate. Figures are cached, because groups of clips overlap."""
 
     reference: Reference
     predicted: Mouth
@@ -58,5 +58,5 @@ class Take:
         return misalignment_s(self.predicted, self.real)
 
 
-Takes = Sequence[Take]
-Measure = Callable[[Takes], float | None]
+ScoredClips = Sequence[ScoredClip]
+Measure = Callable[[ScoredClips], float | None]
