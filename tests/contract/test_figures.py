@@ -1,4 +1,4 @@
-"""Measured figures: six in both READMEs, and the errors by language, are those of the report."""
+"""Measured figures: six in both READMEs, and the errors by language, equal the report's."""
 
 import re
 from collections.abc import Callable
