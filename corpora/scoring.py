@@ -43,8 +43,8 @@ def matched_pairs(
     """Align two strings with the fewest errors (Levenshtein 1966).
 
     Of several best alignments, this one prefers substitutions from the end. rapidfuzz prefers
-    deletions, which would change published figures. Returns pairs of indices. An insertion has
-    None as the first index, a deletion as the second.
+    deletions, which would change published figures. Returns pairs of indices. The first index is
+    None for an insertion, the second for a deletion.
     """
     rows, columns = len(reference) + 1, len(recognized) + 1
     cost = np.zeros((rows, columns), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Draw every head: small pictures for the page, and sheets for the docs."""
+"""Draws every head: small pictures for the page, and sheets for the docs."""
 
 from collections.abc import Callable
 from functools import partial

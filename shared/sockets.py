@@ -304,7 +304,7 @@ class Poller:
         self._poller.register(self.waker.descriptor, zmq.POLLIN)
 
     def add(self, socket: Socket, *, is_quiet: bool = False) -> None:
-        """Watch a socket. A quiet one does not end `wait`."""
+        """Watch a socket. A quiet socket does not end `wait`."""
         self._sockets[socket.raw] = socket
         if is_quiet:
             self._quiet.add(socket.raw)

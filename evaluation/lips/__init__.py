@@ -1,1 +1,1 @@
-"""Measure the lips."""
+"""Measures the lips."""

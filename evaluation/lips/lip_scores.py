@@ -1,4 +1,4 @@
-"""Score lip models live on held-out clips, next to the real lips.
+"""Scores lip models live on held-out clips, next to the real lips.
 
 The frames are those that the services would send, with clean sound, and with other voices or music
 10 dB below the speech. Clips form groups by language, source and speaker. *New* speakers have no

@@ -43,7 +43,7 @@ def sample_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
 
 
 def corpus_sentences(model: AcousticModel, corpus: Path) -> list[Sentence]:
-    """Read twenty sentences of the split ``test`` of a corpus; raises UserError if it has none."""
+    """Read twenty sentences of the split ``test``; raises UserError if the split is empty."""
     errors = RowErrors()
     utterances = read_corpus(corpus, errors, model.inventory, split="test")
     if not utterances:

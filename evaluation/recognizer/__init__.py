@@ -1,1 +1,1 @@
-"""Measure the recognizer."""
+"""Measures the recognizer."""

@@ -1,1 +1,1 @@
-"""Measure the running system: latency, cost, drawing."""
+"""Measures the running system: latency, cost, drawing."""

@@ -1,4 +1,4 @@
-"""Measure what attackers cost: memory of each service, and delay of another client's frames.
+"""Measures what attackers cost: memory of each service, and delay of another client's frames.
 
 The services run as under ``kouxing run``, with keys, on free ports. During each attack a session
 is streamed in real time: before, during and after it. The attacker is a separate process, which
@@ -148,7 +148,7 @@ def _result(
     processes = {kind: system.supervisor.process(kind).pid for kind in KINDS}
     memories = {kind: Memory(process_id) for kind, process_id in processes.items()}
 
-    def restart_growth() -> None:  # the other client's session has its memory by now
+    def restart_growth() -> None:  # the memory of the other client's session is now allocated
         for memory in memories.values():
             memory.restart_growth()
 

@@ -1,4 +1,4 @@
-"""Measure what faults do to a live face: killed and frozen services, load, networks.
+"""Measures what faults do to a live face: killed and frozen services, load, networks.
 
 For each fault the services run as under ``kouxing run``, on free ports, or on virtual hosts
 (``network.py``). A sentence is streamed in real time until something breaks. The results of a

@@ -1,4 +1,4 @@
-"""Measure how many live sessions a system can serve: delay, refusals, CPU and memory.
+"""Measures how many live sessions a system can serve: delay, refusals, CPU and memory.
 
 One client process speaks in all sessions in real time. Their number rises in steps beyond the limit
 of the system. Each step starts new sessions. A frame's latency is the time from when the last

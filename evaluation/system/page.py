@@ -1,4 +1,4 @@
-"""Measure how the page draws, and its delay, in a headless Chromium.
+"""Measures how the page draws, and its delay, in a headless Chromium.
 
 The services run as under ``kouxing run``, on free ports. The processor draws the page, with
 SwiftShader. First the face only idles. Then the page's microphone plays a recording in a loop. The

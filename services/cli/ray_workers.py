@@ -53,7 +53,7 @@ class Worker:
         return str(ray.util.get_node_ip_address())
 
     def drain(self) -> None:
-        """Let the worker finish, then end the actor for good."""
+        """Wait until the worker has finished, then end the actor permanently."""
         self._draining = True
         self._process.terminate()
         self._process.wait()

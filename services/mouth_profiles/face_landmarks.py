@@ -1,4 +1,4 @@
-"""Compute the mouth's FAPs from the landmarks of a face, without the motion of the head.
+"""Computes the mouth's FAPs from the landmarks of a face, without the motion of the head.
 
 The landmarks come from MediaPipe's face mesh (Kartynnik et al. 2019, "Real-time facial surface
 geometry from monocular video on mobile GPUs"), in pixels: x to the right, y down, z away from the

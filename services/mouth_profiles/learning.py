@@ -1,4 +1,4 @@
-"""Fit a mouth profile to filmed speech: an affine map of the FAPs and a ridge regression.
+"""Fits a mouth profile to filmed speech: an affine map of the FAPs and a ridge regression.
 
 Source: Hoerl and Kennard 1970, "Ridge regression: biased estimation for nonorthogonal problems".
 

@@ -106,7 +106,7 @@ class RecognizerSession:
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.last_sequence = 0  # number of the newest accepted audio message
-        self._gap_since_s: float | None = None  # since when messages behind a gap are dropped
+        self._gap_since_s: float | None = None  # start of dropping messages after a gap
         self.client = NO_PEER  # sender of the newest audio
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded

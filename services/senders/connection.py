@@ -25,7 +25,7 @@ class Connection(ABC):
     Each protocol is one subclass, listed in ``protocols.PROTOCOLS``.
     """
 
-    default_port: ClassVar[int]  # on which programs of this protocol listen
+    default_port: ClassVar[int]  # default port of the protocol
     options: ClassVar[Options] = COMMON_OPTIONS  # names and values, default first; (): any text
 
     def __init__(self, target: Target) -> None:

@@ -1,4 +1,4 @@
-"""Read and write MPEG-4 ``.fap`` text files, version 2.1, as Xface and Greta do.
+"""Reads and writes MPEG-4 ``.fap`` text files, version 2.1, as Xface and Greta do.
 
 The first line is ``2.1 NAME FPS NFRAMES``; NAME may contain spaces. Each frame has two lines: a
 mask of 68 digits, then the frame number and one value for each 1 in the mask. Lines that start with

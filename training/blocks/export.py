@@ -1,4 +1,4 @@
-"""Export the block network to ONNX; the recognizer runs it one block at a time.
+"""Exports the block network to ONNX; the recognizer runs it one block at a time.
 
 The graph computes :class:`kouxing.training.blocks.network.BlockEncoder` and its readout for a block
 and its right context, for several sessions. Each has room for ``B + R`` positions, and fewer

@@ -1,4 +1,4 @@
-"""Tune Whisper's encoder in blocks toward its own undisturbed output, and train its readout.
+"""Tunes Whisper's encoder in blocks toward its own undisturbed output, and trains its readout.
 
 Sources: Hinton, Vinyals and Dean 2015, "Distilling the knowledge in a neural network" (soft
 targets); Romero et al. 2015, "FitNets: hints for thin deep nets" (hidden layers as targets).

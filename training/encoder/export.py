@@ -1,4 +1,4 @@
-"""Export the audio encoder to ONNX, and write its model file.
+"""Exports the audio encoder to ONNX, and writes its model file.
 
 The graph computes one step for any number of sessions.
 

@@ -1,1 +1,1 @@
-"""Train the Gaussian mixture models."""
+"""Trains the Gaussian mixture models."""

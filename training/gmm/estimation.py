@@ -1,4 +1,4 @@
-"""Estimate the Gaussian mixture HMMs of the recognizer from transcribed speech.
+"""Estimates the Gaussian mixture HMMs of the recognizer from transcribed speech.
 
 Source: Li et al. 2011, section 3.1 (the model; the paper trained with HTK); the procedure is the
 HTK book's (Young et al. 2009, chapters 8 and 10): flat start, embedded re-estimation along the best

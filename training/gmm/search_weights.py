@@ -1,4 +1,4 @@
-"""Choose the search weights on development data: acoustic scale and phone penalty."""
+"""Chooses the search weights on development data: acoustic scale and phone penalty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

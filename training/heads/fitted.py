@@ -1,4 +1,4 @@
-"""Read MakeHuman's hair, brows, lashes and teeth (CC0), which are fitted to its base mesh.
+"""Reads MakeHuman's hair, brows, lashes and teeth (CC0), which are fitted to its base mesh.
 
 A file ``.mhclo`` gives each vertex of its ``.obj`` as three vertices of the base mesh with weights,
 and an offset that scales with the head. The parts therefore follow the shape of every head, and

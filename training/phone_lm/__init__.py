@@ -1,1 +1,1 @@
-"""Train phone language models."""
+"""Trains phone language models."""

@@ -1,4 +1,4 @@
-"""Draw sentences from a word language model, as phones for a phone language model.
+"""Draws sentences from a word language model, as phones for a phone language model.
 
 The word model is Open-gram, a trigram of 72,000 Chinese words (CC BY-SA 3.0), as the SunPinyin
 input method ships it (Debian package ``sunpinyin-data``). ``tslminfo -v lm_sc.t3g`` (Debian package

@@ -1,1 +1,1 @@
-"""Fit the dynamic visemes to tracked lips."""
+"""Fits the dynamic visemes to tracked lips."""

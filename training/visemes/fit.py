@@ -1,4 +1,4 @@
-"""Fit the dynamic visemes' parameters to tracked lips by least squares.
+"""Fits the dynamic visemes' parameters to tracked lips by least squares.
 
 Source: Wang & Cai 2003, section 4. Two stages of gradient descent minimize the squared error
 between the model's curves and the measured curves: first the vowels, with the silences and the

@@ -119,7 +119,7 @@ class ClientCore:
         self._watch(session, on=True)
 
     def remove_inbox(self, session: str, inbox: Inbox) -> None:
-        """Pass no more events to an inbox."""
+        """Stop passing events to an inbox."""
         self._inboxes[session].remove(inbox)
         self._watch(session, on=False)
         inbox.end(None)
