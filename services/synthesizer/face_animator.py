@@ -161,7 +161,7 @@ class FaceAnimator:
             yield from self._frames_until(time_s)
 
     def skip_to(self, time_s: float) -> None:
-        """Skip the frames before a media time. The face moves smoothly to its state at that time."""
+        """Skip the frames before a media time. The face moves smoothly to that time."""
         self._event_s = max(self._event_s, time_s)
         number = self._frame_number(time_s - self._delay_s)
         if number > self._next_frame:
