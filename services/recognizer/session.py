@@ -102,7 +102,7 @@ class RecognizerSession:
         self.audio = AudioQueue(start.sample_rate_hz, overload)  # not decoded yet
         self.is_due = False  # waits for the block network's thread
         self.is_scoring = False  # on this thread
-        self.accepted_s = now_s  # when the stream last took audio
+        self.accepted_s = now_s  # when the stream last took audio, except during scoring
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.last_sequence = 0  # number of the newest accepted audio message
@@ -219,9 +219,9 @@ class RecognizerSession:
         ``hop`` is the hop of the block network, in blocks. During scoring, it does not change, and
         nothing is skipped.
         """
-        self.accepted_s = now_s
         has_skipped = False
         if not self.is_scoring:
+            self.accepted_s = now_s
             self.stream.set_hop(hop)
             has_skipped = self.audio.skip_old(now_s)
             is_light = self.face.settings.acoustic == AcousticModelName.LIGHT
