@@ -87,7 +87,10 @@ class KnownNames:
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def _check(self, text: str) -> str:
-        if text not in self.names() and not re.fullmatch(self.pattern, text):
+        name = text.strip().lower()
+        if name in self.names():
+            return name
+        if not re.fullmatch(self.pattern, text):
             raise ValueError
         return text
 

@@ -88,7 +88,7 @@ def train_traits(
     arousal, valence = _test_speakers(voice, feelings, speakers)
     write_card(
         output,
-        title="VoiceKind traits",
+        title="Voice traits",
         details=f"a linear readout of the audio encoder's state, seed {seed}",
         recordings=speech,
         notes=(

@@ -112,7 +112,7 @@ def find_node() -> str:
     """Return the Node next to Python, or else on the path. Raises UserError if Node is missing."""
     node = shutil.which("node", path=str(Path(sys.executable).parent)) or shutil.which("node")
     if node is None:
-        raise UserError("other lip-sync programs need Node: pip install 'kouxing[page]'")
+        raise UserError("Node is missing; install it with: pip install 'kouxing[page]'")
     return node
 
 

@@ -137,8 +137,11 @@ def compare(
 ) -> Comparison:
     """Compare on held-out clips with tracked lips and, if given, one split of a corpus.
 
-    Raises ``UserError`` if a folder has no recordings, or Node is not installed.
+    Raises ``UserError`` if a folder has no recordings, if Node is not installed, or outside a
+    checkout, which has the package.
     """
+    if not _SCRIPT.is_file():
+        raise UserError("kouxing-lips is missing; run this command in a checkout of kouxing")
     references = align_corpus(load_model("blocks"), manifest, split, audio) if manifest else []
     with exported_models() as models:
         num_clips, agreements = _compare_lips(models, clips)

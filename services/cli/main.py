@@ -164,6 +164,9 @@ def _run_command() -> None:
         text = str(error)
     except _UsageError as error:
         text = _usage_text(error)
+    except typer.Abort:
+        CONSOLE.print("kouxing: aborted; nothing was written")
+        sys.exit(1)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise

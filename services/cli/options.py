@@ -39,7 +39,7 @@ Language = Annotated[
         callback=_find_language,
         help=f"Language of the speech: {', '.join(language_codes())}, or an installed language."
         " auto: any language, with universal phones. Default: zh."
-        " docs/languages.md compares the errors of the languages.",
+        " docs/results.md has the errors of each language.",
     ),
 ]
 PhoneAlphabet = Annotated[

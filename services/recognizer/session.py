@@ -299,7 +299,7 @@ class RecognizerSession:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
             if isinstance(message, SpeechMessage) and not isinstance(message, LipMessage):
-                self.replay_window.update(event_of(message), self.output_sequence)
+                self.replay_window.update(event_of(message), self.last_sequence)
 
 
 class _AheadLimit:

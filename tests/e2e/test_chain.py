@@ -1,12 +1,15 @@
 """Sound through real processes: the frames of the chain, and the same phones by every way."""
 
+import asyncio
 import csv
+import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
-from kouxing_client import Client, FapFrame
+from kouxing_client import Client, FapFrame, Phone
+from kouxing_client.aio import AsyncClient
 from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.live_faces import live_events, live_frames
@@ -20,6 +23,7 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import LipPositions
+from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
 from tests.e2e.conftest import Command
@@ -28,6 +32,7 @@ from tests.lips import LIPS
 from tests.system import DEMO, LIMIT_S, VOWELS_FILE, System, samples_of_file, start_python
 
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
+OPEN_JAW = 2  # index of FAP 3
 SENTENCE = samples_of_file(DEMO / "hello-female.wav")
 MOUTH = np.array(MOUTH_FAPS) - 1
 LIPS_AND_JAW = [*range(2, 11), *range(50, 58)]  # without the corners' height, which shows feelings
@@ -41,6 +46,15 @@ def opening(frame: FapFrame) -> float:
 @pytest.fixture(scope="module")
 def sent(system: System) -> Stream:
     return stream(system.control, SENTENCE)
+
+
+def test_phones_become_final_and_speech_starts_and_ends(sent: Stream) -> None:
+    assert len(sent.symbols) > 20
+    assert {*sent.symbols} <= {*load_inventory().phones}
+    assert all({phone.index: phone.final for phone in sent.phones}.values())
+    states = [speech.active for speech in sent.speech]
+    assert (states[0], states[-1]) == (True, False)
+    assert all(before != after for before, after in itertools.pairwise(states))
 
 
 def test_the_sound_is_the_audio_that_was_sent(sent: Stream) -> None:
@@ -138,6 +152,10 @@ def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     assert scored[:, MOUTH].any()
 
 
+CHUNK = 997  # samples, so that no chunk ends with a slice of 20 ms
+Timed = tuple[str, int, int, float]  # symbol, onset and duration in samples at 16 kHz, confidence
+
+
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Some samples, and a loud stereo recording at 44.1 kHz that ends within a word."""
@@ -213,3 +231,41 @@ def test_speak_and_listen_return_the_phones_of_the_chain(
         output, log = listener.communicate(timeout=LIMIT_S)
         assert f"session {name} ended: {len(phones)} phones" in log
         assert output.splitlines() == [line(phone) for phone in phones]
+
+
+def test_the_asyncio_client_returns_the_phones_of_the_chain_bit_for_bit(
+    system: System, recordings: list[Path], expected: dict[str, list[events.Phone]]
+) -> None:
+    async def recognized(client: AsyncClient, path: Path) -> list[Timed]:
+        samples, rate_hz = read_audio(path)
+        session = await client.open_session(
+            encoding="f32le",
+            sample_rate_hz=rate_hz,
+            num_channels=samples.shape[1],
+            paced=False,
+        )
+        async with session:
+            results = await session.results(Phone, keep_all=True)
+            for begin in range(0, len(samples), CHUNK):
+                await session.push(samples[begin : begin + CHUNK].astype("<f4").tobytes())
+            await session.finish()
+            return [
+                (phone.symbol, phone.media_time, phone.duration, phone.confidence)
+                async for phone in results
+                if phone.final and phone.duration
+            ]
+
+    async def run() -> list[list[Timed]]:
+        async with AsyncClient(system.control) as client:
+            return await asyncio.gather(*(recognized(client, path) for path in recordings))
+
+    for path, phones in zip(recordings, asyncio.run(run()), strict=True):
+        assert phones == [
+            (
+                phone.symbol,
+                round(phone.onset_s * 16000),
+                round(phone.duration_s * 16000),
+                phone.confidence,
+            )
+            for phone in expected[path.name]
+        ]

@@ -295,3 +295,21 @@ def test_a_full_disk_gives_one_line() -> None:
         )
     text = "kouxing: cannot write the output: No space left on device\n"
     assert (done.returncode, done.stderr) == (2, text)
+
+
+def test_a_refused_overwrite_gives_one_line(tmp_path: Path) -> None:
+    output = tmp_path / "my.glb"
+    output.write_text("mine")
+    terminal, other_end = os.openpty()
+    command = [sys.executable, "-m", "kouxing", "head", "export", output]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdin=other_end, stdout=other_end, stderr=other_end
+    )
+    os.write(terminal, b"n\n")
+    assert process.wait(LIMIT_S) == 1
+    os.close(other_end)
+    shown = os.read(terminal, 10_000).decode()
+    os.close(terminal)
+    assert "Overwrite it? [y/N]" in shown
+    assert shown.endswith("kouxing: aborted; nothing was written\r\n")
+    assert output.read_text() == "mine"

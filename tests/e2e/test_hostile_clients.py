@@ -144,6 +144,14 @@ def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> It
         revoke_key("laptop")
 
 
+def test_roles_limit_what_a_key_may_do(keyed: Client, client: Client, witness: Session) -> None:
+    assert witness.name in {item.session for item in keyed.status().sessions}
+    with pytest.raises(Refused, match=r"not-allowed: .* no role client"):
+        keyed.open_session()
+    with pytest.raises(Refused, match=r"not-allowed: .* no role client or operator"):
+        keyed.set_face(witness.name, expressions={"joy": 1.0})
+
+
 def test_a_revoked_key_is_cut_while_it_follows(
     system: System, keyed: Client, client: Client
 ) -> None:
@@ -182,6 +190,16 @@ def test_rejects_nan_and_accepts_empty_chunks_silence_and_clipping(
         sent.finish()
     assert sent.times[-1] >= 16000
     assert np.isfinite(sent.faps).all()
+
+
+def test_names_an_unknown_session(client: Client, bus: Bus, witness: Session) -> None:
+    audio = bus.connect_dealer(witness.info["audio"])
+    audio.send(AudioChunk(session="nobody", token="t", sequence=1, pcm=b""))
+    error = next(answers(audio, Error))
+    assert (error.code, error.session) == ("unknown-session", "nobody")
+    with pytest.raises(Refused, match="nobody") as caught:
+        client.request("close-session", "nobody", token="t")
+    assert caught.value.code == "unknown-session"
 
 
 def test_rejects_a_foreign_token_and_drops_a_replay(

@@ -112,6 +112,16 @@ def test_rejects_wav_codecs_that_ffmpeg_takes_for_others(
         _open(monkeypatch, path.read_bytes())
 
 
+def test_reports_a_caf_file_that_is_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "a.caf"
+    soundfile.write(path, SPEECH, RATE_HZ)
+    path.write_bytes(path.read_bytes()[:-32_000])
+    source = open_audio(path)
+    assert sum(map(len, source.blocks)) == 16_000
+    (warning,) = source.warnings
+    assert warning.startswith(f"{path}: the file is cut off after 1.0 s of")
+
+
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT", "PCM_24", "PCM_U8", "ALAW", "ULAW"])
 def test_reads_every_encoding_of_a_wav_pipe(monkeypatch: pytest.MonkeyPatch, subtype: str) -> None:
     file = io.BytesIO()
@@ -178,6 +188,16 @@ def test_reports_a_wrong_wav_header(
         assert message in text
 
 
+def test_reports_the_length_of_a_cut_wav_pipe_with_a_high_rate(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    soundfile.write(tmp_path / "a.wav", np.full(4 * 96_000, 0.25), 96_000)
+    source = _open(monkeypatch, (tmp_path / "a.wav").read_bytes()[: 2 * 96_000 * 2 + 44])
+    for _ in source.blocks:
+        pass
+    assert "cut off after 2.0 s of 4.0 s" in source.warnings[0]
+
+
 @pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])
 def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
@@ -193,6 +213,14 @@ def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     assert len(next(source.blocks)) == source.sample_rate_hz // 50
     os.close(writer)
     [*source.blocks]  # noqa: B018 - it ends in the middle of a packet
+
+
+def test_reports_a_cut_flv_pipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "a.flv"
+    write_media(path, "aac", SPEECH.repeat(3), 48_000)
+    for share in np.linspace(0.4, 0.9, 20):  # FFmpeg takes some of these ends for a new track
+        source = _open(monkeypatch, path.read_bytes()[: int(path.stat().st_size * share)])
+        assert len([*source.blocks]) > 0
 
 
 def test_reads_raw_samples_if_no_format_fits_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

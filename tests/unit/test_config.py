@@ -255,3 +255,7 @@ def test_an_unknown_service_or_key_is_an_error() -> None:
         config("listener")
     with pytest.raises(UserError, match=r"--set: .* key port; the nearest is gateway.port"):
         config(assignments=["port=1"])
+
+
+def test_names_may_have_capitals() -> None:
+    assert settings().load(DriverConfig, {"background": "Green"}).background == "green"

@@ -11,7 +11,10 @@ from kouxing.shared.budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, Budget
 from kouxing.shared.bus import AUDIO
 from kouxing.shared.connections import (
     MAX_QUEUED,
+    NEW_CHECKS,
+    NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
+    TRIMS_S,
     Connection,
     ConnectionLimiter,
 )
@@ -85,6 +88,33 @@ def test_disconnects_a_peer_whose_message_does_not_end(scene: Scene) -> None:
     assert not honest.is_disconnected
 
 
+def test_does_not_wake_the_loop_for_an_incomplete_message(scene: Scene) -> None:
+    scene.limiter.waker = waker = mock.Mock()
+    scene.deliver(1)
+    scene.enforce_limits(0.0)
+    for read, number in ((300, 0), (400, 1)):
+        scene.traffic[1] = Traffic(read=read)
+        for look in range(10):
+            scene.enforce_limits(10.0 * number + look)
+            scene.socket.num_polls += 1  # each time that the loop waits
+        assert waker.wake.called
+        waker.wake.reset_mock()
+        scene.enforce_limits(10.0 * number + 10.0)
+        assert not waker.wake.called
+
+
+def test_sheds_the_owner_with_the_most_undelivered_bytes(scene: Scene) -> None:
+    scene.patch.setattr(connections, "MAX_UNDELIVERED", 700_000)
+    many = [scene.deliver(number, "many") for number in (1, 2, 3)]
+    single = scene.deliver(4, "single")
+    scene.enforce_limits(0.0)
+    scene.traffic = dict.fromkeys((1, 2, 3), Traffic(read=200_000))
+    scene.traffic[4] = Traffic(read=300_000)
+    scene.enforce_limits(1.0)
+    assert sum(connection.is_disconnected for connection in many) == 1
+    assert not single.is_disconnected
+
+
 def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
     scene.patch.setattr(connections, "MAX_UNREAD", 3 * MAX_QUEUED)
     silent = [scene.deliver(number, "silent") for number in range(1, 5)]
@@ -122,6 +152,16 @@ def test_clients_cannot_use_connections_of_services_or_other_keys(scene: Scene) 
     assert len(scene.limiter.connections_to(scene.socket)) == 10 + 2
 
 
+def test_services_can_use_connections_that_clients_do_not_use(scene: Scene) -> None:
+    services = [scene.deliver(number, "service") for number in range(20)]
+    scene.enforce_limits(0.0)
+    assert [connection.is_disconnected for connection in services] == [False] * 15 + [True] * 5
+    for number in range(20, 30):
+        scene.deliver(number, f"key {number}")
+    scene.enforce_limits(0.0)
+    assert len(scene.limiter.connections_to(scene.socket)) == 17
+
+
 def test_surplus_peers_are_disconnected_later(scene: Scene) -> None:
     for number in range(9):
         scene.deliver(number, "key")
@@ -137,6 +177,18 @@ def test_resets_the_oldest_surplus_peers_above_the_capacity(scene: Scene) -> Non
     scene.enforce_limits(0.0)
     scene.enforce_limits(0.05)
     assert [held.close.called for held in scene.held.values()] == [True] + [False] * 40
+
+
+def test_an_idle_surplus_peer_can_reconnect_at_once(scene: Scene) -> None:
+    scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
+    for number in range(10):
+        scene.limiter.find(number, scene.socket)
+    for look in range(NEW_CHECKS):
+        scene.enforce_limits(float(look))
+    scene.deliver(10, "talker")
+    scene.enforce_limits(float(NEW_CHECKS))
+    assert scene.ended == {0}
+    assert not scene.held
 
 
 def test_resets_a_surplus_peer_that_keeps_sending(scene: Scene) -> None:
@@ -157,6 +209,20 @@ def test_silent_connections_make_room(scene: Scene) -> None:
         False
     ] * 9
     assert not talker.is_disconnected
+
+
+@pytest.mark.parametrize(
+    ("number", "trims"), [(NUM_ENDED_BEFORE_TRIM - 1, 0), (NUM_ENDED_BEFORE_TRIM, 1)]
+)
+def test_gives_memory_back_after_many_peers_left(scene: Scene, number: int, trims: int) -> None:
+    trim = mock.Mock()
+    scene.patch.setattr(connections, "trim_heap", trim)
+    for descriptor in range(number):
+        scene.deliver(descriptor, f"key {descriptor}")
+        scene.ended.add(descriptor)
+        scene.enforce_limits(0.0)
+    scene.enforce_limits(TRIMS_S[0])
+    assert trim.call_count == trims
 
 
 def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(scene: Scene) -> None:

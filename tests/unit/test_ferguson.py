@@ -14,7 +14,7 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.endpoints import segment_speech
+from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableSegmenter, segment_speech
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
@@ -27,6 +27,7 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.records import replace
 from kouxing.training.ferguson.recipe import fit_openings, relative_openings, travel_of
 from tests.lips import clip_of, phone, utterance
+from tests.live_streams import LiveStream
 from tests.system import DEMO
 
 LIPS = load_lip_model(name="ferguson")
@@ -125,6 +126,18 @@ def test_segments_end_at_pauses_dips_and_hisses() -> None:
     assert segments[0].end_s == pytest.approx(0.6, abs=0.045)
     assert segments[1].end_s == segments[2].start_s
     assert segments[-1].end_s == pytest.approx(1.58, abs=0.045)
+
+
+def test_streaming_finds_the_same_segments() -> None:
+    samples = read_audio(DEMO / "hello-female.wav")[0].mean(axis=1)[: 2 * RATE_HZ]
+    segmenter = SyllableSegmenter()
+    segments = []
+    for output in LiveStream(load_model()).feed(samples, chunk=113):
+        if isinstance(output, Progress):
+            segments += segmenter.add_slice(output)
+    segments += segmenter.finish()
+    assert segments == segment_speech(measure_slices(samples))
+    assert len(segments) > 3
 
 
 def test_finals_follow_by_the_influence_factor() -> None:

@@ -145,6 +145,16 @@ def test_a_still_face_with_eye_contact_only_breathes_and_blinks() -> None:
     assert faps[:, LID].max() > 800.0
 
 
+def test_no_loop_can_be_seen_in_the_motion_of_a_minute() -> None:
+    face = make_face(idle_motion_seed=3)
+    faps = np.array([values for _, values in face.relax(3000)])
+    for motion in (faps[:, YAW], faps[:, LID], gaze_deg(faps)):
+        centered = motion - motion.mean()
+        for lag in range(250, 1500, 25):
+            assert np.corrcoef(centered[:-lag], centered[lag:])[0, 1] < 0.8
+        assert np.ptp(motion[-250:]) > 0.0  # never frozen
+
+
 def test_the_head_does_not_repeat_its_motion_within_a_minute() -> None:
     for seed in SEEDS:
         motion = IdleMotion(seed)

@@ -23,6 +23,8 @@ from kouxing.evaluation.lips import (
 from kouxing.evaluation.lips import closures as closures_module
 from kouxing.evaluation.lips.agreement import agreement_of
 from kouxing.evaluation.lips.closures import Detections, closures, contacts, is_closed_at
+from kouxing.evaluation.lips.curves import num_turns, pooled_moments
+from kouxing.evaluation.lips.effort import correlate_by_speaker, lip_intensity, opening_range
 from kouxing.evaluation.lips.extrema import match_extrema, misalignment_s, warping_path
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_mouth
 from kouxing.evaluation.lips.references import Reference
@@ -78,6 +80,16 @@ def test_examples_of_measures(module: ModuleType) -> None:
     assert not outcome.failed
 
 
+def test_correlation_error_and_turns_of_curves() -> None:
+    # without means: made (-1, 0, 1), real (-1, 1, 0)
+    pair = np.array([1.0, 2.0, 3.0]), np.array([10.0, 12.0, 11.0])
+    moments = pooled_moments([pair, (np.array([np.nan]), np.array([1.0]))])
+    assert moments.correlation == pytest.approx(0.5)
+    assert moments.rmse == pytest.approx(np.sqrt(2 / 3))
+    assert pooled_moments([(np.ones(3), np.arange(3.0))]).correlation is None
+    assert num_turns(np.array([0.0, 1.0, 1.0, 2.0, 1.0, 3.0])) == 2
+
+
 def test_agreement_measures_the_lag() -> None:
     curve = 150.0 + 150.0 * np.sin(2 * np.pi * TIME_S)
     real = mouth_of(curve)
@@ -104,6 +116,15 @@ def test_counts_missed_and_false_closures() -> None:
     second = contacts(made, real)[1]
     assert second.time_s == pytest.approx(2.05)
     assert not second.is_true
+
+
+def test_closures_after_the_end_of_the_clip_do_not_count() -> None:
+    real = mouth((0.5, 0.5), (1.5, 1.5))
+    made = mouth((0.5, 0.5), (3.5, 3.5))
+    is_known = real.time_s < 3.0
+    curves = {"opening": real.opening[is_known]}
+    clip = Mouth(real.time_s[is_known], curves, real.is_closed[is_known])
+    assert closures(made, clip) == Detections(real=2, met=1, predicted=1, true=1)
 
 
 def test_real_lips_are_closed_in_the_lowest_tenth_of_their_range() -> None:
@@ -152,6 +173,27 @@ def test_spread_within_phones_ignores_differences_between_them() -> None:
 def test_turns_per_second_of_speech() -> None:
     clips = [ScoredClip(reference(mouth()), mouth_of(30.0 * np.arange(200.0) % 300.0))]
     assert in_speech.turns_per_s(clips) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
+
+
+def test_effort_correlates_within_speakers() -> None:
+    # deviations of level and range: A (-1, 0, 1) and (-1, 1, 0), r = 0.5; B the same, r = 1
+    levels, ranges = [0.0, 1.0, 2.0, 50.0, 60.0, 70.0], [1.0, 3.0, 2.0, 9.0, 10.0, 11.0]
+    assert correlate_by_speaker([*"AAABBB"], levels, ranges) == pytest.approx(0.75)
+    assert correlate_by_speaker([*"AABB"], levels[:4], ranges[:4]) is None
+    assert opening_range(np.arange(101.0)) == pytest.approx(90.0)
+    assert lip_intensity(mouth_of(np.array([0.0, 6.0, 6.0]))) == pytest.approx(300 / np.sqrt(2))
+
+
+def test_louder_clips_have_wider_and_faster_lips() -> None:
+    takes = []
+    for gain, extent in ((1.0, 100.0), (2.0, 300.0), (3.0, 200.0)):
+        clip = reference(mouth())
+        louder = replace(clip, clip=replace(clip.clip, samples=gain * clip.clip.samples))
+        takes.append(Take(louder, mouth_of(extent * (np.arange(200.0) % 2))))
+    level_db = 20 * np.log10([1.0, 2.0, 3.0])
+    r_db = np.corrcoef(level_db, [100.0, 300.0, 200.0])[0, 1]
+    assert effort.effort_correlation(takes) == pytest.approx(r_db)
+    assert effort.speech_lip_intensity(takes) == pytest.approx(0.5)
 
 
 def test_matched_extrema_of_a_late_mouth() -> None:

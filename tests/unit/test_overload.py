@@ -217,6 +217,13 @@ def test_the_hop_falls_some_time_after_the_load() -> None:
     assert set(hops[late:]) == {1}
 
 
+def test_a_load_between_the_limits_does_not_change_the_hop() -> None:
+    recognizer = Recognizer()
+    recognizer.run(5.0, others=0.25, network=0.8)
+    assert set(recognizer.run(20.0, others=0.25, network=0.29)) == {3, 2}
+    assert set(recognizer.run(20.0, others=0.25, network=0.29)) == {2}
+
+
 def test_the_hop_falls_only_as_far_as_the_highest_recent_load_allows() -> None:
     recognizer = Recognizer()
     recognizer.run(5.0, others=0.3, network=1.1)
@@ -233,3 +240,13 @@ def test_the_network_runs_less_often_while_a_session_is_behind() -> None:
     assert hops[0] == 1
     assert hops[-1] == MAX_HOP
     assert recognizer.run(2 * RESTORE_AFTER_S, others=0.1, network=0.1)[-1] == 1
+
+
+def test_the_hop_rises_before_the_light_model_is_used() -> None:
+    session = Session()
+    session.run(2.0, speed=3.0)
+    assert not session.overload.is_behind
+    while not session.overload.needs_light_model(session.now_s):
+        was_behind = session.overload.is_behind
+        session.run(CHUNK_S, speed=0.8)
+    assert was_behind

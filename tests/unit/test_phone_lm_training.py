@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from kouxing.shared.errors import UserError
+from kouxing.training.commands import app
 from kouxing.training.phone_lm import open_gram
 from kouxing.training.phone_lm.open_gram import draw_phones
 from kouxing.training.phone_lm.recipe import (
@@ -30,7 +32,29 @@ SENTENCE = [
 ]
 
 
+def wandering(num_sentences: int = 400, seed: int = 0) -> Stream:
+    """Sentences in which two phones tell much about the next."""
+    rng = np.random.default_rng(seed)
+    likely = rng.dirichlet(np.full(8, 0.2), (8, 8))
+    sentences = []
+    for length in rng.integers(1, 12, num_sentences):
+        sentence = [0, 0]
+        for _ in range(length):
+            sentence.append(int(rng.choice(8, p=likely[sentence[-2], sentence[-1]])))
+        sentences.append([7 * phone for phone in sentence[2:]])
+    return stream_of(sentences, MANDARIN)
+
+
 # --- estimation
+
+
+@pytest.mark.parametrize("max_ngrams", [60, 300, 1_000_000])
+def test_probabilities_after_every_context_sum_to_one(max_ngrams: int) -> None:
+    graph = estimate_phone_lm([wandering()], MANDARIN, order=4, max_ngrams=max_ngrams).graph
+    for context in range(0, len(graph.last_phone), max(1, len(graph.last_phone) // 60)):
+        probs = [np.exp(step(graph, context, phone)[0]) for phone in range(NUM_PHONES)]
+        assert sum(probs) == pytest.approx(1, abs=1e-3)
+        assert min(probs) > 0
 
 
 def test_smooths_like_witten_and_bell() -> None:
@@ -195,3 +219,11 @@ def test_rejects_unreadable_texts_and_empty_input(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no text to count"):
         train_phone_lm([], [], output, MANDARIN)
     assert not output.exists()
+
+
+@pytest.mark.parametrize("option", ["--ngrams", "--dictionary"])
+def test_n_grams_need_a_dictionary(option: str, tmp_path: Path) -> None:
+    arguments = ["phone-lm", "-o", str(tmp_path / "l.npz"), option, str(tmp_path / "file")]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, UserError)
+    assert "use --ngrams and --dictionary together" in str(result.exception)

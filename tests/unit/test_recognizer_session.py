@@ -24,7 +24,7 @@ from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ErrorCode
-from kouxing.shared.wire.speech import AcousticModelName, Progress
+from kouxing.shared.wire.speech import Acknowledge, AcousticModelName, AudioState, Progress
 from tests.live_streams import START
 from tests.system import VOWELS_FILE, samples_of_file
 
@@ -220,3 +220,15 @@ def test_continues_after_a_gap_that_is_not_filled_in_time() -> None:
     assert take(session, 1, 4, now_s=5.0) == [1]
     assert take(session, 6, now_s=5.0 + 0.9 * RESEND_WAIT_S) == []
     assert take(session, 7, 8, now_s=5.0 + RESEND_WAIT_S) == [7, 8]
+
+
+def test_after_the_end_a_replacement_needs_no_audio_message(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    session = make_session()
+    assert take(session, 1, 2, 3) == [1, 2, 3]
+    session.output_sequence = 40
+    ended = Progress(session="s", media_time=960, state=AudioState.ENDED)
+    monkeypatch.setattr(session.link, "acknowledge", lambda *_: [ended])
+    session.on_acknowledge(Acknowledge(session="s", sequence=40), 0.0)
+    assert session.replay_window.last_droppable_sequence == 3

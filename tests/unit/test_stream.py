@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.offline import recognize
@@ -42,6 +43,17 @@ def of_kind(kind: type[E], outputs: Sequence[StreamOutput]) -> list[E]:
 def messages_of(outputs: Sequence[StreamOutput]) -> list[Message]:
     """Return messages, which can be compared; events with arrays cannot."""
     return [message_of(output) for output in outputs if not isinstance(output, Waveform)]
+
+
+@pytest.mark.parametrize(("rate_hz", "size"), [(16_000, 97), (44_100, 1021)])
+def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
+    expected, outputs = (
+        recognize_live(MODEL, SAMPLES, chunk, sample_rate_hz=rate_hz, **FACE)
+        for chunk in (None, size)
+    )
+    assert messages_of(outputs) == messages_of(expected)
+    audio = [output.samples for output in of_kind(Waveform, outputs)]
+    np.testing.assert_array_equal(np.concatenate(audio), to_16_khz(SAMPLES, rate_hz))
 
 
 def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:

@@ -226,7 +226,7 @@ class Builder:
         Opaque triangles come first, from the outside inward, so that they hide others before these
         are shaded. Translucent ones follow from the inside outward, so that outer strands blend
         over inner ones. Triangles without strands are removed; they would cast shadows. ``alpha``
-        (H, W) is the size of the texture.
+        (H, W) is the alpha channel of the texture.
         """
         hair = fitted.read(self._folder, f"hair/{person.hair}/{person.hair}")
         points = hair.fit(vertices)
