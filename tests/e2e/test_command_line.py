@@ -301,7 +301,7 @@ def test_a_refused_overwrite_gives_one_line(tmp_path: Path) -> None:
     output = tmp_path / "my.glb"
     output.write_text("mine")
     terminal, other_end = os.openpty()
-    command = [sys.executable, "-m", "kouxing", "head", "export", output]
+    command = [sys.executable, "-m", "kouxing", "head", "export", str(output)]
     process = subprocess.Popen(
         command, cwd=ROOT, stdin=other_end, stdout=other_end, stderr=other_end
     )
