@@ -45,9 +45,9 @@ def write_videos(
     A condition that is not possible for every sentence is left out, because a listening test needs
     all sentences in all conditions. ``programs`` are folders with curves of other programs, and
     each is a condition, at its best delay for these sentences. Clips with tracked lips add the
-    conditions ``tracked`` and ``anchor``, a mouth at rest. All mouths have an expressiveness of 1,
-    like the tracked one. Raises UserError if a file cannot be written, or a program's table cannot
-    be used.
+    conditions ``reference`` and ``anchor``, a mouth at rest. All mouths have an expressiveness of
+    1, like the tracked one. Raises UserError if a file cannot be written, or a program's table
+    cannot be used.
     """
     missing = [
         (make, sentence, path)
@@ -97,7 +97,7 @@ def _conditions(
     for program in programs:
         yield program.name, partial(_frames_with_mouth, conditions[0], load_shipped(program, clips))
     if all(len(clip.time_s) and clip.is_in_sync for clip in clips):
-        yield "tracked", partial(_frames_with_mouth, conditions[0], tracked_frames)
+        yield "reference", partial(_frames_with_mouth, conditions[0], tracked_frames)
         yield "anchor", partial(_frames_with_mouth, conditions[0], _mouth_at_rest)
 
 

@@ -28,13 +28,14 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the video
 @app.command()
 def new(
     folder: Folder,
-    reference: Annotated[str, typer.Option(help="Condition used as hidden reference.")] = "",
-    anchor: Annotated[str, typer.Option(help="Condition used as low anchor.")] = "",
 ) -> None:
-    """Create a study from videos named CONDITION/SENTENCE.mp4."""
+    """Create a study from videos named CONDITION/SENTENCE.mp4.
+
+    A condition with the name reference is the hidden reference, and anchor is the low anchor.
+    """
     from kouxing.evaluation.mos.study import new_study
 
-    study = new_study(folder, reference=reference, anchor=anchor)
+    study = new_study(folder)
     sizes = plural(len(study.sentences), "sentence"), plural(len(study.conditions), "condition")
     print_message(f"created a study of {' in '.join(sizes)}; next: kouxing mos serve {folder}")
 

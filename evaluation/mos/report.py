@@ -105,12 +105,11 @@ def mean_of(scores: Scores) -> Mean:
 
 def print_report(study: Study, opinions: Iterable[Opinion], console: Console) -> None:
     """Print the results as a table."""
-    roles = {study.reference: " (hidden reference)", study.anchor: " (anchor)"}
     columns = ("scale", "condition", "all scores", "no outliers", "judges", "outliers")
     rows = [
         [
             opinion.scale,
-            opinion.condition + roles.get(opinion.condition, ""),
+            opinion.condition,
             *map(str, (opinion.of_all, opinion.without_outliers, opinion.num_judges)),
             f"{opinion.num_outliers} of {opinion.num_scores}",
         ]
@@ -121,12 +120,10 @@ def print_report(study: Study, opinions: Iterable[Opinion], console: Console) ->
 
 
 def to_csv(study: Study, answers: Iterable[Answer]) -> str:
-    """Return a table with a line per score, and the role of its condition."""
+    """Return a table with a line per score; ``practice`` is True for those that do not count."""
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
-    writer.writerow([*(field.name for field in fields(Answer)), "role"])
-    roles = {study.reference: "reference", study.anchor: "anchor"}
+    writer.writerow([*(field.name for field in fields(Answer)), "practice"])
     for answer in answers:
-        role = "practice" if answer.place < 0 else roles.get(answer.condition, "")
-        writer.writerow([*asdict(answer).values(), role])
+        writer.writerow([*asdict(answer).values(), answer.place < 0])
     return table.getvalue()

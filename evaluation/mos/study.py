@@ -21,6 +21,7 @@ from kouxing.shared.terminal import write_json
 from kouxing.shared.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "study.json"
+REFERENCE, ANCHOR = "reference", "anchor"  # the best condition, and one that is bad on purpose
 SUFFIXES = {".mp4", ".webm", ".mov"}
 LANGUAGES = ("zh", "en")  # languages of the page
 _MAX_BYTES = 16 << 20
@@ -34,8 +35,6 @@ class Study:
     folder: Path
     sentences: tuple[str, ...]
     conditions: tuple[str, ...]
-    reference: str  # condition that is the hidden reference; may be empty
-    anchor: str  # condition that is bad on purpose; may be empty
     files: dict[tuple[str, str], Path] = field(repr=False)  # by sentence and condition
 
 
@@ -46,18 +45,14 @@ def check_no_study(folder: Path) -> None:
         raise UserError(f"{file} exists, and answers may refer to it; use another folder")
 
 
-def new_study(folder: Path, *, reference: str = "", anchor: str = "") -> Study:
+def new_study(folder: Path) -> Study:
     """Find the videos ``CONDITION/SENTENCE.mp4`` of a folder and write ``study.json``.
 
     Raises UserError if the folder already is a study, lacks videos, or has one without sound.
     """
     check_no_study(folder)
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
-    content = {
-        "reference": reference,
-        "anchor": anchor,
-        "videos": [f"{path.parent.name}/{path.name}" for path in videos],
-    }
+    content = {"videos": [f"{path.parent.name}/{path.name}" for path in videos]}
     study = _parse(folder, content)
     for path in study.files.values():
         check_video(path)
@@ -90,11 +85,7 @@ def _parse(folder: Path, content: Any) -> Study:
     for sentence, condition in product(sentences, conditions):
         if (sentence, condition) not in files:
             raise UserError(f"sentence {sentence!r} has no video in condition {condition!r}")
-    reference, anchor = str(content["reference"]), str(content["anchor"])
-    if unknown := {reference, anchor} - {"", *conditions}:
-        known = ", ".join(sorted(conditions))
-        raise UserError(f"no condition is named {min(unknown)!r}; choose from {known}")
-    return Study(root, sentences, conditions, reference, anchor, files)
+    return Study(root, sentences, conditions, files)
 
 
 def williams_design(num_conditions: int) -> NDArray[np.int64]:
@@ -123,6 +114,6 @@ def places_of_judge(judge: int, study: Study) -> dict[int, tuple[str, str]]:
         for block in range(len(sentences))
         for condition in design[(judge + rows.randrange(len(design))) % len(design)]
     ]
-    extremes = dict.fromkeys((study.reference, study.anchor, *conditions))
-    practice = [(order[-1][0], condition) for condition in extremes if condition][:2]
+    extremes = [name for name in (REFERENCE, ANCHOR) if name in conditions]
+    practice = [(order[-1][0], name) for name in dict.fromkeys((*extremes, *conditions))][:2]
     return dict(enumerate([*practice, *order], start=-len(practice)))

@@ -11,9 +11,8 @@ from rich.console import Console
 
 from kouxing.services.cli.options import (
     AudioTrack,
-    CurveFormat,
     Language,
-    ListenOutput,
+    ListenFormat,
     MouthFile,
     PhoneAlphabet,
 )
@@ -153,10 +152,6 @@ def listen(
     session: Annotated[
         str, typer.Argument(help="Name of the session. It may open later. Default: the newest.")
     ] = "",
-    show: Annotated[
-        ListenOutput,
-        typer.Option(help="What to print. Syllables and phones are printed once they are final."),
-    ] = ListenOutput.FAPS,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -167,11 +162,12 @@ def listen(
         ),
     ] = None,
     form: Annotated[
-        CurveFormat | None,
+        ListenFormat | None,
         typer.Option(
             "--as",
-            help="Values of the frames. Shapes are printed as JSON lines, and the drawn mouths of"
-            " rhubarb when they change. Default: the first that the format supports.",
+            help="Values to print or record. Shapes are printed as JSON lines, the drawn mouths of"
+            " rhubarb when they change, and syllables and phones once they are final. Default:"
+            " faps, or the first that the file's format supports.",
         ),
     ] = None,
     alphabet: PhoneAlphabet = None,
@@ -182,7 +178,7 @@ def listen(
     from kouxing.services.cli.follow import follow
 
     check_output(output, force=force)
-    follow(_session_name(session), output, show, form, control_address(control), alphabet)
+    follow(_session_name(session), output, form, control_address(control), alphabet)
 
 
 def send(

@@ -25,9 +25,7 @@ from kouxing.services.driver.video.writer import (
 )
 from kouxing.shared.errors import UserError
 
-_DRAWING_OPTIONS = frozenset(
-    {"lips", "head", "size", "background", "camera", "yaw_deg", "pitch_deg", "captions"}
-)
+_DRAWING_OPTIONS = frozenset({"lips", "head", "size", "background", "camera", "captions"})
 
 
 class Exporter(Protocol):
@@ -157,7 +155,7 @@ def _make_renderer(
     if background is None and output.suffix == ".mp4":
         raise UserError("MP4 has no transparency; write .mov, .webm or pictures (.png)")
     head = scene.load_head(options.head)
-    camera = scene.camera(head, options.camera, options.yaw_deg, options.pitch_deg)
+    camera = scene.camera(head, options.camera)
     renderer = Renderer(
         head, width_px // num_faces, height_px, background=background, camera=camera
     )

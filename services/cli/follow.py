@@ -9,7 +9,7 @@ import numpy as np
 from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 
 from kouxing.services.cli.curves import CURVE_EXPORTERS, CurveExporter, Curves, Row, json_line
-from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenOutput
+from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
 from kouxing.services.cli.streaming import missed_warning
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.control_client import connect
@@ -33,46 +33,46 @@ T = TypeVar("T", FapFrame, Phone)
 def follow(
     session: str,
     output: Path | None,
-    shown: ListenOutput,
-    form: CurveFormat | None,
+    form: ListenFormat | None,
     control: str,
     alphabet: Alphabet | None = None,
 ) -> None:
     """Follow a session until it ends; without a name, the newest one, or else the next one.
 
-    The frames go to ``output``. Without it, what ``shown`` selects is printed, phones in an
+    The frames go to ``output``. Without it, they are printed, or syllables, or phones in an
     ``alphabet``. Raises ``UserError`` if control does not answer, the file cannot be written, or
     the options do not fit each other.
     """
-    if alphabet is not None and shown is not ListenOutput.PHONES:
-        raise UserError("--alphabet applies to phones; add --show phones")
-    if shown is not ListenOutput.FAPS and (output is not None or form is not None):
-        raise UserError(f"--show {shown} cannot be combined with --output or --as; leave these out")
-    if form is CurveFormat.LIVELINK and output is None:
+    if alphabet is not None and form is not ListenFormat.PHONES:
+        raise UserError("--alphabet applies to phones; add --as phones")
+    is_speech = form in (ListenFormat.PHONES, ListenFormat.SYLLABLES)
+    if is_speech and output is not None:
+        raise UserError(f"--as {form} is only printed; leave out --output")
+    if form is ListenFormat.LIVELINK and output is None:
         raise UserError("--as livelink is a table; add --output face.csv")
-    exporter = None if output is None else _open_exporter(output, form)
+    curve_form = None if form is None or is_speech else CurveFormat(form)
+    exporter = None if output is None else _open_exporter(output, curve_form)
     with connect(control) as client:
         followed = _wait_for_session(session, client)
-        shows_faps = shown is ListenOutput.FAPS
-        results = followed.results(FapFrame if shows_faps else Phone, keep_all=True)
+        results = followed.results(Phone if is_speech else FapFrame, keep_all=True)
         arriving = _iter_until_interrupt(results, followed.name)
-        if not shows_faps:
+        if is_speech:
             inventory = load_inventory(followed.info["facts"]["language"] or DEFAULT_LANGUAGE)
             phones = map(_event_of, arriving)
-            if shown is ListenOutput.SYLLABLES:
+            if form is ListenFormat.SYLLABLES:
                 count = _print(_syllable_lines(phones, inventory))
             else:
                 count = _print(_phone_lines(respell(phones, inventory, alphabet)))
         else:
             rows = map(_row, arriving)
             live = Curves(rows, is_live=True)
-            count = _print_frames(rows, form) if exporter is None else exporter.write(live)
-    unit = "frame" if shows_faps else shown.value.removesuffix("s")
-    if form is CurveFormat.RHUBARB and output is None:
+            count = _print_frames(rows, curve_form) if exporter is None else exporter.write(live)
+    unit = form.value.removesuffix("s") if form and is_speech else "frame"
+    if form is ListenFormat.RHUBARB and output is None:
         unit = "mouth shape"
     print_message(f"session {followed.name} ended: {plural(count, unit)}")
     if results.num_missed:
-        print_message(missed_warning(results.num_missed, "frame" if shows_faps else "phone"))
+        print_message(missed_warning(results.num_missed, "phone" if is_speech else "frame"))
     if output is not None:
         print_message(f"wrote {output}")
 

@@ -58,7 +58,7 @@ from kouxing.shared.terminal import open_progress, plural, print_message, write_
 Array = NDArray[np.float64]
 Span = tuple[float, float, str]  # start and end in seconds, and the label
 
-DEFAULT_NUM_POINTS = 21
+NUM_POINTS = 21  # on each line of the contour, in a table
 FRAME_RATE_HZ = 25.0
 CSV_COLUMNS = ("time_s", "opening", "line", "point", "x", "y", "phone")
 _VIDEO_SIZE_PX = (640, 480)
@@ -78,8 +78,6 @@ class _Mouth:
     key_frames: KeyFrames
     widths: tuple[Array, Array]  # times, and the width at each, relative to the mouth at rest
     inventory: PhoneInventory
-    smooth: bool  # whether the velocity of the opening is continuous
-    num_points: int  # for each line of the contour, in a table
 
     def widths_at(self, times_s: Sequence[float] | Array) -> Array:
         """Return the width at times (n,), relative to the mouth at rest."""
@@ -89,7 +87,7 @@ class _Mouth:
         """Return the times of the video's frames, and the opening and the width at each of them."""
         num_frames = int(len(self.samples) / MEDIA_RATE_HZ * FRAME_RATE_HZ) + 1
         times_s = np.arange(num_frames) / FRAME_RATE_HZ
-        openings = self.key_frames.openings_at(times_s, smooth=self.smooth)
+        openings = self.key_frames.openings_at(times_s)
         return times_s, openings, self.widths_at(times_s)
 
     @property
@@ -107,8 +105,6 @@ def draw_mouth(
     *,
     lips: WidthSource = WidthSource.VISEMES,
     timing: TimingMethod | None = None,
-    smooth: bool = False,
-    num_points: int | None = None,
     speech_to_text: Path | None = None,
     track: int | None = None,
     language: str = DEFAULT_LANGUAGE,
@@ -116,9 +112,9 @@ def draw_mouth(
     """Draw the mouth of a sound file, in the format of the output's suffix.
 
     ``.svg`` and ``.png`` show the mouth at the key frames, ``.mp4`` is a video with sound, and
-    ``.csv`` has the contour of every frame with ``num_points`` for each line. Without a text, the
-    model in the folder ``speech_to_text`` recognizes it, or else phones are recognized. With
-    ``smooth``, the velocity of the opening is continuous at key frames. ``lips`` gives the width.
+    ``.csv`` has the contour of every frame with ``NUM_POINTS`` for each line. Without a text, the
+    model in the folder ``speech_to_text`` recognizes it, or else phones are recognized. ``lips``
+    gives the width.
 
     Raises ``UserError`` if a file cannot be read or written, or the options do not fit each other.
     """
@@ -126,10 +122,6 @@ def draw_mouth(
     write = _WRITERS.get(suffix)
     if write is None:
         raise UserError(f"{output}: use a name that ends in {', '.join(_WRITERS)}")
-    if num_points is not None and suffix != ".csv":
-        raise UserError(f"{output}: --points applies to .csv; leave it out")
-    if smooth and suffix not in (".mp4", ".csv"):
-        raise UserError(f"{output}: --smooth applies to .mp4 and .csv; a picture has key frames")
     if text is not None and speech_to_text is not None:
         raise UserError("use either a text or --speech-to-text, not both")
     if text is None and speech_to_text is None and timing is not None:
@@ -156,8 +148,6 @@ def draw_mouth(
         key_frames=key_frames_of(phones, load_table(inventory), inventory.silence),
         widths=widths,
         inventory=inventory,
-        smooth=smooth,
-        num_points=num_points or DEFAULT_NUM_POINTS,
     )
     print_message(f"wrote {output}: {write(output, mouth)}")
 
@@ -300,7 +290,7 @@ def _write_csv(output: Path, mouth: _Mouth) -> str:
         firsts = progress.track(range(0, len(times_s), _BLOCK_FRAMES), description="writing")
         for first in firsts:
             block = slice(first, first + _BLOCK_FRAMES)
-            contours = rounded_contour(openings[block], widths[block], mouth.num_points)
+            contours = rounded_contour(openings[block], widths[block], NUM_POINTS)
             for time_s, opening, lines in zip(
                 times_s[block], openings[block], contours, strict=True
             ):

@@ -119,14 +119,9 @@ def render(
     background: Annotated[
         str, typer.Option(help="studio, transparent (not for .mp4), #rrggbb, or a color name.")
     ] = "studio",
-    camera: Annotated[Framing, typer.Option(help="Part that fills the picture.")] = Framing.FACE,
-    yaw: Annotated[
-        float,
-        typer.Option(min=-180, max=180, help="Camera angle toward the face's left, in degrees."),
-    ] = 0.0,
-    pitch: Annotated[
-        float, typer.Option(min=-80, max=80, help="Camera angle upward, in degrees.")
-    ] = 0.0,
+    camera: Annotated[
+        Framing, typer.Option(help="Part that fills the picture, or the head from the side.")
+    ] = Framing.FACE,
     rate: Annotated[
         float | None,
         typer.Option(
@@ -172,8 +167,7 @@ def render(
     check_output(*(existing_output(target) for _, target in pairs), inputs=inputs, force=force)
     options = ExportOptions(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
-        yaw_deg=yaw, pitch_deg=pitch, rate_hz=rate, at_s=at, sound=sound,
-        captions=captions, speed=speed,
+        rate_hz=rate, at_s=at, sound=sound, captions=captions, speed=speed,
     )  # fmt: skip
 
     def render_file(source: Path, target: Path) -> None:
@@ -327,17 +321,6 @@ def lips(
         TimingMethod | None,
         typer.Option(help="Times of the text by energy and zero crossings, or forced alignment."),
     ] = None,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="Interpolate smoothly between key frames (.mp4, .csv).")
-    ] = False,
-    points: Annotated[
-        int | None,
-        typer.Option(
-            min=2,
-            max=1000,
-            help="Points on each of the four lines of the contour (.csv). Default: 21.",
-        ),
-    ] = None,
     speech_to_text: Annotated[
         Path | None, typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text.")
     ] = None,
@@ -358,8 +341,6 @@ def lips(
         Path(output),
         lips=lips,
         timing=timing,
-        smooth=smooth,
-        num_points=points,
         speech_to_text=speech_to_text,
         track=track,
         language=language or DEFAULT_LANGUAGE,

@@ -80,10 +80,15 @@ class CurveFormat(StrEnum):
     LIVELINK = "livelink"  # ARKit and head angles, as the app Live Link Face records them
 
 
-class ListenOutput(StrEnum):
-    """Output of ``kouxing listen``."""
+class ListenFormat(StrEnum):
+    """Values that ``kouxing listen`` prints or records: those of ``CurveFormat``, and speech."""
 
-    FAPS = "faps"
+    FAPS = CurveFormat.FAPS
+    ARKIT = CurveFormat.ARKIT
+    OCULUS = CurveFormat.OCULUS
+    VRM = CurveFormat.VRM
+    RHUBARB = CurveFormat.RHUBARB
+    LIVELINK = CurveFormat.LIVELINK
     SYLLABLES = "syllables"
     PHONES = "phones"
 
@@ -121,8 +126,6 @@ class ExportOptions:
     size: str = "1280x720"
     background: str = "studio"
     camera: Framing = Framing.FACE
-    yaw_deg: float = 0.0
-    pitch_deg: float = 0.0
     rate_hz: float | None = None  # images per second; None: the default of the motion
     at_s: float | None = None  # time of a single picture
     sound: Path | None = None  # sound to add to curves

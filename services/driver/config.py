@@ -23,11 +23,12 @@ COLORS = {
 
 
 class Framing(StrEnum):
-    """The part of the head that fills the picture."""
+    """View of the head."""
 
     FACE = "face"
     HEAD = "head"
     MOUTH = "mouth"
+    SIDE = "side"  # the head at 60 degrees
 
 
 def parse_size(text: str) -> tuple[int, int]:

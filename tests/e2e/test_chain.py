@@ -220,7 +220,7 @@ def test_speak_and_listen_return_the_phones_of_the_chain(
     for number, path in enumerate(recordings):
         name = f"same-{number}"
         listener = start_python(
-            "-m", "kouxing", "listen", name, "--show", "phones", control=system.control
+            "-m", "kouxing", "listen", name, "--as", "phones", control=system.control
         )
         assert listener.stderr is not None
         assert name in listener.stderr.readline()

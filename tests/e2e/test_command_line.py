@@ -80,7 +80,7 @@ def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_
     recorded = tmp_path / "face.fap"
     waits = "waiting for session heard to open, as with kouxing speak my.wav --session heard"
     recorder = listening(system.control, "heard", "--output", recorded, says=waits)
-    printer = listening(system.control, "heard", "--show", "syllables", says=waits)
+    printer = listening(system.control, "heard", "--as", "syllables", says=waits)
     with (
         Client(system.control) as client,
         client.open_session("heard", encoding="f32le", paced=False) as session,
@@ -103,7 +103,7 @@ def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_
 def test_listen_without_a_name_follows_the_newest_session(system: System) -> None:
     with Client(system.control) as client, client.open_session("older"):
         newer = client.open_session("newer")
-        listener = listening(system.control, "--show", "phones", says="following session newer")
+        listener = listening(system.control, "--as", "phones", says="following session newer")
         newer.close()
         assert output_of(listener)[1] == "session newer ended: 0 phones\n"
 
@@ -157,7 +157,7 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["listen", "two words"], "letters, digits"),
         (["listen", "heard", "-o", "face.txt"], ".jsonl"),
         (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "this format holds faps"),
-        (["listen", "heard", "--show", "phones", "--as", "vrm"], "cannot be combined"),
+        (["listen", "heard", "--as", "phones", "-o", "a.csv"], "is only printed"),
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
         (["send", "http://127.0.0.1"], "write vmc://HOST"),

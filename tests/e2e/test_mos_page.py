@@ -18,7 +18,7 @@ from kouxing.evaluation.mos.study import load_study, new_study, places_of_judge
 from kouxing.evaluation.system.chromium import Chromium
 from tests.system import ROOT, free_port
 
-CONDITIONS = ("good", "bad")
+CONDITIONS = ("reference", "anchor")
 SENTENCES = ("one", "two")
 
 
@@ -80,7 +80,7 @@ def folder(tmp_path: Path, video: Path) -> Path:
     for sentence, condition in product(SENTENCES, CONDITIONS):
         (folder / condition).mkdir(parents=True, exist_ok=True)
         shutil.copy(video, folder / condition / f"{sentence}.mp4")
-    new_study(folder, reference="good", anchor="bad")
+    new_study(folder)
     return folder
 
 
@@ -161,7 +161,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
 
 
 def test_judges_score_every_video_in_a_browser(browser: Chromium, served: Served) -> None:
-    Page(browser, served).judge_everything({"good": 5, "bad": 2})
+    Page(browser, served).judge_everything({"reference": 5, "anchor": 2})
     assert browser.complaints == []
     study = load_study(served.folder)
     answers = [answer for answer in read_answers(served.folder) if answer.place >= 0]

@@ -71,11 +71,11 @@ def test_renders_a_fap_file_as_a_video_with_sound(face: Path, tmp_path: Path) ->
 
 def test_renders_a_transparent_picture_of_any_head(face: Path, tmp_path: Path) -> None:
     pictures = []
-    for head, yaw in (("man", 0.0), ("man", 40.0), ("child", 0.0)):
-        path = tmp_path / f"{head}{yaw:.0f}.png"
+    for head, view in (("man", Framing.HEAD), ("man", Framing.SIDE), ("child", Framing.HEAD)):
+        path = tmp_path / f"{head}-{view}.png"
         render(
             face, path, head=head, size="161x121", background="transparent",
-            camera=Framing.HEAD, yaw=yaw, at=0.2,
+            camera=view, at=0.2,
         )  # fmt: skip
         pictures.append(np.asarray(Image.open(path)).astype(int))
     for picture in pictures:

@@ -13,7 +13,8 @@ from kouxing.services.cli.animation import FaceMotion
 from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves, Row
 from kouxing.services.cli.exporters import open_exporter
 from kouxing.services.cli.follow import follow
-from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenOutput
+from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
+from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import NUM_FAPS
@@ -71,7 +72,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"unknown format; .*\.mp4, .*\.png, .*\.csv"):
             open_exporter(output, ExportOptions())
         with pytest.raises(UserError, match=r"unknown format; .*\.fap, \.csv, \.jsonl"):
-            follow("", output, ListenOutput.FAPS, CurveFormat.FAPS, control="")
+            follow("", output, ListenFormat.FAPS, control="")
         assert not output.exists()
 
 
@@ -90,7 +91,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         ("a.csv", {"size": "640x360"}, "--size does not apply .* .mp4"),
         ("a.fap", {"rate_hz": 30.0}, "--rate does not apply .* .mp4"),
         ("a.png", {"rate_hz": 30.0}, "--rate does not apply"),
-        ("a.glb", {"yaw_deg": 9.0}, "--yaw does not apply"),
+        ("a.glb", {"camera": Framing.SIDE}, "--camera does not apply"),
         ("a.csv", {"sound": Path("a.wav")}, "--sound does not apply"),
         ("a.mp4", {"background": "transparent"}, "MP4 has no transparency"),
         ("a.mp4", {"background": "mud"}, "write studio, transparent"),

@@ -72,7 +72,7 @@ def test_languages_have_codes_and_titles() -> None:
 def test_draws_the_mouth_of_an_english_text(tmp_path: Path) -> None:
     output = tmp_path / "mouth.csv"
     text = "Six spoons of peas, and 5 men"
-    draw_mouth(SOUND, text, output, num_points=2, lips=WidthSource.FERGUSON, language="english")
+    draw_mouth(SOUND, text, output, lips=WidthSource.FERGUSON, language="english")
     with output.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     closed = {row["phone"] for row in rows if row["opening"] == "0.0000"}

@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
+from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, NUM_POINTS, draw_mouth
 from kouxing.services.cli.offline import lips
 from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.driver import picture
@@ -25,19 +25,19 @@ TEXT = "四是四，十是十，十四是十四，四十是四十。"
 
 def test_table_holds_the_contour_of_every_frame(tmp_path: Path) -> None:
     output = tmp_path / "mouth.csv"
-    draw_mouth(SOUND, TEXT, output, num_points=5, lips=WidthSource.FERGUSON)
+    draw_mouth(SOUND, TEXT, output, lips=WidthSource.FERGUSON)
     with output.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == CSV_COLUMNS
-    assert len(rows) == NUM_FRAMES * len(LINES) * 5
+    assert len(rows) == NUM_FRAMES * len(LINES) * NUM_POINTS
     last = rows[-1]
-    assert (last["line"], last["point"], last["phone"]) == ("outer lower", "4", "")
+    assert (last["line"], last["point"], last["phone"]) == ("outer lower", str(NUM_POINTS - 1), "")
     assert {"s", "ii", "sh", "iii"} <= {row["phone"] for row in rows}
     widest = max(rows, key=lambda row: float(row["opening"]))
     first = next(row for row in rows if row["time_s"] == widest["time_s"])
     at = rows.index(first)
-    heights = [float(row["y"]) for row in rows[at : at + 20]]
-    expected = contour([float(widest["opening"])], 5)[0, :, :, 1].ravel()
+    heights = [float(row["y"]) for row in rows[at : at + 4 * NUM_POINTS]]
+    expected = contour([float(widest["opening"])], NUM_POINTS)[0, :, :, 1].ravel()
     np.testing.assert_allclose(heights, expected, atol=1e-4)
 
 
@@ -84,7 +84,7 @@ def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:
 def test_reports_a_text_that_does_not_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, fits: bool
 ) -> None:
-    draw_mouth(SOUND, text, tmp_path / "mouth.csv", num_points=2, lips=WidthSource.FERGUSON)
+    draw_mouth(SOUND, text, tmp_path / "mouth.csv", lips=WidthSource.FERGUSON)
     assert ("the text does not fit the sound" not in capsys.readouterr().err) == fits
 
 

@@ -50,7 +50,12 @@ def seen(head: Head, framing: Framing, point: str, size: tuple[int, int] = (160,
 
 @pytest.mark.parametrize("framing", list(Framing))
 def test_framed_parts_are_in_the_picture(head: Head, framing: Framing) -> None:
-    points = {"face": ("2.1", "11.1", "10.1"), "head": ("11.4",), "mouth": ("9.3", "2.1", "8.3")}
+    points = {
+        "face": ("2.1", "11.1", "10.1"),
+        "head": ("11.4",),
+        "side": ("11.4", "9.3"),
+        "mouth": ("9.3", "2.1", "8.3"),
+    }
     for point in points[framing]:
         assert np.abs(seen(head, framing, point)).max() < 0.97
 

@@ -15,7 +15,9 @@ from kouxing.shared.errors import UserError
 # height of the picture's center above the eyes, and distance of the camera, in FAPU ES
 _FRAMINGS = {
     Framing.FACE: (-0.267, 20.0), Framing.HEAD: (-0.25, 26.0), Framing.MOUTH: (-1.20, 6.6),
+    Framing.SIDE: (-0.25, 26.0),
 }  # fmt: skip
+_SIDE_DEG = 60.0
 _RISE = 0.0114  # height of the camera above the center, as a fraction of its distance
 
 
@@ -35,15 +37,15 @@ def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
     return Head.load(path, detail)
 
 
-def camera(
-    head: Head, framing: Framing = Framing.FACE, yaw_deg: float = 0.0, pitch_deg: float = 0.0
-) -> Camera:
-    """Place the camera in front of a head, at angles to the subject's left and upwards."""
+def camera(head: Head, framing: Framing = Framing.FACE, yaw_deg: float | None = None) -> Camera:
+    """Place the camera at an angle to the subject's left; by default the angle of ``framing``."""
     eyes = head.eye_centers.mean(axis=0)
     unit_m = float(head.eye_centers[0, 0] - head.eye_centers[1, 0])
     height, distance = _FRAMINGS[framing]
     target = np.array([eyes[0], eyes[1] + height * unit_m, 0.0])
-    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg) + np.arctan(_RISE)
+    if yaw_deg is None:
+        yaw_deg = _SIDE_DEG if framing is Framing.SIDE else 0.0
+    yaw, pitch = np.radians(yaw_deg), np.arctan(_RISE)
     if framing is Framing.MOUTH:  # from close up, aim at the face instead of the head's pivot
         target[2] = eyes[2]
     ahead = [np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]

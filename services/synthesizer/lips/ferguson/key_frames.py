@@ -2,9 +2,7 @@
 
 Source: Zhang et al. 2021, sections 4 and 5, eq. 6. Each initial and final has an opening R, 0
 (closed) to 5. The mouth has this opening when the phone starts; in between, R is linear. Before and
-after speech the mouth is closed, and it starts moving shortly before the first sound. As an option,
-R is a smooth curve: a piecewise cubic without overshoot (PCHIP, Fritsch and Butland, "A method for
-constructing local monotone piecewise cubic interpolants", 1984).
+after speech the mouth is closed, and it starts moving shortly before the first sound.
 """
 
 from collections.abc import Sequence
@@ -12,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
 
-from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
 from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
@@ -31,15 +28,11 @@ class KeyFrames:
     times_s: Array  # (num_key_frames,) strictly ascending, at least one
     openings: Array  # (num_key_frames,) R at these times, 0 to MAX_OPENING
 
-    def openings_at(self, times_s: ArrayLike, *, smooth: bool = False) -> Array:
-        """Return R (n,) at times (n,); with ``smooth``, its velocity is continuous."""
-        times = np.asarray(times_s, dtype=np.float64)
-        if not smooth or len(self.times_s) == 1:
-            linear: Array = np.interp(times, self.times_s, self.openings)  # Zhang 2021, eq. 6
-            return linear
-        within = np.clip(times, self.times_s[0], self.times_s[-1])
-        curve: Array = PchipInterpolator(self.times_s, self.openings)(within)
-        return np.clip(curve, 0.0, MAX_OPENING)
+    def openings_at(self, times_s: ArrayLike) -> Array:
+        """Return R (n,) at times (n,)."""
+        times = np.asarray(times_s)
+        openings: Array = np.interp(times, self.times_s, self.openings)  # Zhang 2021, eq. 6
+        return openings
 
 
 def anchors_of(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]:
