@@ -4,6 +4,7 @@ import * as THREE from "three";
 
 const MIN_FRACTION = 0.1; // fraction of the largest displacement; vertices that move less are not in the region
 const MAX_HEAD = 3; // height of a head, relative to the region from chin to brows
+const MAX_NECK = 0.9; // part of a head below its chin, relative to the same region
 const MAX_TALL = 2; // height of a head whose mesh also has a body, relative to the same region
 const MAX_TALL_OF_MOUTH = 5; // the same, relative to the region of shapes that move only the mouth
 const MAX_TILT = 0.17; // angle between the eyes and the x axis that is not corrected
@@ -59,8 +60,12 @@ export class FaceRegion {
     const whole = new THREE.Box3();
     for (const mesh of new Set(this.#parts.map((part) => part.mesh))) whole.expandByObject(mesh);
     const height = sizeOf(moved).y;
-    if (height === 0 || sizeOf(whole).y <= MAX_HEAD * height) return { center: centerOf(whole), height: sizeOf(whole).y };
-    const limit = this.#parts.every(({ shape }) => isMouth(shape)) ? MAX_TALL_OF_MOUTH : MAX_TALL;
+    const isMouthOnly = this.#parts.every(({ shape }) => isMouth(shape));
+    const neck = isMouthOnly ? 0 : moved.min.y - whole.min.y; // or the body of a figure with a large head
+    if (height === 0 || (sizeOf(whole).y <= MAX_HEAD * height && neck <= MAX_NECK * height)) {
+      return { center: centerOf(whole), height: sizeOf(whole).y };
+    }
+    const limit = isMouthOnly ? MAX_TALL_OF_MOUTH : MAX_TALL;
     const center = centerOf(moved);
     moved.max.y = Math.min(whole.max.y, moved.min.y + limit * height);
     center.y = centerOf(moved).y;

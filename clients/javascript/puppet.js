@@ -187,14 +187,10 @@ function vrmAvatar(vrm, meshes) {
   const shapes = findShapes(set, names);
   const turnsEyes = speaking?.turnsEyes || [...shapes.values()].some((shape) => shape.startsWith("eyeLook"));
   const lookAt = !turnsEyes && vrm.lookAt?.applier instanceof VRMLookAtBoneApplier ? vrm.lookAt : null;
-  const head = vrm.humanoid.getRawBoneNode("head");
-  const target = head.getWorldPosition(new THREE.Vector3());
-  const faceHeight = VRM_FACE_M * head.getWorldScale(new THREE.Vector3()).y;
-  target.y += faceHeight / 4; // the bone is at the end of the neck
   return {
     scene: vrm.scene,
     set,
-    view: { target, height: VIEW_HEIGHT * faceHeight },
+    view: speaking?.view ?? viewOfHead(vrm, expressions, shapes),
     pose(weights, shapeNames) {
       speaking?.pose(weights, shapeNames);
       const weightOf = new Map(shapeNames.map((name, i) => [name, weights[i]]));
@@ -205,6 +201,24 @@ function vrmAvatar(vrm, meshes) {
       vrm.update(seconds);
     },
   };
+}
+
+/** Return the view of the face that expressions move; if they only change materials, above the neck. */
+function viewOfHead(vrm, expressions, shapes) {
+  const targets = expressions.flatMap(({ expressionName, binds }) => {
+    const shape = shapes.get(expressionName);
+    const moved = shape === undefined ? [] : binds.filter(({ primitives }) => primitives !== undefined);
+    return moved.flatMap(({ primitives, index }) => primitives.map((mesh) => ({ mesh, index, shape })));
+  });
+  if (targets.length > 0) {
+    const { center, height } = new FaceRegion(targets).bounds;
+    return { target: center, height: VIEW_HEIGHT * height };
+  }
+  const head = vrm.humanoid.getRawBoneNode("head");
+  const target = head.getWorldPosition(new THREE.Vector3());
+  const height = VRM_FACE_M * head.getWorldScale(new THREE.Vector3()).y;
+  target.y += height / 4; // the bone is at the end of the neck
+  return { target, height: VIEW_HEIGHT * height };
 }
 
 /** Return whether a bind of an expression moves vertices or changes a material. */

@@ -93,6 +93,17 @@ def column(shapes: list[str]) -> Mesh:
     return Mesh("Body", points, np.arange(12).reshape(4, 3), dict.fromkeys(shapes, moved))
 
 
+def chibi() -> Mesh:
+    """Make a figure with a large head, from the floor to the top of the head at 1 m."""
+    heights = np.repeat([0, 0.42, 0.85, 1.0], 3)
+    points = np.stack([np.tile([-0.1, 0.1, 0], 4), heights, np.tile([0, 0, 0.1], 4)], axis=1)
+    targets = {
+        name: np.outer(heights == height, [0, -0.02, 0])
+        for name, height in zip(ARKIT, (0.42, 0.42, 0.85, 0.85), strict=True)
+    }
+    return Mesh("Body", points, np.arange(12).reshape(4, 3), targets)
+
+
 def change(path: Path, kind: str) -> None:
     if kind.startswith("jaw bone"):
         bones = [{"name": "CC_Base_Head"}, {"name": "CC_Base_JawRoot"}]
@@ -108,8 +119,8 @@ def change(path: Path, kind: str) -> None:
         document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
     elif kind == "no effect":
         binary[:] = bytes(len(binary))
-    elif kind == "empty expressions":
-        add_humanoid(document)
+    elif kind in ("empty expressions", "expressions"):
+        add_humanoid(document, num_expressions=5 if kind == "expressions" else 0)
     elif kind == "cut off":
         path.write_bytes(path.read_bytes()[:-100])
         return
@@ -132,8 +143,12 @@ def change(path: Path, kind: str) -> None:
     write_chunks(path, document, binary)
 
 
-def add_humanoid(document: dict[str, Any]) -> None:
-    """Make a VRM in centimeters whose expressions move nothing, as some exporters write."""
+def add_humanoid(document: dict[str, Any], num_expressions: int) -> None:
+    """Make a VRM in centimeters. Without expressions, "aa" moves nothing, as in some files."""
+    presets = {
+        name: {"morphTargetBinds": [{"node": 0, "index": index, "weight": 1}]}
+        for index, name in enumerate(("aa", "ih", "ou", "ee", "oh")[:num_expressions])
+    }
     bones = {"head": len(document["nodes"])}
     limbs = {"Arm": ("UpperArm", "LowerArm", "Hand"), "Leg": ("UpperLeg", "LowerLeg", "Foot")}
     names = [
@@ -151,7 +166,7 @@ def add_humanoid(document: dict[str, Any]) -> None:
             "specVersion": "1.0",
             "meta": {"name": "x", "authors": ["x"], "licenseUrl": "https://vrm.dev/licenses/1.0/"},
             "humanoid": {"humanBones": {bone: {"node": node} for bone, node in bones.items()}},
-            "expressions": {"preset": {"aa": {"morphTargetBinds": []}}},
+            "expressions": {"preset": {"aa": {"morphTargetBinds": []}} | presets},
         }
     }
 
@@ -164,6 +179,8 @@ FILES: dict[str, tuple[list[Mesh], str]] = {
     "vowels": (face(VOWELS), ""),
     **{kind: (face(ARKIT), kind) for kind in TURNS},
     "vrm": (face(VOWELS), "empty expressions"),
+    "large head": ([box("Head", (0, 0.7, 0), 0.6, VOWELS)], "expressions"),
+    "chibi": ([chibi()], ""),
     "body": ([column(VOWELS)], ""),
     "no effect": (face(ARKIT), "no effect"),
     "cut off": (face(ARKIT), "cut off"),
@@ -217,6 +234,15 @@ def test_frames_the_head_and_not_an_eye(
     assert found[name]["height"] == pytest.approx(0.48, abs=0.05)
 
 
+def test_frames_the_large_head_of_a_small_figure(found: dict[str, dict[str, Any]]) -> None:
+    vrm, chibi = found["large head"], found["chibi"]
+    assert vrm["set"] == "vrm"
+    assert vrm["target"] == pytest.approx([0, 70, 0], abs=1)  # it is in centimeters
+    assert vrm["height"] == pytest.approx(1.6 * 90, abs=1)  # with the moved chin
+    assert chibi["target"] == pytest.approx([0, 0.71, 0.05], abs=0.01)
+    assert chibi["height"] == pytest.approx(1.6 * 0.6, abs=0.01)
+
+
 def test_the_jaw_bone_turns_only_for_parts_without_shapes(
     found: dict[str, dict[str, Any]],
 ) -> None:
@@ -243,7 +269,7 @@ def test_a_vrm_speaks_by_morph_targets_if_its_expressions_move_nothing(
 ) -> None:
     assert found["vrm"]["set"] == "vrm"
     assert found["vrm"]["opening"] == 1
-    assert found["vrm"]["height"] == pytest.approx(38.4)  # in centimeters
+    assert found["vrm"]["height"] == pytest.approx(48.0)  # in centimeters
 
 
 @pytest.mark.parametrize(
