@@ -98,6 +98,7 @@ def test_splits_a_syllable_into_phones() -> None:
         ("2024-01-02世", "二零二四年一月二日世"),
         ("(021)55556666，010 6552 9988", "零二一五五五五六六六六零一零六五五二九九八八"),
         ("编号0123，6222021234567890", "编号零一二三六二二二零二一二三四五六七八九零"),
+        ("12：30分，9:05分，.5米，6*7", "十二点三十分九点零五分零点五米六乘七"),
         ("1.2.3版，9·11，08:05，0.25", "一点二点三版九一一八点零五分零点二五"),
     ],
 )
@@ -111,6 +112,8 @@ def test_reads_numbers(text: str, read: str) -> None:
         ("音樂、重慶", "yin1 yue4 chong2 qing4"),
         ("睡覺，銀行行長", "shui4 jiao4 yin2 hang2 hang2 zhang3"),
         ("看著，著名，頭髮乾", "kan4 zhe5 zhu4 ming2 tou2 fa4 gan4"),
+        ("慢慢地走，认真地说", "man4 man4 de5 zou3 ren4 zhen1 de5 shuo1"),
+        ("这块地很大，当地", "zhe4 kuai4 di4 hen3 da4 dang1 di4"),
         ("nǐhǎo, péngyou", "ni3 hao3 peng2 you"),
         ("fāngàn fāng'àn", "fan1 gan4 fang1 an4"),
         ("ni3hao3 hua1r5 hui4 r5", "ni3 hao3 hua1 r5 hui4 r5"),
