@@ -117,30 +117,34 @@ export class Decoder {
 
   /** Store the phones that all paths share, and drop records that no path needs. */
   dropRecords() {
-    const places = [];
-    for (let token = 0; token < this.numTokens; token++) {
-      for (let state = 0; state < this.#maxStates; state++) {
-        const place = token * this.#maxStates + state;
-        if (this.#score[place] > this.#c.IMPOSSIBLE) places.push(place);
-      }
+    const [records, link, score] = [this.records, this.#link, this.#score];
+    const { IMPOSSIBLE } = this.#c;
+    const numPlaces = this.numTokens * this.#maxStates;
+    const paths = new Int32Array(records.length);
+    let numPaths = 0;
+    for (let place = 0; place < numPlaces; place++) {
+      if (score[place] <= IMPOSSIBLE) continue;
+      numPaths++;
+      if (link[place] !== NO_RECORD) paths[link[place]]++;
     }
-    const paths = new Int32Array(this.records.length);
-    for (const place of places) if (this.#link[place] !== NO_RECORD) paths[this.#link[place]]++;
-    for (let record = paths.length - 1; record >= 0; record--) {
-      const { before } = this.records[record];
-      if (paths[record] && before !== NO_RECORD) paths[before] += paths[record];
+    for (let number = paths.length - 1; number >= 0; number--) {
+      const { before } = records[number];
+      if (before !== NO_RECORD) paths[before] += paths[number];
     }
-    const shared = paths.lastIndexOf(places.length);
+    const shared = paths.lastIndexOf(numPaths);
     this.shared.push(...this.#trace(shared));
-    const numberOf = new Int32Array(this.records.length).fill(NO_RECORD);
-    const kept = [];
-    this.records.forEach((record, number) => {
-      if (!paths[number] || number < shared) return;
-      numberOf[number] = kept.length;
-      kept.push({ ...record, before: record.before === NO_RECORD ? NO_RECORD : numberOf[record.before] });
-    });
-    this.records = kept;
-    for (const place of places) if (this.#link[place] !== NO_RECORD) this.#link[place] = numberOf[this.#link[place]];
+    const numberOf = new Int32Array(records.length).fill(NO_RECORD);
+    let numKept = 0;
+    for (let number = Math.max(shared, 0); number < paths.length; number++) {
+      if (!paths[number]) continue;
+      const { end, phone, before } = records[number];
+      numberOf[number] = numKept;
+      records[numKept++] = { end, phone, before: before === NO_RECORD ? NO_RECORD : numberOf[before] };
+    }
+    records.length = numKept;
+    for (let place = 0; place < numPlaces; place++) {
+      if (score[place] > IMPOSSIBLE && link[place] !== NO_RECORD) link[place] = numberOf[link[place]];
+    }
     this.lastShared = shared === NO_RECORD ? NO_RECORD : numberOf[shared];
   }
 

@@ -68,14 +68,16 @@ export class LogMel {
    * transformed (Cooley & Tukey 1965). The columns are real, so half of their transform is enough.
    */
   #powers(samples) {
-    const [root, windowed, real, imaginary] = [this.#root, this.#windowed, this.#real, this.#imaginary];
+    const [size, root, windowed, window] = [this.#size, this.#root, this.#windowed, this.#window];
+    const [real, imaginary, power] = [this.#real, this.#imaginary, this.#power];
     const { cosines, sines } = this.#columns;
     const { cosines: rotationCosines, sines: rotationSines } = this.#rotations;
     const half = root / 2;
-    for (let i = 0; i < windowed.length; i++) windowed[i] = this.#window[i] * samples[i];
+    for (let i = 0; i < size; i++) windowed[i] = window[i] * samples[i];
     for (let column = 0; column < root; column++) {
       for (let k = 0; k <= half; k++) {
-        let [re, im] = [0, 0];
+        let re = 0;
+        let im = 0;
         for (let n = 0, at = column, wave = k * root; n < root; n++, at += root, wave++) {
           re += windowed[at] * cosines[wave];
           im -= windowed[at] * sines[wave];
@@ -88,23 +90,22 @@ export class LogMel {
     for (let k = 0; k <= half; k++) {
       for (let row = 0; row < half; row++) {
         // even and odd terms; in the bin half of the rows later, the odd terms have the opposite sign
-        let [evenReal, evenImaginary, oddReal, oddImaginary] = [0, 0, 0, 0];
+        let evenReal = 0;
+        let evenImaginary = 0;
+        let oddReal = 0;
+        let oddImaginary = 0;
         for (let n = 0, at = k * root, wave = row * root; n < half; n++, at += 2, wave += 2) {
           evenReal += real[at] * cosines[wave] + imaginary[at] * sines[wave];
           evenImaginary += imaginary[at] * cosines[wave] - real[at] * sines[wave];
           oddReal += real[at + 1] * cosines[wave + 1] + imaginary[at + 1] * sines[wave + 1];
           oddImaginary += imaginary[at + 1] * cosines[wave + 1] - real[at + 1] * sines[wave + 1];
         }
+        // the upper half of the spectrum mirrors the lower half
         const bin = k + root * row;
-        this.#setPower(bin, (evenReal + oddReal) ** 2 + (evenImaginary + oddImaginary) ** 2);
-        this.#setPower(bin + this.#size / 2, (evenReal - oddReal) ** 2 + (evenImaginary - oddImaginary) ** 2);
+        power[bin] = (evenReal + oddReal) ** 2 + (evenImaginary + oddImaginary) ** 2;
+        power[size / 2 - bin] = (evenReal - oddReal) ** 2 + (evenImaginary - oddImaginary) ** 2;
       }
     }
-    return this.#power;
-  }
-
-  /** Set the power of a bin; the upper half of the spectrum mirrors the lower half. */
-  #setPower(bin, power) {
-    this.#power[Math.min(bin, this.#size - bin)] = power;
+    return power;
   }
 }
