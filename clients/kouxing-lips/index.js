@@ -303,5 +303,5 @@ function sourceNode(context, source) {
     if (!elementNodes.has(source)) elementNodes.set(source, new MediaElementAudioSourceNode(context, { mediaElement: source }));
     return Object.assign(elementNodes.get(source), { isPlayed: true });
   }
-  throw new TypeError("expected a MediaStream, a track, an AudioBuffer, an audio element or an audio node");
+  throw new TypeError("expected a MediaStream, a track, an AudioBuffer, an <audio> or <video> element, or an audio node");
 }

@@ -4,17 +4,19 @@ import { LipEngine } from "./engine/engine.js";
 import { loadModel } from "./engine/model.js";
 
 let model = null; // a promise
-let engine = null;
+let engine = null; // of the newest session
 let port = null; // port of the audio thread
 
 self.onmessage = async ({ data: { type, ...data } }) => {
   try {
+    if (NEED_SESSION.includes(type) && !engine) throw new Error("no sound is open; call open() or listenTo() first");
     await HANDLERS[type](data);
   } catch (error) {
     self.postMessage({ type: "error", text: error.message });
   }
 };
 
+const NEED_SESSION = ["push", "finish", "express"];
 const HANDLERS = {
   /** Load the models. */
   async load({ models, phones }) {

@@ -196,6 +196,15 @@ def test_notices_about_the_microphone_and_the_tab(browser: Browser, site: Path) 
         wait_for_notice("the microphone was unplugged")
 
 
+def test_calls_without_sound_give_a_sentence(browser: Browser, site: Path) -> None:
+    text = "no sound is open; call open() or listenTo() first"
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        browser.evaluate("window.lips.push(new Float32Array(320)); 1")
+        browser.wait_for(f"window.notices.includes('{text}')")
+        assert browser.evaluate("window.lips.finish().catch(({ message }) => message)") == text
+
+
 def test_a_source_that_another_one_replaces_is_reported(browser: Browser, site: Path) -> None:
     with serve_folder(site) as origin:
         open_demo(browser, origin)
