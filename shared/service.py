@@ -425,8 +425,8 @@ class Service(MessageLoop):
         self.clock_offset.update(reply.sent_ns, reply.received_ns, reply.replied_ns, now_ns())
         if not self._control_instance:
             self._log_ready()
-        has_restarted = self._control_instance not in ("", reply.control)
-        self._control_instance = reply.control
+        has_restarted = self._control_instance not in ("", reply.control_instance)
+        self._control_instance = reply.control_instance
         if reply.keys is not None:
             self._allow_keys(reply.keys)
         if has_restarted:

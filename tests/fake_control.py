@@ -192,7 +192,7 @@ class FakeControl:
             sent_ns=beat.sent_ns,
             received_ns=beat.sent_ns,
             replied_ns=beat.sent_ns,
-            control=self.name,
+            control_instance=self.name,
         )
         self.commands.send(reply, to=sender)
         self.heartbeats.append(beat)

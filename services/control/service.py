@@ -247,7 +247,7 @@ class ControlService(Service):
             sent_ns=heartbeat.sent_ns,
             received_ns=received_ns,
             replied_ns=now_ns(),
-            control=self._process_id,
+            control_instance=self._process_id,
             keys=self._requests.changed_keys(heartbeat),
         )
         self._commands.send(reply, to=sender)

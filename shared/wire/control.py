@@ -96,7 +96,7 @@ class HeartbeatReply(Message, frozen=True, kw_only=True):
     sent_ns: int  # as in the heartbeat
     received_ns: int  # control's clock
     replied_ns: int  # control's clock
-    control: Name  # generated when control starts; when it changes, control has restarted
+    control_instance: Name  # generated when control starts; when it changes, control has restarted
     keys: Annotated[dict[Name, AllowedKey], Meta(max_length=MAX_KEYS)] | None = (
         None  # keys that may connect to the worker, by public key; None: as before
     )

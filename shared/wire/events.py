@@ -76,8 +76,8 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
                 pitch_hz=event.pitch_hz or None,
                 arousal=event.arousal,
                 valence=event.valence,
-                is_laughter=event.is_laughter,
-                is_breath=event.is_breath,
+                laughter=event.is_laughter,
+                breath=event.is_breath,
             )
         case events.AudioSkipped():
             return Progress(media_time=to_samples(event.time_s), state=AudioState.SKIPPED)
@@ -125,6 +125,6 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
                 pitch_hz=message.pitch_hz or 0.0,
                 arousal=message.arousal,
                 valence=message.valence,
-                is_laughter=message.is_laughter,
-                is_breath=message.is_breath,
+                is_laughter=message.laughter,
+                is_breath=message.breath,
             )

@@ -95,8 +95,8 @@ class Progress(Message, frozen=True, kw_only=True):
     pitch_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # None: unvoiced
     arousal: Feeling = 0.0  # arousal in the voice, relative to the speaker's mean
     valence: Feeling = 0.0  # valence, relative to the speaker's mean; below 0: unpleasant
-    is_laughter: bool = False  # laughter, which is not speech
-    is_breath: bool = False  # audible breath
+    laughter: bool = False  # laughter, which is not speech
+    breath: bool = False  # audible breath
     # Newest frame of the lost synthesizer; the new one continues after it. In the first message of
     # an epoch
     newest_frame: NewestFrame | None = None

@@ -63,7 +63,9 @@ def test_heartbeats_of_a_wrong_clock_count(clock_ns: int) -> None:
     assert isinstance(heartbeat, Heartbeat)
     wrong = replace(heartbeat, sent_ns=clock_ns)
     assert decode(encode(wrong)) == wrong
-    reply = HeartbeatReply(sent_ns=clock_ns, received_ns=-1, replied_ns=clock_ns, control="c")
+    reply = HeartbeatReply(
+        sent_ns=clock_ns, received_ns=-1, replied_ns=clock_ns, control_instance="c"
+    )
     assert decode(encode(reply)) == reply
 
 

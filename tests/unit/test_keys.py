@@ -221,7 +221,9 @@ def test_rejects_too_many_keys_but_revokes_them(
     allowed.write_text(text + "".join(lines[:number]), encoding="ascii")
     grants = read_grants().items()
     keys = {public: AllowedKey(name=one.name, roles=list(one.roles)) for public, one in grants}
-    reply = HeartbeatReply(sent_ns=0, received_ns=0, replied_ns=0, control="control-1", keys=keys)
+    reply = HeartbeatReply(
+        sent_ns=0, received_ns=0, replied_ns=0, control_instance="control-1", keys=keys
+    )
     assert sum(map(len, encode(reply))) < MAX_MESSAGE_BYTES
     allowed.write_text(text + "".join(lines), encoding="ascii")
     with pytest.raises(UserError, match=f"{allowed}: .*revoke some with 'kouxing keys revoke'"):

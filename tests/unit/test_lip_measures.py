@@ -189,7 +189,7 @@ def test_louder_clips_have_wider_and_faster_lips() -> None:
     for gain, extent in ((1.0, 100.0), (2.0, 300.0), (3.0, 200.0)):
         clip = reference(mouth())
         louder = replace(clip, clip=replace(clip.clip, samples=gain * clip.clip.samples))
-        takes.append(Take(louder, mouth_of(extent * (np.arange(200.0) % 2))))
+        takes.append(ScoredClip(louder, mouth_of(extent * (np.arange(200.0) % 2))))
     level_db = 20 * np.log10([1.0, 2.0, 3.0])
     r_db = np.corrcoef(level_db, [100.0, 300.0, 200.0])[0, 1]
     assert effort.effort_correlation(takes) == pytest.approx(r_db)
