@@ -81,8 +81,8 @@ class EncodingCheck:
     def check(self, message: bytes) -> None:
         """Check a message of any length.
 
-        Raises ``UserError`` if the data has another encoding; the text names the likely one. All
-        later messages are then refused, too.
+        Raises ``UserError`` if the data has another encoding; the text names the likely one. Then
+        all later messages are also refused.
         """
         if self._is_done or not message:
             return

@@ -48,7 +48,7 @@ def address_of(descriptor: int) -> str:
 
 
 def port_of(descriptor: int) -> int:
-    """Return the local port, 0 if there is none."""
+    """Return the local port, or 0 if the socket has no port."""
     with contextlib.suppress(OSError), _borrow_socket(descriptor) as connection:
         name = connection.getsockname()
         return int(name[1]) if isinstance(name, tuple) else 0

@@ -56,7 +56,7 @@ class Comparison:
     opening_correlation: dict[str, float | None]
     closure_f1: dict[str, float | None]
     num_recordings: int
-    # by acoustic model; "difference" is that of the package from the server
+    # by acoustic model; "difference" is between package and server
     phone_error_rate: dict[str, dict[str, float]]
 
 
@@ -119,7 +119,7 @@ def server_events(samples: Samples, acoustic: str = "light") -> list[SoundEvent]
 def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> Faps:
     """Return the server's frames (F, 68), without idle motion.
 
-    ``feeling`` replaces that of the default settings.
+    ``feeling`` replaces the default setting.
     """
     settings = SynthesizerConfig()
     face = FaceAnimator(

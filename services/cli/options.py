@@ -81,7 +81,7 @@ class CurveFormat(StrEnum):
 
 
 class ListenFormat(StrEnum):
-    """Values that ``kouxing listen`` prints or records: those of ``CurveFormat``, and speech."""
+    """Values that ``kouxing listen`` prints or records: ``CurveFormat``, and speech."""
 
     FAPS = CurveFormat.FAPS
     ARKIT = CurveFormat.ARKIT
