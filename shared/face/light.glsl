@@ -24,6 +24,7 @@ const vec3 SKY = vec3(0.36, 0.38, 0.42);
 const vec3 GROUND = vec3(0.17, 0.14, 0.125);
 const float SHOULDER = 0.22; // how much bright light is compressed, so that it does not clip
 const float GLOSS = 14.0; // of a color per difference of red and green
+const float STRANDS = 1.8; // of a hair texture's squared gray; its mean reflects fully
 const vec3 CROWN = vec3(0.0, 0.97, -0.24);
 // reflections in the eyes; lower than the key light, because the lid would hide them
 const vec3 WINDOW = vec3(-0.36, 0.34, 0.87);
@@ -65,7 +66,7 @@ vec3 shaded(vec3 texel, vec3 light, float high) {
     light *= mix(0.70, 0.96, smoothstep(0.60, 0.66, strength)) / max(strength, 0.25);
     high = 0.0;
   }
-  high *= 1.0 + GLOSS * max(texel.r - texel.g - 0.23, 0.0); // lips are wet
+  high *= strands ? STRANDS * texel.g * texel.g : 1.0 + GLOSS * max(texel.r - texel.g - 0.23, 0.0); // lips are wet
   return sqrt(min(texel * texel * light + high, 1.0));
 }
 

@@ -137,5 +137,9 @@ def test_a_head_is_small_and_has_soft_hair_and_fine_skin(name: str, tmp_path: Pa
     materials = {material["name"]: material for material in document["materials"]}
     assert materials["hair"]["alphaMode"] == "MASK"
     assert materials["lashes"]["alphaMode"] == materials["brows"]["alphaMode"] == "BLEND"
+    if heads.load(name).cel:
+        assert "KHR_materials_unlit" in materials["skin"]["extensions"]
+        assert "KHR_materials_unlit" not in materials["eye_left"]["extensions"]
+        return
     relief = document["textures"][materials["skin"]["normalTexture"]["index"]]
     assert document["images"][relief["source"]]["name"] == "skin_normal"

@@ -53,10 +53,13 @@ LEFT_LOWER_LID = (
 _SIDES = ("Left", "Right")
 _PAINTED_HAIR = "large/young_caucasian_female_special_suit.png"
 _HAIR_TEXTURES = {"afro01": "afro"}
-# styles with a fringe over the right eye, and its distance from the head's axis at the side, dm
-_FRINGES = {"bob01": 0.73, "bob02": 0.73}
+# styles with a fringe over the right eye: its distance from the head's axis at the side, dm, and by
+# what fraction it is lifted off the forehead
+_FRINGES = {"bob01": (0.73, 0.0), "bob02": (0.73, 0.03)}
 _SOFT_EDGE = 7  # texels across the edges of strands that may blend
 _COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
+# quads; smaller strands of these styles hang in front of the skin, and are removed
+_LOOSE_STRANDS = {"bob01": 60, "bob02": 60, "short04": 10}
 _SWEEP = 0.62  # fraction of the angle to the right ear by which it is turned
 _BROW_RAISE = 0.016  # how far the inner ends rise, dm
 _WIDEST_HAIR = 5.9  # height, dm
@@ -235,42 +238,27 @@ class Builder:
         crown = 1 + person.crown * np.sin(np.pi * np.clip(height, 0, 1) ** 1.7)
         points[:, 0] *= person.hair_width * crown
         if person.hair in _FRINGES:
-            points = self._swept_aside(points, vertices, _FRINGES[person.hair])
+            points = self._swept_aside(points, vertices, *_FRINGES[person.hair])
         quads, uv, welds = hair.quads, hair.uv, hair.welds
-        coarse, num_coarse = None, 0
+        if person.hair in _LOOSE_STRANDS:
+            size = subdivision.patch_sizes(welds[quads])
+            quads = quads[size >= _LOOSE_STRANDS[person.hair]]
         if len(quads) < _COARSE_HAIR:
             points, quads, uv, welds = subdivision.smooth_strands(points, quads, uv, welds)
-            # the corners of the coarse quads come first
-            used = np.unique(quads[:, 0])
-            order = np.concatenate([used, np.setdiff1d(np.arange(len(points)), used)])
-            number = np.argsort(order)
-            points, quads, uv = points[order], number[quads], uv[order]
-            welds = number[welds[order]]
-            coarse, num_coarse = quads[:, 0].reshape(-1, 4), len(used)
+        triangles = subdivision.triangles_of(quads)
+        triangles = triangles[(textures.sample_alpha(triangles, uv, alpha) > 0.25).any(axis=1)]
+        inner = ndimage.minimum_filter(alpha, _SOFT_EDGE)
+        opaque = (textures.sample_alpha(triangles, uv, inner) > 0.9).all(axis=1)
+        middle = points[triangles].mean(axis=1) - PIVOT
+        outward = np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2]
+        triangles = triangles[np.lexsort([np.where(opaque, -outward, outward), ~opaque])]
+        used, triangles, welds = subdivision.used_vertices(triangles, welds)
+        color = np.tile(textures.tint(person.look.hair), (len(used), 1))
+        part = parts.Geometry(points[used], triangles, uv[used], color, welds)
+        return HeadPiece("hair", part, "hair", 0.6, np.ones(len(used)))
 
-        def order_triangles(quads: Index) -> Index:
-            triangles = subdivision.triangles_of(quads)
-            triangles = triangles[(textures.sample_alpha(triangles, uv, alpha) > 0.25).any(axis=1)]
-            inner = ndimage.minimum_filter(alpha, _SOFT_EDGE)
-            opaque = (textures.sample_alpha(triangles, uv, inner) > 0.9).all(axis=1)
-            middle = points[triangles].mean(axis=1) - PIVOT
-            outward = np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2]
-            return triangles[np.lexsort([np.where(opaque, -outward, outward), ~opaque])]
-
-        color = np.tile(textures.tint(person.look.hair), (len(points), 1))
-        part = parts.Geometry(points, order_triangles(quads), uv, color, welds)
-        return HeadPiece(
-            "hair",
-            part,
-            "hair",
-            0.6,
-            np.ones(len(points)),
-            coarse_vertices=num_coarse,
-            coarse_triangles=None if coarse is None else order_triangles(coarse),
-        )
-
-    def _swept_aside(self, points: Float, vertices: Float, width: float) -> Float:
-        """Turn a fringe that covers the right eye to the side of the head."""
+    def _swept_aside(self, points: Float, vertices: Float, width: float, lifted: float) -> Float:
+        """Turn a fringe that covers the right eye to the side, and lift it off the forehead."""
         eye = eye_centers(vertices, self._mesh)[1]
         x, y, z = points.T
         depth = z - paint.AXIS_Z
@@ -285,7 +273,13 @@ class Builder:
 
         radius = np.hypot(x, depth) * reach(turned) / reach(turn)
         swept = np.stack([radius * np.sin(turned), y, paint.AXIS_Z + radius * np.cos(turned)], 1)
-        return np.where((swept_part > 0)[:, None], swept, points)
+        swept = np.where((swept_part > 0)[:, None], swept, points)
+        x, depth = swept[:, 0], swept[:, 2] - paint.AXIS_Z
+        front = np.clip((1.3 - np.abs(np.arctan2(x, depth) + 0.2)) / 0.5, 0, 1)
+        above = y - eye[1]
+        front *= np.clip((1.0 - above) / 0.4, 0, 1) * np.clip((above + 0.2) / 0.3, 0, 1)
+        outward = (lifted * front)[:, None] * np.stack([x, np.zeros_like(x), depth], axis=1)
+        return np.asarray(swept + outward)
 
     def _brows(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the brows, and raise their inner ends; they follow the skin below them."""
@@ -410,7 +404,9 @@ class Builder:
             "brows": encode(
                 textures.hairs(load(f"eyebrows/{brows}/{brows}.png"), look.brow_strength)
             ),
-            "lashes": encode(textures.hairs(load(f"eyelashes/{lashes}/{lashes}.png", 256), 1.0)),
+            "lashes": encode(
+                textures.hairs(load(f"eyelashes/{lashes}/{lashes}.png", 256), look.lash_strength)
+            ),
         }
 
     def _roots(self, skin: Skin, hair: HeadPiece) -> Float:

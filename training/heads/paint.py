@@ -108,6 +108,7 @@ class Look:
     age: float = 0.0  # wrinkles and spots
     iris: Color = (0.36, 0.22, 0.13)
     iris_size: float = 1.0
+    lash_strength: float = 1.0
     lash_line: float = 1.0  # width of the dark edge of the upper lid
     cloth: Color = (0.20, 0.29, 0.38)
     cel: bool = False  # cel shading: plain colors, light and shade

@@ -6,6 +6,7 @@ Computer-Aided Design 10(6), 1978.
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse import csgraph
 
 from kouxing.services.driver.head.surface import Float, Index, edges_of
 
@@ -104,6 +105,14 @@ def used_vertices(triangles: Index, welds: Index) -> tuple[Index, Index, Index]:
     used, corners = np.unique(triangles, return_inverse=True)
     _, first, same = np.unique(welds[used], return_index=True, return_inverse=True)
     return used, corners.reshape(-1, 3), first[same]
+
+
+def patch_sizes(quads: Index) -> Index:
+    """Return for each quad (F, 4) the number of quads that are connected to it."""
+    corner, quad = quads.ravel(), np.repeat(np.arange(len(quads)), 4)
+    incidence = _incidence(corner, quad, (quads.max() + 1, len(quads)))
+    _, patch = csgraph.connected_components(incidence.T @ incidence, directed=False)
+    return np.asarray(np.bincount(patch)[patch])
 
 
 def vertex_normals(vertices: Float, triangles: Index) -> Float:

@@ -255,7 +255,7 @@ def _part_node(
     primitive: dict[str, Any] = {
         "attributes": attributes,
         "indices": add_indices(triangles),
-        "material": document.add("materials", _material(part, textures)),
+        "material": document.add("materials", _material(part, textures, cel=head.cel)),
     }
     mesh: dict[str, Any] = {"name": part.name, "primitives": [primitive], "extras": {}}
     if len(coarse) < len(triangles):
@@ -269,7 +269,7 @@ def _part_node(
     return document.add("nodes", node)
 
 
-def _material(part: HeadPart, textures: dict[str, int]) -> dict[str, Any]:
+def _material(part: HeadPart, textures: dict[str, int], *, cel: bool) -> dict[str, Any]:
     wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
     material: dict[str, Any] = {
         "name": part.name,
@@ -285,12 +285,14 @@ def _material(part: HeadPart, textures: dict[str, int]) -> dict[str, Any]:
     elif part.transparent:
         material["alphaMode"] = "BLEND"
     relief = textures.get(f"{part.texture}_normal")
-    if relief is not None:
-        material["normalTexture"] = {"index": relief}
     if part.name in shaders.EYES:
         material["extensions"] = {
             "KHR_materials_clearcoat": {"clearcoatFactor": 1.0, "clearcoatRoughnessFactor": 0.03}
         }
+    elif cel:  # physical light would show folds that a drawing omits; shadows are in the colors
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    if relief is not None and not cel:
+        material["normalTexture"] = {"index": relief}
     if part.double_sided:
         material["doubleSided"] = True
     return material

@@ -94,7 +94,7 @@ const SHEEN = `vec3 light;
   float high;
   light_vertex(inverseTransformDirection(normal, viewMatrix),
     inverseTransformDirection(normalize(vViewPosition), viewMatrix), vColor.rgb, light, high);
-  totalEmissiveRadiance += high;`;
+  totalEmissiveRadiance += high * STRANDS * sampledDiffuseColor.g;`;
 const ADDED = { eye_left: WINDOW, eye_right: WINDOW, hair: SHEEN };
 
 /** Return a physical material for a part: subsurface scattering, wet eyes, glossy hair. */
