@@ -108,7 +108,7 @@ def used_vertices(triangles: Index, welds: Index) -> tuple[Index, Index, Index]:
 
 
 def patch_sizes(quads: Index) -> Index:
-    """Return for each quad (F, 4) the number of quads that are connected to it."""
+    """Return for each quad (F, 4) the size of its connected patch, in quads."""
     corner, quad = quads.ravel(), np.repeat(np.arange(len(quads)), 4)
     incidence = _incidence(corner, quad, (quads.max() + 1, len(quads)))
     _, patch = csgraph.connected_components(incidence.T @ incidence, directed=False)

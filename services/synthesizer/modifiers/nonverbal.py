@@ -28,6 +28,7 @@ from kouxing.shared.face.high_level import VISEME_NAMES, VISEMES
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
 _BREATH_OPENING = 0.3  # fraction of an open vowel's opening
 _LAUGH_OPENING = (0.12, 0.58)  # the same, in silence and added by the loudest notes
+_LAUGH_SQUINT = 0.5  # how far the lower lids rise, as a share of a squint
 _LAUGH_DEG, _BREATH_DEG = (-2.5, -2.0), -1.2  # the head's pitch; upwards
 _LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filter
 _LAUGH_EASE_S = 0.045  # time constant of each filter pole; notes remain visible
@@ -78,5 +79,9 @@ class NonverbalSounds:
 
 
 _BREATH = _breath()
-_SMILING = EXPRESSION_FAPS[ExpressionName.JOY] + _opened(_LAUGH_OPENING[0], _LAUGH_DEG[0])
+_SMILING = (
+    EXPRESSION_FAPS[ExpressionName.JOY]
+    + np.float32(_LAUGH_SQUINT) * EXPRESSION_FAPS[ExpressionName.SQUINT]
+    + _opened(_LAUGH_OPENING[0], _LAUGH_DEG[0])
+)
 _LOUD_NOTE = _opened(_LAUGH_OPENING[1], _LAUGH_DEG[1])
