@@ -53,8 +53,8 @@ LEFT_LOWER_LID = (
 _SIDES = ("Left", "Right")
 _PAINTED_HAIR = "large/young_caucasian_female_special_suit.png"
 _HAIR_TEXTURES = {"afro01": "afro"}
-# styles with a fringe over the right eye: its distance from the head's axis at the side, dm, and the
-# fraction by which it is lifted off the forehead
+# styles with a fringe over the right eye: its distance from the head's axis at the side, dm, and
+# the fraction by which it is lifted off the forehead
 _FRINGES = {"bob01": (0.73, 0.0), "bob02": (0.73, 0.03)}
 _SOFT_EDGE = 7  # texels across the edges of strands that may blend
 _COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
