@@ -7,7 +7,7 @@ const NUM_PHONES = 12; // on the page
 const AVATAR = /\.(vrm|glb)$/i;
 const byId = (id) => document.getElementById(id);
 const [face, note, voice] = [byId("face"), byId("note"), byId("phones")];
-let rivals = null; // [{ face, lips: input and FAPs }], while they are compared
+let comparison = null; // the newest one: { rivals: [{ face, lips: input and FAPs }], empty while they load }
 let followed = null; // audio node that the rivals follow
 
 for (const head of HEADS) {
@@ -34,7 +34,7 @@ byId("microphone").onclick = () =>
     setMicrophone(true);
   });
 byId("final").onclick = () => act(setFinalPhones);
-byId("compare").onclick = () => act(rivals ? stopComparing : startComparing);
+byId("compare").onclick = () => act(comparison ? stopComparing : startComparing);
 byId("sample").onclick = () => act((lips) => play(lips, "sample.wav"));
 byId("file").onchange = ({ target }) => {
   take(target.files[0]);
@@ -58,7 +58,7 @@ navigator.serviceWorker?.register("service-worker.js");
 /** Turn final phones on or off, which reloads the lip sync. */
 async function setFinalPhones(lips) {
   const isOn = byId("final").ariaPressed !== "true";
-  if (rivals) stopComparing();
+  if (comparison) stopComparing();
   lips.stop();
   setMicrophone(false);
   byId("final").ariaPressed = String(isOn);
@@ -102,55 +102,63 @@ async function prepare() {
 
 /** Show HeadAudio and wLipSync next to this package. */
 async function startComparing(lips) {
-  const { headAudio, wLipSync } = await import("./rivals.js");
-  const shown = [];
-  for (const [title, start] of Object.entries({ HeadAudio: headAudio, wLipSync })) {
-    const rival = Object.assign(document.createElement("kouxing-face"), { title });
-    rival.setAttribute("manual", "");
-    shown.push({ face: rival, lips: await start(lips.context) });
+  const started = { rivals: [] };
+  setComparison(started);
+  const rivals = [];
+  try {
+    const { headAudio, wLipSync } = await import("./rivals.js");
+    for (const [title, start] of Object.entries({ HeadAudio: headAudio, wLipSync })) {
+      const rival = Object.assign(document.createElement("kouxing-face"), { title });
+      rival.setAttribute("manual", "");
+      rivals.push({ face: rival, lips: await start(lips.context) });
+    }
+  } catch (error) {
+    if (comparison === started) setComparison(null);
+    throw error;
   }
-  const [first, second] = shown;
+  if (comparison !== started) return; // stopped in the meantime
+  const [first, second] = rivals;
   byId("faces").prepend(first.face);
   byId("faces").append(second.face);
-  rivals = shown;
-  setComparing();
-  showRivals(lips);
+  started.rivals = rivals;
+  setRivalHeads();
+  showRivals(lips, started);
 }
 
 function stopComparing() {
-  for (const { face: rival, lips: { node } } of rivals) {
+  for (const { face: rival, lips: { node } } of comparison.rivals) {
     rival.remove();
     followed?.disconnect(node);
   }
-  rivals = followed = null;
-  setComparing();
+  followed = null;
+  setComparison(null);
 }
 
-function setComparing() {
-  byId("compare").ariaPressed = String(rivals !== null);
-  document.body.classList.toggle("comparing", rivals !== null);
-  setRivalHeads();
+function setComparison(newest) {
+  comparison = newest;
+  byId("compare").ariaPressed = String(newest !== null);
+  document.body.classList.toggle("comparing", newest !== null);
 }
 
 /** Give the rivals the same head. FAPs move it, so an avatar cannot show them. */
 function setRivalHeads() {
   const head = face.getAttribute("src");
   const src = head.startsWith("heads/") ? head : `heads/${HEADS[0]}.glb`;
-  for (const { face: rival } of rivals ?? []) rival.setAttribute("src", src);
+  for (const { face: rival } of comparison?.rivals ?? []) rival.setAttribute("src", src);
 }
 
 /** Show the rivals' faces for each image, and let them follow the current source. */
-function showRivals(lips) {
-  if (rivals === null) return;
-  requestAnimationFrame(() => showRivals(lips));
+function showRivals(lips, shown) {
+  if (comparison !== shown) return;
+  requestAnimationFrame(() => showRivals(lips, shown));
   if (lips.node !== followed) {
-    for (const { lips: { node } } of rivals) {
+    for (const { lips: { node } } of shown.rivals) {
       followed?.disconnect(node);
       lips.node?.connect(node);
     }
     followed = lips.node;
   }
-  for (const { face: rival, lips: rivalLips } of rivals) rival.show(rivalLips.faps());
+  for (const { face: rival, lips: rivalLips } of shown.rivals) rival.show(rivalLips.faps());
 }
 
 /** Run an action on the lip sync; show its error message. */
