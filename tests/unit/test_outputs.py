@@ -17,7 +17,7 @@ from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
 from kouxing.services.driver.video.film import Frame
-from kouxing.services.driver.video.writer import PictureSequence
+from kouxing.services.driver.video.writer import PictureSequence, check_name
 from kouxing.shared.errors import UserError
 from kouxing.shared.output_file import open_output
 from kouxing.shared.terminal import check_output
@@ -222,6 +222,11 @@ def test_a_sequence_of_pictures_replaces_a_longer_one(tmp_path: Path) -> None:
     sequence.write_image(np.zeros((2, 2, 3), np.uint8))
     assert {path.name for path in tmp_path.iterdir()} == {*others, "face0000.png"}
     assert (tmp_path / "face0000.png").stat().st_size > 0
+
+
+def test_a_picture_has_one_number(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="a name with one number such as"):
+        check_name(tmp_path / "face%d%d.png")
 
 
 def test_an_error_names_the_folder_to_create(tmp_path: Path) -> None:

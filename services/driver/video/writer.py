@@ -108,10 +108,12 @@ def open_writer(
 
 def check_name(path: Path) -> None:
     """Raise ``UserError`` if a path is not a valid output in an existing folder."""
-    if path.suffix not in _FORMATS and not is_sequence(path):
+    if path.suffix not in _FORMATS and (
+        not is_sequence(path) or len(_NUMBER.findall(path.name)) > 1
+    ):
         raise UserError(
             f"{path}: use a name that ends in {', '.join(VIDEO_SUFFIXES)}, a folder,"
-            " or a name with a number such as face%05d.png"
+            " or a name with one number such as face%05d.png"
         )
     if not path.parent.is_dir():
         raise write_error(path, FileNotFoundError())
