@@ -15,7 +15,7 @@ import secrets
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar
 
@@ -41,11 +41,9 @@ from kouxing.shared.wire.control import (
     Heartbeat,
     HeartbeatReply,
     SessionInput,
-    SessionStarted,
-    StartSession,
 )
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession, SessionFacts
+from kouxing.shared.wire.session import Error, SessionFacts
 
 if TYPE_CHECKING:
     from kouxing.shared.prometheus import MetricsServer
@@ -132,29 +130,15 @@ class Service(MessageLoop):
         """Return the handlers of control's messages; subclasses add theirs."""
         return {
             HeartbeatReply: self._on_heartbeat_reply,
-            StartSession: self._on_start_session,
-            CloseSession: lambda message, _: self.stop_session(message.session),
-            FlushSession: lambda message, _: self.flush_session(message.session),
             Error: self.on_error,
         }
-
-    def start_session(self, start: StartSession) -> bool:
-        """Serve a session. Return False if ``session_started`` is called later."""
-        return True
-
-    def stop_session(self, session: str) -> None:
-        """Stop serving a session, if it exists."""
-
-    def flush_session(self, session: str) -> None:
-        """Drop audio of a session that is not yet shown."""
-
-    def served_sessions(self) -> Iterable[StartSession]:
-        """Return the sessions that a restarted control restores from this service."""
-        return ()
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return the input progress of each session."""
         return {}
+
+    def on_control_restart(self) -> None:
+        """React to a restart of control, which has forgotten what is not in heartbeats."""
 
     def gauges(self) -> dict[str, float]:
         """Return additional figures by name, for heartbeats and Prometheus."""
@@ -166,24 +150,12 @@ class Service(MessageLoop):
 
     # --- for subclasses to call ----------------------------------------------------------------
 
-    def session_started(self, start: StartSession, media_time: int = 0) -> None:
-        """Report that this service serves a session, whose phones are final up to a media time."""
-        self.send_to_control(
-            SessionStarted(session=start.session, request=start.request, media_time=media_time)
-        )
-
     def publish_event(
         self, name: EventName, session: str, detail: str = "", media_time: int = 0
     ) -> None:
         """Request control to publish an event about a session."""
         event = Event(session=session, name=name, detail=detail[:2000], media_time=media_time)
         self.send_to_control(event)
-
-    def report_skipped(self, session: str, skipped_s: float) -> None:
-        """Count and publish the duration of a live session's skipped audio, unless it is 0."""
-        if skipped_s > 0.0:
-            self.metrics.count("skipped_audio_ms", round(1e3 * skipped_s))
-            self.publish_event(EventName.AUDIO_SKIPPED, session, f"{skipped_s:.2f} s")
 
     def send_to_control(self, message: Message) -> None:
         """Send a message to control; do nothing in control itself."""
@@ -309,18 +281,6 @@ class Service(MessageLoop):
         """Log another service's error."""
         self.warn(error.code, error.text, error.session)
 
-    def _on_start_session(self, start: StartSession, _sender: Peer) -> None:
-        if self._exit_requested:
-            return
-        try:
-            heartbeat_due_s = time.monotonic() + HEARTBEAT_S
-            self._heartbeat_due_s = min(self._heartbeat_due_s, heartbeat_due_s)
-            if self.start_session(start):
-                self.session_started(start)
-        except UserError as error:
-            self.warn("start", str(error), start.session)
-            self.publish_event(EventName.ERROR, start.session, f"{ErrorCode.TIMEOUT}: {error}")
-
     def send_heartbeat_if_due(self) -> None:
         """Send a heartbeat if it is time; long work calls this in between."""
         now_s = time.monotonic()
@@ -430,10 +390,7 @@ class Service(MessageLoop):
         if reply.keys is not None:
             self._allow_keys(reply.keys)
         if has_restarted:
-            for start in self.served_sessions():
-                self.send_to_control(
-                    SessionStarted(session=start.session, request=start.request, start=start)
-                )
+            self.on_control_restart()
 
     def _allow_keys(self, keys: Mapping[str, AllowedKey]) -> None:
         """Accept only connections with these keys."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from kouxing_client.follower import Follower
 
-from kouxing.shared.service import Service
+from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.message import Message
@@ -23,7 +23,7 @@ class ServiceFollower(Follower):
 
     def __init__(
         self,
-        service: Service,
+        service: SessionService,
         session_start: StartSession,
         handlers: Mapping[type[Message], Callable[[Any], None]],
         *,
@@ -67,7 +67,7 @@ class ServiceFollower(Follower):
 class _ServiceTransport:
     """Subscribes with the sockets of a service."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: SessionService) -> None:
         self._service = service
         self._on_message: dict[Socket, Callable[[Any], None]] = {}
 

@@ -25,8 +25,8 @@ from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
-from kouxing.shared.service import Service
 from kouxing.shared.service_follower import ServiceFollower
+from kouxing.shared.session_service import SessionService
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
@@ -46,7 +46,7 @@ class _FollowedSession:
     leave_by_s: float | None = None  # set once the session has closed
 
 
-class DriverService(Service):
+class DriverService(SessionService):
     """The driver process."""
 
     kind = KIND

@@ -38,8 +38,8 @@ from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.records import replace
-from kouxing.shared.service import Service
 from kouxing.shared.service_follower import ServiceFollower
+from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
@@ -63,7 +63,7 @@ class _FollowedSession:
     syllables: SyllableTrack
 
 
-class GatewayService(Service):
+class GatewayService(SessionService):
     """The gateway process.
 
     HTTP runs in an asyncio loop. The loop runs while the service waits for messages.

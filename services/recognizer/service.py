@@ -33,7 +33,7 @@ from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
 from kouxing.shared.phones.events import Progress, Waveform
 from kouxing.shared.records import replace
-from kouxing.shared.service import Service
+from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
@@ -52,7 +52,7 @@ STEP_S = 0.002  # interval between steps with several sessions, to process their
 MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
 
 
-class RecognizerService(Service):
+class RecognizerService(SessionService):
     """The recognizer process."""
 
     kind = KIND

@@ -41,7 +41,7 @@ from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.records import replace
-from kouxing.shared.service import Service
+from kouxing.shared.session_service import SessionService
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import (
     SPEECH_MESSAGES,
@@ -69,7 +69,7 @@ LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
 
-class SynthesizerService(Service):
+class SynthesizerService(SessionService):
     """The synthesizer process."""
 
     kind = KIND

@@ -23,6 +23,7 @@ from kouxing.shared.service import (
     Service,
 )
 from kouxing.shared.service_kind import ServiceKind
+from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted
 from kouxing.shared.wire.speech import Progress, Speech
@@ -140,7 +141,7 @@ def test_warns_if_an_insecure_service_is_reachable_from_other_hosts(
     assert ("insecure = true" in caplog.text) == warns
 
 
-class Worker(Service):
+class Worker(SessionService):
     """Records what happens, in order."""
 
     kind = ServiceKind(name="worker", role="worker")

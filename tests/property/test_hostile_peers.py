@@ -23,6 +23,7 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.records import replace
 from kouxing.shared.service import Service
+from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
@@ -140,6 +141,7 @@ class Peers:
 
     def start(self, message: StartSession) -> None:
         """Start a session, perhaps at the endpoint of a hostile worker."""
+        assert isinstance(self.service, SessionService)
         with contextlib.suppress(UserError):  # control gets the reason
             self.service.start_session(message)
 
@@ -180,7 +182,7 @@ def test_control_answers_after_anything(actions: list[tuple[str, Any]], as_worke
 
 
 @cache
-def recognizer() -> tuple[Service, Socket, Socket]:
+def recognizer() -> tuple[SessionService, Socket, Socket]:
     service = RecognizerService(
         RecognizerConfig(
             audio=LOCAL, phones=LOCAL, unpaced_audio=LOCAL, control=NO_CONTROL, insecure=True
@@ -190,7 +192,7 @@ def recognizer() -> tuple[Service, Socket, Socket]:
 
 
 @cache
-def synthesizer() -> tuple[Service, Socket, Socket]:
+def synthesizer() -> tuple[SessionService, Socket, Socket]:
     service = SynthesizerService(
         SynthesizerConfig(phone_input=LOCAL, faps=LOCAL, control=NO_CONTROL, insecure=True)
     )
@@ -201,11 +203,12 @@ def synthesizer() -> tuple[Service, Socket, Socket]:
 @settings(max_examples=25)
 @given(actions=ACTIONS)
 def test_a_worker_answers_after_anything(
-    worker: Callable[[], tuple[Service, Socket, Socket]], actions: list[tuple[str, Any]]
+    worker: Callable[[], tuple[SessionService, Socket, Socket]], actions: list[tuple[str, Any]]
 ) -> None:
-    peers = Peers(*worker())
+    service, router, publisher = worker()
+    peers = Peers(service, router, publisher)
     peers.start(START)
     peers.attack(actions)
     peers.check_answer(Error)
-    peers.service.stop_session("demo")
+    service.stop_session("demo")
     peers.close()

@@ -1,0 +1,70 @@
+"""A service that serves sessions, which control starts and stops."""
+
+import time
+from collections.abc import Iterable
+
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Peer
+from kouxing.shared.message_loop import Handler
+from kouxing.shared.service import HEARTBEAT_S, Service
+from kouxing.shared.wire.control import EventName, SessionStarted, StartSession
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import CloseSession, ErrorCode, FlushSession
+
+
+class SessionService(Service):
+    """Base class of services with sessions. A subclass overrides the first methods below."""
+
+    def start_session(self, start: StartSession) -> bool:
+        """Serve a session. Return False if ``session_started`` is called later."""
+        return True
+
+    def stop_session(self, session: str) -> None:
+        """Stop serving a session, if it exists."""
+
+    def flush_session(self, session: str) -> None:
+        """Drop audio of a session that is not yet shown."""
+
+    def served_sessions(self) -> Iterable[StartSession]:
+        """Return the sessions that a restarted control restores from this service."""
+        return ()
+
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        """Return the handlers of control's messages; subclasses add theirs."""
+        return {
+            **super().control_handlers(),
+            StartSession: self._on_start_session,
+            CloseSession: lambda message, _: self.stop_session(message.session),
+            FlushSession: lambda message, _: self.flush_session(message.session),
+        }
+
+    def on_control_restart(self) -> None:
+        """Report the sessions, so that control restores them."""
+        for start in self.served_sessions():
+            self.send_to_control(
+                SessionStarted(session=start.session, request=start.request, start=start)
+            )
+
+    def session_started(self, start: StartSession, media_time: int = 0) -> None:
+        """Report that this service serves a session, whose phones are final up to a media time."""
+        self.send_to_control(
+            SessionStarted(session=start.session, request=start.request, media_time=media_time)
+        )
+
+    def report_skipped(self, session: str, skipped_s: float) -> None:
+        """Count and publish the duration of a live session's skipped audio, unless it is 0."""
+        if skipped_s > 0.0:
+            self.metrics.count("skipped_audio_ms", round(1e3 * skipped_s))
+            self.publish_event(EventName.AUDIO_SKIPPED, session, f"{skipped_s:.2f} s")
+
+    def _on_start_session(self, start: StartSession, _sender: Peer) -> None:
+        if self.should_exit:
+            return
+        try:
+            heartbeat_due_s = time.monotonic() + HEARTBEAT_S
+            self._heartbeat_due_s = min(self._heartbeat_due_s, heartbeat_due_s)
+            if self.start_session(start):
+                self.session_started(start)
+        except UserError as error:
+            self.warn("start", str(error), start.session)
+            self.publish_event(EventName.ERROR, start.session, f"{ErrorCode.TIMEOUT}: {error}")
