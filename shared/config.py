@@ -129,6 +129,8 @@ def _check_hosts_of(values: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _check_metrics(value: str) -> str:
+    if value.endswith(":*"):  # an endpoint with any port; Prometheus needs a known one
+        raise ValueError
     if value:
         _check_endpoint(f"tcp://{value}")
     return value

@@ -116,7 +116,10 @@ def test_a_default_may_depend_on_another_key() -> None:
             f"one of {', '.join(lip_model_names())}; did you mean ferguson?",
         ),
         (DriverConfig, "size", "641x480", "an even WIDTHxHEIGHT from 16x16 to 7680x4320"),
-        (RecognizerConfig, "metrics", "9100", "HOST:PORT such as 127.0.0.1:9100, or empty"),
+        *(
+            (RecognizerConfig, "metrics", text, "HOST:PORT such as 127.0.0.1:9100, or empty")
+            for text in ("9100", "127.0.0.1:*")
+        ),
         (
             GatewayConfig,
             "trusted_origins",
