@@ -24,11 +24,13 @@ PAGE_MODULES := three/LICENSE three/build/three.core.js three/build/three.module
 	three/examples/jsm/utils/BufferGeometryUtils.js three/examples/jsm/utils/SkeletonUtils.js \
 	@mediapipe/face_mesh
 MOS := evaluation/mos/page
+CLIENT := proto/node
 JAVASCRIPT := clients/javascript
 LIPS := clients/kouxing-lips
 LIPS_MODELS := $(LIPS)/models/model.json
 RIVALS := evaluation/rivals
 OVRLIPSYNC := clients/ovrlipsync
+AVATAR := examples/browser-vrm
 BLENDER := examples/blender/.venv
 BLENDER_LOCK := examples/blender/requirements.lock
 SAMPLE := shared/demo/hello-female.wav
@@ -72,7 +74,7 @@ wheel: .venv/installed $(PAGE)/node_modules/.package-lock.json
 	ls -l dist
 
 test: .venv/installed-dev setup $(LIPS_MODELS) \
-		$(patsubst %,%/node_modules/.package-lock.json,$(JAVASCRIPT) $(LIPS))
+		$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR))
 	$(STAGES) $(TEST_STAGES)
 
 test-python:
@@ -163,8 +165,8 @@ lock: .venv/installed-dev
 	printf '%s\n' $(RIVAL_PACKAGES) | $(COMPILE) --output-file $(RIVALS)/requirements.lock -
 
 clean:
-	rm -rf .venv $(BLENDER) $(PAGE)/node_modules \
-		$(JAVASCRIPT)/node_modules $(LIPS)/node_modules $(LIPS)/models \
+	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(CLIENT)/node_modules \
+		$(JAVASCRIPT)/node_modules $(LIPS)/node_modules $(LIPS)/models $(AVATAR)/node_modules \
 		$(RIVALS)/node_modules $(RIVALS)/.venv \
 		$(PAGE)/head*.glb build dist out
 
@@ -189,7 +191,7 @@ $(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
 	$(NPM) $(PAGE) ci
 	touch $@ $(PAGE)/node_modules/.package-lock.json
 
-$(patsubst %,%/node_modules/.package-lock.json,$(JAVASCRIPT) $(LIPS) $(RIVALS)): \
+$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR) $(RIVALS)): \
 		%/node_modules/.package-lock.json: %/package-lock.json | .venv/installed
 	$(NPM) $* ci
 	touch $@

@@ -1,5 +1,6 @@
 """Programs that know only PROTOCOL.md: strangers, and the examples."""
 
+import shutil
 import struct
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+import soundfile
 import zmq
 from kouxing_client import Client
 from kouxing_client.keys import Key
@@ -19,8 +21,9 @@ from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.keys import key_folder, load_key, user_key
 from tests.documents import code_blocks
 from tests.e2e.following import Stream, stream
-from tests.system import ROOT, VOWELS_FILE, System, free_port, samples_of_file
+from tests.system import NODE, ROOT, VOWELS_FILE, System, free_port, samples_of_file
 
+EXAMPLES = ROOT / "examples" / "stream"
 KEY_FILE = "~/.local/state/kouxing/client.key"
 
 
@@ -170,19 +173,50 @@ SAMPLES = samples_of_file(VOWELS_FILE)
 @pytest.fixture
 def programs(tmp_path: Path) -> list[list[str]]:
     """The commands of the programs."""
+    shutil.copytree(ROOT / "examples" / "node", tmp_path, dirs_exist_ok=True)
+    (tmp_path / "node_modules").symlink_to(ROOT / "proto" / "node" / "node_modules")
     program = tmp_path / "follow"
     options = ["-std=c11", "-Wall", "-Werror", "-lzmq"]
     subprocess.run(["cc", FOLDER / "follow.c", "-o", program, *options], check=True)
-    return [[sys.executable, str(FOLDER / "follow.py")], [str(program)]]
+    return [
+        [sys.executable, str(FOLDER / "follow.py")],
+        [str(NODE), str(tmp_path / "follow.mjs")],
+        [str(program)],
+    ]
 
 
-def test_without_a_server_each_program_prints_one_line(programs: list[list[str]]) -> None:
+@pytest.fixture
+def client(tmp_path: Path, programs: list[list[str]]) -> list[str]:
+    """The command of the program that streams a file."""
+    return [str(NODE), str(tmp_path / "stream.mjs")]
+
+
+@pytest.mark.parametrize("wav", ["stereo 24", "float 48k"])
+def test_the_client_streams_wav_files(
+    system: System, tmp_path: Path, client: list[str], wav: str
+) -> None:
+    samples, rate_hz, form = {
+        "stereo 24": (np.stack([SAMPLES, SAMPLES], axis=1), 16000, "PCM_24"),
+        "float 48k": (np.repeat(SAMPLES, 3), 48000, "FLOAT"),
+    }[wav]
+    soundfile.write(tmp_path / "said.wav", samples, rate_hz, form, format="WAVEX")
+    arguments = [*client, str(tmp_path / "said.wav"), system.control.partition(" ")[0]]
+    output = subprocess.run(arguments, check=True, stdout=subprocess.PIPE, text=True).stdout
+    jaw = [float(line.split()[-1]) for line in output.splitlines()]
+    assert len(jaw) == pytest.approx(50 * len(samples) / rate_hz, abs=50)
+    assert max(jaw) - min(jaw) > 100
+
+
+def test_without_a_server_each_program_prints_one_line(
+    programs: list[list[str]], client: list[str]
+) -> None:
     address = f"tcp://127.0.0.1:{free_port()}"
     assistant = [sys.executable, str(ROOT / "examples" / "voice-assistant" / "assistant.py")]
     running = [
         subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for command in [
             *([*program, "", address] for program in programs),
+            [*client, str(VOWELS_FILE), address],
             [*assistant, address.replace("tcp", "ws")],
         ]
     ]
@@ -222,7 +256,7 @@ def test_follow_a_session_that_moves_to_its_end(system: System, programs: list[l
             assert process.stdout is not None
             outputs.append(process.stdout.read().splitlines())  # not communicate, after readline
             process.wait()
-    assert [process.returncode for process in running] == [0, 0]
+    assert [process.returncode for process in running] == [0, 0, 0]
     for lines in outputs:
         times_s, jaw = zip(*(map(float, line.split()) for line in lines), strict=True)
         times = [round(16000 * time_s) for time_s in times_s]
