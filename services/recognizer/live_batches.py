@@ -83,6 +83,10 @@ class LiveBatches:
         network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
         if decoded := self._network.take_decoded():
             self._busy.add(network_weight * self._network.batch_s)
+            # speech that the encoder found during the run; sessions with more audio follow below
+            ended = [session for session in decoded if not session.audio]
+            ready = [session for session in ended if not self._waits_for_network(session)]
+            self._recognizer.decode_found([session.stream for session in ready])
             self._on_decoded(decoded)
         sessions = [session for session in sessions if session.can_accept]
         now_s = time.monotonic()

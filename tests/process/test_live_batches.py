@@ -1,0 +1,80 @@
+"""Batches of live audio: what is decoded after a run of the block network."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+from kouxing.services.recognizer.live_batches import LiveBatches
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.shared.metrics import LoadMeter
+from kouxing.shared.overload import SkipPolicy
+
+
+class FakeAudio(list[int]):
+    """Queued audio."""
+
+    overload = SkipPolicy(1.0, 0.0)
+
+
+class FakeSession:
+    """A session whose stream is itself, and whose audio ends during the run of the network."""
+
+    def __init__(self) -> None:
+        self.audio = FakeAudio([1])
+        self.is_due = self.is_scoring = False
+        self.stream = self
+        self.found: list[str] = []  # speech that is not decoded yet
+
+    @property
+    def is_decoding(self) -> bool:
+        return bool(self.audio) or self.is_due or self.is_scoring
+
+    @property
+    def can_accept(self) -> bool:
+        return bool(self.audio)
+
+    def accept_waveform(self, max_s: float, now_s: float, hop: int) -> None:
+        assert max_s > 0.0 < now_s, hop
+        self.audio.clear()
+        self.found.append("needs the network")
+
+    def start_scoring(self) -> None:
+        assert self.is_scoring
+
+    def finish_scoring(self) -> None:
+        self.found.append("end of speech")
+
+
+class FakeRecognizer:
+    """Decodes what the streams have found."""
+
+    def __init__(self) -> None:
+        self.decoded: list[str] = []
+
+    def run_encoder(self, streams: Sequence[FakeSession]) -> None:
+        assert len(streams) == 1
+
+    def needs_network(self, stream: FakeSession) -> bool:
+        return "needs the network" in stream.found
+
+    def decode_found(self, streams: Sequence[FakeSession]) -> None:
+        for stream in streams:
+            self.decoded += stream.found
+            stream.found.clear()
+
+
+def test_speech_found_during_a_run_is_decoded_without_more_audio() -> None:
+    recognizer, sent = FakeRecognizer(), list[Any]()
+    session = cast(RecognizerSession, FakeSession())
+    batches = LiveBatches(
+        [session, session],
+        cast(Recognizer, recognizer),
+        LoadMeter(1.0, 0.0),
+        wake=lambda: None,
+        on_early=sent.append,
+        on_decoded=lambda sessions: sent.extend((list(sessions), [*recognizer.decoded])),
+        on_batch=lambda: None,
+    )
+    batches.decode_all([session])
+    assert recognizer.decoded == ["needs the network", "end of speech"]
+    assert sent[-2:] == [[session], recognizer.decoded]
