@@ -30,6 +30,7 @@ _MIN_DISTINCT = 60  # values of a block; clipped sound and square waves have few
 _MIN_GAIN = 4.0  # ratio of the two flatnesses
 _MIN_SOUND_CORRELATION, _MIN_READ_CORRELATION = 0.3, 0.4  # of neighbors in sound
 _NUM_PACKETS = 10  # messages that start with the same 4 bits: packets of a codec
+_MAX_LOW_BYTE_SHARE = 0.3  # of the most frequent low byte; more in clipped and 8-bit sound
 
 
 def _decode_mulaw(data: NDArray[np.uint8]) -> Array:
@@ -131,7 +132,7 @@ class EncodingCheck:
         ]
         if likely:
             self._refuse(min(likely)[1])
-        elif is_white and self._is_compressed():
+        elif is_white and self._is_compressed(data[::2]):
             self._refuse("compressed data")
         elif not is_white and (
             correlation > _MIN_SOUND_CORRELATION
@@ -151,9 +152,13 @@ class EncodingCheck:
             )
             raise UserError(self._error)
 
-    def _is_compressed(self) -> bool:
+    def _is_compressed(self, low_bytes: NDArray[np.uint8]) -> bool:
         starts = self._packet_starts[:_NUM_PACKETS]
-        has_packets = len(starts) == _NUM_PACKETS and len(set(starts)) == 1
+        has_packets = (
+            len(starts) == _NUM_PACKETS
+            and len(set(starts)) == 1
+            and np.bincount(low_bytes).max() < _MAX_LOW_BYTE_SHARE * len(low_bytes)
+        )
         return has_packets or find_sound_start(self._begin) is not None
 
     def _measure_loudest(self, samples: NDArray[np.floating]) -> Measure:

@@ -127,6 +127,9 @@ def test_refuses_packets_of_a_codec() -> None:
         *(square(frequency_hz) for frequency_hz in (50, 440, 3000, 7999)),
         *(0.9 * tone(frequency_hz) for frequency_hz in (440, 4000, 7990)),
         *(np.where(np.arange(len(TIME_S)) % period, 0.0, 0.9) for period in (3, 50, 800)),
+        np.floor(RANDOM.uniform(-128, 128, len(TIME_S))) / 128,  # 8-bit noise
+        # clipped noise whose messages of 640 bytes all start alike
+        np.where(np.arange(len(TIME_S)) % 320, RANDOM.normal(0, 100, len(TIME_S)).clip(-1, 1), 1),
         (3 * (tone(220) + tone(277) + tone(330))).clip(-1, 1),  # clipped music
         *(speech(gain) for gain in (0.89, 5.0, 100.0)),
         np.concatenate([RANDOM.uniform(-1, 1, RATE_HZ), speech()]),

@@ -107,6 +107,28 @@ def test_reads_numbers(text: str, read: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("texts", "spelling"),
+    [
+        (
+            "随地吐痰 离地三尺 跪地求饶 征地补偿 拿地成本 买地建房 触地得分 贴地飞行 满地打滚"
+            " 摔倒在地起不来 落地签证 世界各地人民 一地鸡毛 大量耕地 妈妈地里干活 常常地震"
+            " 特别地区 自然地理 幸福地带 重要地位 很多地方 种好地再走 学校地处山区",
+            "di4",
+        ),
+        (
+            "慢慢地 慢慢地走 高兴地说 认真地看 非常努力地学习 开心地笑 大声地喊 很快地跑 突然地停下"
+            " 小心翼翼地走 一步一步地走 更好地服务 高兴地表示 轻轻地点头 認真地學習",
+            "de5",
+        ),
+    ],
+)
+def test_reads_the_particle_only_after_an_adverb(texts: str, spelling: str) -> None:
+    for text in texts.split():
+        read = [syllable.spelling for syllable in transcribe(text).syllables]
+        assert read[text.index("地")] == spelling, text
+
+
+@pytest.mark.parametrize(
     ("text", "spellings"),
     [
         ("音樂、重慶", "yin1 yue4 chong2 qing4"),

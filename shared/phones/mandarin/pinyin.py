@@ -18,11 +18,12 @@ Decisions beyond these sources:
 
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.phones.mandarin.adverbs import adverb_particles
 from kouxing.shared.phones.mandarin.bopomofo import WORDS_IN_BOPOMOFO, read_bopomofo
 from kouxing.shared.phones.mandarin.numbers import numbers_as_words, unambiguous_numbers
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
@@ -89,8 +90,6 @@ _READ_AS = (
     (re.compile("(?<![名顯显原編编論论卓土昭])著(?![名作者稱称書书述])"), "着"),
     (re.compile("乾(?![隆坤卦])"), "干"),
 )
-_BEFORE_PARTICLE = re.compile("[^\\W\\d_一二两三这那哪此该本每各他块片亩种寸的]")
-_AFTER_PARTICLE = re.compile("[^\\W\\d_的很是有不也都太上下里中面]")
 _KEYCAP = re.compile("[0-9#*]\ufe0f?\u20e3")  # emoji of a key, a bullet
 _NUMERAL = re.compile("[①-⒛Ⅰ-Ⅻⅰ-ⅻ㈠-㈩㊀-㊉]")  # a number as one character
 _LETTERS = str.maketrans("ɑɡ\u0306", "ag\u030c")  # schoolbook letters; a breve instead of a caron
@@ -371,23 +370,9 @@ def _pinyin_of(characters: str) -> list[str]:
         neutral_tone_with_five=True,
         v_to_u=False,
     )
-    for index in _adverb_particles(simplified):
+    for index in adverb_particles(simplified):
         syllables[index] = "de5"
     return syllables
-
-
-def _adverb_particles(characters: str) -> Iterator[int]:
-    """Yield where 地 ends an adverb, as in 慢慢地走; pypinyin reads it like the noun."""
-    from pypinyin.seg.mmseg import seg  # noqa: PLC0415 (takes 0.3 s with pypinyin)
-
-    if "地" not in characters:
-        return
-    index = 0
-    for word in seg.cut(characters):
-        before, after = characters[:index][-1:], characters[index + 1 :][:1]
-        if word == "地" and _BEFORE_PARTICLE.match(before) and _AFTER_PARTICLE.match(after):
-            yield index
-        index += len(word)
 
 
 def _simplify(characters: str) -> str:
