@@ -130,26 +130,35 @@ def write_json(path: Path | None, results: object) -> None:
 
 
 def check_output(
-    *paths: Path | None, inputs: Iterable[Path | None] = (), force: bool = False
+    *outputs: Path | Sequence[Path] | None,
+    inputs: Iterable[Path | None] = (),
+    force: bool = False,
 ) -> None:
     """Check that output files can be written. Call this before long work; None is skipped.
 
-    Asks whether to overwrite a file, unless ``force`` is set. Raises ``UserError`` if a file cannot
-    be written, exists and there is no terminal to ask on, or is also one of the ``inputs``.
+    The existing pictures of a sequence are one output. Asks whether to overwrite a file, unless
+    ``force`` is set. Raises ``UserError`` if a file cannot be written, exists and there is no
+    terminal to ask on, or is also one of the ``inputs``.
     """
     sources = [source for source in inputs if source is not None and _exists(source)]
-    for path in paths:
-        if path is None:
+    for output in outputs:
+        if output is None:
             continue
+        path, *others = [output] if isinstance(output, Path) else output
         if str(path) == "-":
             raise UserError("-: the output needs a name; standard output is not supported")
         is_new = not _exists(path)
-        if not is_new and any(path.samefile(source) for source in sources):
-            raise UserError(f"{path}: the output is also an input; use another name for the output")
+        for file in () if is_new else (path, *others):
+            if any(file.samefile(source) for source in sources):
+                raise UserError(
+                    f"{file}: the output is also an input; use another name for the output"
+                )
         if path.is_file() and not force:
+            exists = f"{path} and {len(others)} more exist" if others else f"{path} exists"
+            them = "them" if others else "it"
             if not (sys.stdin.isatty() and CONSOLE.is_terminal):
-                raise UserError(f"{path} exists; add --force to overwrite it")
-            typer.confirm(f"{path} exists. Overwrite it?", abort=True, err=True)
+                raise UserError(f"{exists}; add --force to overwrite {them}")
+            typer.confirm(f"{exists}. Overwrite {them}?", abort=True, err=True)
         try:
             with path.open("a"):
                 pass

@@ -1,6 +1,7 @@
 """The output formats of ``kouxing render``: one class per format, found by the file's suffix."""
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -106,10 +107,10 @@ def is_output(path: Path) -> bool:
     return is_sequence(path) or path.suffix.lower() in EXPORTERS
 
 
-def existing_output(output: Path) -> Path | None:
-    """Return the file that must not exist: the first of a sequence of pictures, or the output."""
+def existing_output(output: Path) -> Sequence[Path] | Path | None:
+    """Return the files to replace: the existing pictures of a sequence, or the output."""
     if is_sequence(output) and (pictures := existing_pictures(output)):
-        return pictures[0]
+        return pictures
     return None if output.is_dir() else output
 
 

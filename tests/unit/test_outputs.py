@@ -210,7 +210,13 @@ def test_a_sequence_of_pictures_is_overwritten_only_with_force(
     Path("pictures").mkdir()
     Path("pictures/00007.png").touch()
     Path("face007.png").touch()
-    with pytest.raises(UserError, match=r"007\.png exists; add --force"):
+    with pytest.raises(UserError, match=r"007\.png exists; add --force to overwrite it"):
+        app(["render", "my.wav", output], standalone_mode=False)
+    for name in ("pictures/00008.png", "pictures/00009.png", "face008.png", "face009.png"):
+        Path(name).touch()
+    with pytest.raises(
+        UserError, match=r"007\.png and 2 more exist; add --force to overwrite them"
+    ):
         app(["render", "my.wav", output], standalone_mode=False)
 
 
@@ -220,6 +226,8 @@ def test_a_sequence_of_pictures_replaces_a_longer_one(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     sequence = PictureSequence(tmp_path / "face%04d.png")
     sequence.write_image(np.zeros((2, 2, 3), np.uint8))
+    assert (tmp_path / "face0005.png").exists()  # until the new sequence is complete
+    sequence.close()
     assert {path.name for path in tmp_path.iterdir()} == {*others, "face0000.png"}
     assert (tmp_path / "face0000.png").stat().st_size > 0
 

@@ -296,7 +296,7 @@ class VideoWriter:
 
 
 class PictureSequence:
-    """One PNG file per picture; an existing sequence of the same name is deleted first.
+    """One PNG file per picture; ``close`` deletes the later pictures of an older sequence.
 
     ``path`` is a folder for ``00000.png`` and so on, or a name such as ``face%05d.png``.
 
@@ -309,8 +309,6 @@ class PictureSequence:
         try:
             if path.suffix != ".png":
                 path.mkdir(exist_ok=True)
-            for picture in existing_pictures(path):
-                picture.unlink()
         except OSError as error:
             raise write_error(path, error) from error
 
@@ -323,11 +321,18 @@ class PictureSequence:
         """Ignore the sound."""
 
     def close(self) -> Path:
-        """Return the folder or the name pattern."""
+        """Delete older pictures beyond the last one; return the folder or the name pattern."""
+        written = {picture_name(self._path, number) for number in range(self._num_images)}
+        try:
+            for picture in existing_pictures(self._path):
+                if picture not in written:
+                    picture.unlink()
+        except OSError as error:
+            raise write_error(self._path, error) from error
         return self._path
 
     def discard(self) -> None:
-        """Keep the pictures written so far."""
+        """Keep the pictures written so far, and older ones."""
 
 
 def write_picture(path: Path, image: UInt8) -> None:
