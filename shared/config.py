@@ -87,9 +87,10 @@ class KnownNames:
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def _check(self, text: str) -> str:
-        name = text.strip().lower()
-        if name in self.names():
-            return name
+        name = text.strip()
+        for known in (name, name.lower()):
+            if known in self.names():
+                return known
         if not re.fullmatch(self.pattern, text):
             raise ValueError
         return text
@@ -129,10 +130,10 @@ def _check_hosts_of(values: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _check_metrics(value: str) -> str:
-    if value.endswith(":*"):  # an endpoint with any port; Prometheus needs a known one
-        raise ValueError
     if value:
-        _check_endpoint(f"tcp://{value}")
+        host, port = split_endpoint(_check_endpoint(f"tcp://{value}"), "metrics")
+        if host == "*" or port == "*" or int(port) == 0:  # Prometheus needs a known port
+            raise ValueError
     return value
 
 

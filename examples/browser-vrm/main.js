@@ -69,6 +69,7 @@ function missing(names) {
 function connect() {
   const url = new URL("/viewer", query.get("gateway") ?? "ws://127.0.0.1:8080");
   url.searchParams.set("session", query.get("session") ?? "");
+  url.searchParams.set("token", query.get("token") ?? "");
   // Avatars with "Perfect Sync" have ARKit's 52 shapes, others have only VRM's shapes.
   const isPerfect = missing(ARKIT_NEEDED).length === 0;
   const unknown = missing(VRM_NEEDED);

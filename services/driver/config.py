@@ -82,7 +82,7 @@ class DriverConfig(FaceConfig):
     ] = "studio"
     """Background of windows and videos."""
     camera: Framing = Framing.FACE
-    """The part of the head that fills the picture."""
+    """The part of the head that fills the picture, or the head from the side."""
     virtual_camera: Switch = False
     """Whether to offer the picture to other programs as a camera."""
     size: Annotated[

@@ -20,6 +20,13 @@ def _check_origins(values: tuple[str, ...]) -> tuple[str, ...]:
     return values
 
 
+def _check_https(value: str) -> str:
+    text = value.strip().lower()
+    if text in {"true", "false", "yes", "no", "on", "off", "0", "1"}:
+        raise ValueError
+    return "proxy" if text == "proxy" else value
+
+
 def _check_targets(values: tuple[str, ...]) -> tuple[str, ...]:
     if not values:
         return values
@@ -60,7 +67,11 @@ class GatewayConfig(FaceConfig):
     """Port at which the page is served; 0 uses any free port."""
     head: str = ""
     """GLB file with the page's head, written by 'kouxing head export'."""
-    https: Annotated[str, ValueHint("empty, proxy, or the path of a PEM file")] = ""
+    https: Annotated[
+        str,
+        AfterValidator(_check_https),
+        ValueHint("empty, proxy, or the path of a PEM file such as kouxing.pem"),
+    ] = ""
     """Path of a PEM file with a certificate and its private key. If the file does not exist, the
     gateway creates it with a self-signed certificate. "proxy" serves http at an address that only
     an encrypting proxy or this machine can reach. Empty serves http only on this machine."""

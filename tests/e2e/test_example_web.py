@@ -38,10 +38,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def gateway(control: PageControl, site: str) -> Iterator[str]:
-    """The gateway's address."""
-    gateway = Gateway(control.address, trusted_origins=site)
+    """The gateway's address, with its token."""
+    gateway = Gateway(control.address, trusted_origins=site, token="secret")
     wait_until(lambda: control.heartbeats)
-    yield gateway.page.replace("http", "ws")
+    yield gateway.page.replace("http", "ws") + "?token=secret"
     assert gateway.stop() == 0
 
 
@@ -73,7 +73,8 @@ def test_the_avatar_shows_the_face_of_a_session(
 ) -> None:
     browser = Browser(tmp_path, DEMO / "hello-female.wav", size_px=(240, 180))
     try:
-        browser.command("Page.navigate", url=f"{site}/index.html?gateway={gateway}")
+        address, _, token = gateway.partition("?")
+        browser.command("Page.navigate", url=f"{site}/index.html?gateway={address}&{token}")
         browser.wait_for("window.avatar !== undefined")
         rest = browser.image()
         with Client(control.address, insecure=True) as client, client.open_session("seen"):

@@ -23,7 +23,6 @@ from tests.documents import code_blocks
 from tests.e2e.following import Stream, stream
 from tests.system import NODE, ROOT, VOWELS_FILE, System, free_port, samples_of_file
 
-EXAMPLES = ROOT / "examples" / "stream"
 KEY_FILE = "~/.local/state/kouxing/client.key"
 
 

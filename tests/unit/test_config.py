@@ -2,8 +2,10 @@
 
 import re
 from pathlib import Path
+from typing import Annotated
 
 import pytest
+from pydantic import TypeAdapter
 
 from kouxing.services.cli.configuration import config, markdown_page
 from kouxing.services.control.config import ControlConfig
@@ -13,7 +15,7 @@ from kouxing.services.kinds import CONFIG_TYPES, read_settings
 from kouxing.services.lip_models import lip_model_names
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.config import ServiceConfig, Settings
+from kouxing.shared.config import KnownNames, ServiceConfig, Settings
 from kouxing.shared.errors import UserError
 from tests.documents import code_blocks
 
@@ -118,7 +120,16 @@ def test_a_default_may_depend_on_another_key() -> None:
         (DriverConfig, "size", "641x480", "an even WIDTHxHEIGHT from 16x16 to 7680x4320"),
         *(
             (RecognizerConfig, "metrics", text, "HOST:PORT such as 127.0.0.1:9100, or empty")
-            for text in ("9100", "127.0.0.1:*")
+            for text in ("9100", "127.0.0.1:*", "localhost:0", "*:9100")
+        ),
+        *(
+            (
+                GatewayConfig,
+                "https",
+                text,
+                "empty, proxy, or the path of a PEM file such as kouxing.pem",
+            )
+            for text in ("true", "False", "0")
         ),
         (
             GatewayConfig,
@@ -141,6 +152,16 @@ def test_an_error_names_key_value_origin_and_what_is_allowed(
     with pytest.raises(UserError) as error:
         settings().load(config_type, {key: text})
     assert str(error.value) == f"{section}.{key}: {text!r} (from --set) is not {allowed}"
+
+
+@pytest.mark.parametrize(("text", "name"), [("MyLips", "MyLips"), ("Ferguson", "ferguson")])
+def test_a_known_name_may_have_capitals(text: str, name: str) -> None:
+    known = KnownNames(lambda: ("MyLips", "ferguson"))
+    assert TypeAdapter(Annotated[str, known]).validate_python(text) == name
+
+
+def test_proxy_may_have_capitals() -> None:
+    assert settings().load(GatewayConfig, {"https": "Proxy"}).is_behind_proxy
 
 
 @pytest.mark.parametrize(

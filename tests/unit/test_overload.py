@@ -18,7 +18,7 @@ from kouxing.shared.overload import (
     SkipPolicy,
 )
 
-MAX_BEHIND_S = 0.2
+MAX_LAG_S = 0.2
 CHUNK_S = 0.02
 RATE_HZ = 16_000
 
@@ -27,7 +27,7 @@ class Session:
     """A session of a service that processes audio at a speed, in steps of 20 ms."""
 
     def __init__(self, **options: float) -> None:
-        self.overload = SkipPolicy(MAX_BEHIND_S, **options)
+        self.overload = SkipPolicy(MAX_LAG_S, **options)
         self.now_s = 100.0
         self.waiting_s = -CHUNK_S  # after the oldest chunk
 
@@ -67,7 +67,7 @@ def test_is_never_far_behind_for_long() -> None:
     for _ in range(2000):
         session.run(CHUNK_S, speed=0.3)
         behind_s.append(session.waiting_s)
-    assert max(behind_s) < MAX_BEHIND_S + MAX_LATE_FOR_S
+    assert max(behind_s) < MAX_LAG_S + MAX_LATE_FOR_S
 
 
 def test_skips_audio_that_arrived_while_the_process_was_stopped() -> None:
@@ -141,7 +141,7 @@ def test_reports_skipped_audio_at_most_once_a_second() -> None:
 
 
 def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
-    audio = AudioQueue(2 * RATE_HZ, SkipPolicy(MAX_BEHIND_S))
+    audio = AudioQueue(2 * RATE_HZ, SkipPolicy(MAX_LAG_S))
     chunk = np.zeros((3200, 1), np.float32)  # 0.1 s
     audio.append((0, chunk), 0.0)
     audio.append((1600, chunk), 0.1)
@@ -159,7 +159,7 @@ def test_live_audio_is_taken_in_parts_and_cut_to_the_newest_chunk() -> None:
 
 
 def test_empty_chunks_fill_the_queue() -> None:
-    audio = AudioQueue(RATE_HZ, SkipPolicy(MAX_BEHIND_S))
+    audio = AudioQueue(RATE_HZ, SkipPolicy(MAX_LAG_S))
     for _ in range(100):
         audio.append((0, np.zeros((0, 1), np.float32)), 0.0)
     assert audio.duration_s == pytest.approx(0.1)
