@@ -153,7 +153,7 @@ class Service(MessageLoop):
     def publish_event(
         self, name: EventName, session: str, detail: str = "", media_time: int = 0
     ) -> None:
-        """Request control to publish an event about a session."""
+        """Ask control to publish an event about a session."""
         event = Event(session=session, name=name, detail=detail[:2000], media_time=media_time)
         self.send_to_control(event)
 

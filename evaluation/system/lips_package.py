@@ -177,7 +177,7 @@ def _compare_lips(models: Path, folder: Path) -> tuple[int, dict[str, Agreement]
 def _compare_phones(
     models: Path, references: Sequence[Reference], acoustic: str
 ) -> dict[str, ErrorCounts]:
-    """Count the errors of server and package, and the differences between both."""
+    """Count the errors of server and package, and the differences between the two."""
     counts = {name: ErrorCounts() for name in (SERVER, PACKAGE, DIFFERENCE)}
     for reference in track(references, acoustic, console=CONSOLE, transient=True):
         samples = reference.read_audio()

@@ -165,8 +165,8 @@ def listen(
         ListenFormat | None,
         typer.Option(
             "--as",
-            help="Values to print or record. Shapes are printed as JSON lines, the drawn mouths of"
-            " rhubarb when they change, and syllables and phones once they are final. Default:"
+            help="Values to print or record. Shapes are printed as JSON lines, rhubarb's mouths"
+            " when they change, and syllables and phones once they are final. Default:"
             " faps, or the first that the file's format supports.",
         ),
     ] = None,

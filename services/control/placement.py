@@ -78,7 +78,7 @@ class Placement:
             left = 100 * max(0.0, self._max_load - load.expected(now_s))
             text = (
                 f"every {kind or f'provider of {endpoint}'} is busy: {needed:.0f} % of its time "
-                f"must be free, and {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
+                f"must be free, but only {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
             )
             raise Refusal(ErrorCode.BUSY, text, RETRY_AFTER_S)
         return best

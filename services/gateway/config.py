@@ -74,7 +74,7 @@ class GatewayConfig(FaceConfig):
     ] = ""
     """Path of a PEM file with a certificate and its private key. If the file does not exist, the
     gateway creates it with a self-signed certificate. "proxy" serves http at an address that only
-    an encrypting proxy or this machine can reach. Empty serves http only on this machine."""
+    an encrypting proxy or this machine can reach. If empty, http is served only on this machine."""
     token: str = ""
     """Secret that the page's address must contain. If empty, the gateway creates a token when
     https is set."""

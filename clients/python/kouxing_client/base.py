@@ -43,7 +43,7 @@ class FaceSettings(TypedDict, total=False):
     listen_to: str
     """session to which the face listens: it looks at the viewer and nods in pauses; or ``""``"""
     listening: bool
-    """whether a person without a session speaks, so the face listens"""
+    """whether a person without a session is speaking, so that the face listens"""
     shapes: Sequence[str]
     """blendshape sets to publish in addition to FAPs"""
 

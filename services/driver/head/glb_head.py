@@ -141,7 +141,7 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
     eyes = _eyes(glb, pieces, names)
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
-        raise BadGlbError("both eyes, found by shapes or names, are at the same place")
+        raise BadGlbError("both eyes, found by shapes or names, are in the same place")
     mouth = [name for name in known if not _NOT_MOUTH.search(name)]
     is_mirrored = any(piece.is_mirrored for piece in pieces if piece.shapes.keys() & mouth)
     turn = _upright(eyes, _moved_center(pieces, mouth), is_mirrored=is_mirrored)
