@@ -185,7 +185,7 @@ class Service(MessageLoop):
             from kouxing.shared.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used
 
             self._heartbeat_due_s = time.monotonic()
-            host, _, port = self.config.metrics.rpartition(":")
+            host, port = split_endpoint(f"tcp://{self.config.metrics}", "metrics")
             self._metrics_server = MetricsServer(
                 host.strip("[]"), int(port), self.metrics, self.name, is_alive=self.check_health
             )

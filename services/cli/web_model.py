@@ -50,7 +50,7 @@ from kouxing.shared.face import expression_motion, shapes
 from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
-FORMAT = "kouxing-lips 3"
+FORMAT = "kouxing-lips 4"
 
 _ALIGNMENT_BYTES = 8
 # the constants that kouxing-lips and ovrlipsync use, by module

@@ -64,6 +64,8 @@ test("a mouth profile is stored until it is deleted", () => {
   new MouthProfileStore(() => storage).keep(learned);
   const later = new MouthProfileStore(() => storage);
   assert.deepEqual(later.current, learned);
+  storage.items["kouxing.voice"] = '{"profile": "YWJj", "learntOn": 1, "before": {}, "after": {}}';
+  assert.deepEqual(new MouthProfileStore(() => storage).current, learned);
   later.keep(null);
   assert.deepEqual(storage.items, {});
   assert.equal(later.current, null);

@@ -59,7 +59,10 @@ export class MouthProfileStore {
   constructor(storage) {
     this.#stored = new StoredValue(storage, "kouxing.voice"); // browsers have used it from the start
     const stored = this.#stored.read();
-    if (typeof stored?.profile === "string" && stored.profile !== "") this.current = stored;
+    if (typeof stored?.profile === "string" && stored.profile !== "") {
+      const { learntOn, learnedOn = learntOn, ...rest } = stored; // learntOn: the name in earlier versions
+      this.current = { ...rest, learnedOn };
+    }
   }
 
   /** Keep a profile; null deletes it. */
