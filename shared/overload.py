@@ -27,7 +27,7 @@ REPORT_INTERVAL_S = 1.0  # interval between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
 ADAPTATION = 0.1  # fraction of the lateness to ignore if the newest audio is just as late
 
-MAX_HOP = 4  # longest time between runs of the block network, in multiples of the shortest
+MAX_HOP = 6  # longest time between runs of the block network, in multiples of the shortest
 MAX_LOAD = 0.6  # cores of a recognizer; above it, the network runs less often
 RESTORE_LOAD = 0.5  # expected load at which the network runs more often again
 RESTORE_AFTER_S = 5.0  # time for which the expected load must be that low

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from kouxing.evaluation.report.markdown import Results, Table, display_floor_ms, join_values
 from kouxing.evaluation.tables import format_number, percent
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.overload import MAX_HOP
 
 _LOOK_AHEAD_MS, _FRAME_MS = 60, 20
 _FRAME_BYTES, _FRAMES_PER_S = 4 * NUM_FAPS, 50
@@ -60,13 +61,13 @@ def _load(results: Results) -> Iterator[list[str]]:
     if not load:
         return
     summary = load["summary"]
-    floor_cores = results.get("sizes", {}).get("floor_cores", {}).get("hop 4")
+    floor_cores = results.get("sizes", {}).get("floor_cores", {}).get(f"hop {MAX_HOP}")
     floor = load["cores"] / floor_cores if floor_cores else None
     yield [
         f"sessions on {load['cores']} cores, all speaking",
         format_number(summary["sessions"], ".0f"),
         format_number(floor, ".0f"),
-        "cores / floor of the processor time; under load, the block network runs every 160 ms",
+        "cores / floor of the processor time; under load, the block network runs every 240 ms",
     ]
     if "recognizer_mb_per_session" in summary:
         memory = (summary[f"{name}_mb_per_session"] for name in ("recognizer", "synthesizer"))

@@ -11,6 +11,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 
 from kouxing.services.cli.options import Language
+from kouxing.shared.overload import MAX_HOP
 from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output, write_json
 
 SENTENCE = Path(__file__).parents[2] / "shared" / "demo" / "hello-female.wav"
@@ -96,7 +97,7 @@ def sizes(json_file: JsonFile = None, force: Force = False) -> None:
     check_output(json_file, force=force)
     figures = measure()
     show(figures, Console())
-    floors = {f"hop {hop}": figures.floor_cores(hop) for hop in (1, 4)}
+    floors = {f"hop {hop}": figures.floor_cores(hop) for hop in (1, MAX_HOP)}
     write_json(json_file, asdict(figures) | {"floor_cores": floors})
 
 
