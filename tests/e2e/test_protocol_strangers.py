@@ -1,5 +1,6 @@
 """Programs that know only PROTOCOL.md: strangers, and the examples."""
 
+import os
 import shutil
 import struct
 import subprocess
@@ -18,12 +19,18 @@ from kouxing_client import Client
 from kouxing_client.keys import Key
 
 from kouxing.evaluation.system.attackers import connect
-from kouxing.shared.keys import key_folder, load_key, user_key
+from kouxing.shared.keys import load_key, user_key
 from tests.documents import code_blocks
-from tests.e2e.following import Stream, stream
-from tests.system import NODE, ROOT, VOWELS_FILE, System, free_port, samples_of_file
-
-KEY_FILE = "~/.local/state/kouxing/client.key"
+from tests.e2e.following import Stream
+from tests.system import (
+    LIMIT_S,
+    NODE,
+    ROOT,
+    VOWELS_FILE,
+    System,
+    free_port,
+    samples_of_file,
+)
 
 
 class Stranger:
@@ -144,24 +151,24 @@ def test_a_client_of_another_version_is_answered_in_its_version(system: System) 
     stranger.close()
 
 
-def test_the_example_in_the_readme_follows_a_face(system: System, tmp_path: Path) -> None:
+def test_the_example_in_the_readme_follows_a_face(system: System) -> None:
     (example,) = code_blocks(ROOT / "README.md", "python")
-    faps = system.endpoints()["faps"].partition(" ")[0]
-    for default, own in (
-        ("tcp://127.0.0.1:5571", faps),
-        (str(Path(KEY_FILE).parent), key_folder()),
-    ):
-        assert default in example
-        example = example.replace(default, str(own))
     command = [sys.executable, "-u", "-c", example]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as program:
+    environment = {**os.environ, "KOUXING_CONTROL": system.control.partition(" ")[0]}
+    samples = samples_of_file(VOWELS_FILE)[:1600]
+    with (
+        Client(system.control) as client,
+        client.open_session("demo", encoding="f32le", paced=False) as session,
+        subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as program,
+    ):
         assert program.stdout is not None
-        heard = threading.Thread(target=program.stdout.readline)
-        heard.start()
-        while heard.is_alive():  # it subscribes at some time
-            stream(system.control, samples_of_file(VOWELS_FILE)[:8000], session="demo")
-        assert program.poll() is None
-        program.terminate()
+        first_line = threading.Thread(target=program.stdout.readline)
+        first_line.start()
+        while first_line.is_alive():  # until the program has subscribed
+            session.push(samples)
+        session.finish()
+        program.stdout.read()
+        assert program.wait(LIMIT_S) == 0
 
 
 FOLDER = ROOT / "examples" / "subscribe"
