@@ -11,55 +11,50 @@ const RETRY_MS := 1000
 @export var face: Node3D
 
 var _socket := WebSocketPeer.new()
+var _is_open := false
 var _retry_at_ms := 0
-var _set := ""
-var _targets := {}  # [mesh, index] of the blendshapes, lists by shape
+var _meshes := []
+var _targets := []  # the mesh and the index of the blendshape that each weight moves
 
 
 func _ready() -> void:
-	var names_of := {}
-	for mesh: MeshInstance3D in face.find_children("*", "MeshInstance3D", true, false):
-		names_of[mesh] = range(mesh.get_blend_shape_count()).map(
-			func(index: int) -> String: return mesh.mesh.get_blend_shape_name(index)
-		)
-	var all_names := []
-	for names: Array in names_of.values():
-		all_names.append_array(names)
-	var chosen := KouxingShapeNames.choose_set(all_names)
-	_set = chosen[0]
-	if _set == "":
-		push_error("kouxing: " + chosen[1])
-		set_process(false)
-		return
-	for mesh: MeshInstance3D in names_of:
-		var shapes := KouxingShapeNames.find_shapes(_set, names_of[mesh])
-		for target: String in shapes:
-			var targets: Array = _targets.get(shapes[target], [])
-			targets.append([mesh, names_of[mesh].find(target)])
-			_targets[shapes[target]] = targets
+	_meshes = face.find_children("*", "MeshInstance3D", true, false)
 
 
 func _process(_delta: float) -> void:
 	_socket.poll()
 	match _socket.get_ready_state():
 		WebSocketPeer.STATE_OPEN:
+			if not _is_open:
+				_is_open = true
+				_socket.send_text(JSON.stringify({"avatar": _meshes.map(_names), "format": "json"}))
 			while _socket.get_available_packet_count() > 0:
 				var packet := _socket.get_packet()
 				if _socket.was_string_packet():
 					_receive(JSON.parse_string(packet.get_string_from_utf8()))
 		WebSocketPeer.STATE_CLOSED:
+			_is_open = false
 			if Time.get_ticks_msec() >= _retry_at_ms:
 				_retry_at_ms = Time.get_ticks_msec() + RETRY_MS
-				var query := "?shapes=%s&format=json&session=%s" % [_set, session.uri_encode()]
-				_socket.connect_to_url(gateway + "/viewer" + query)
+				_socket.connect_to_url(gateway + "/viewer?session=" + session.uri_encode())
+
+
+## Return the names of a mesh's blendshapes.
+func _names(mesh: MeshInstance3D) -> Array:
+	return range(mesh.get_blend_shape_count()).map(
+		func(index: int) -> String: return mesh.mesh.get_blend_shape_name(index)
+	)
 
 
 ## Show a face of the session or at rest; ignore other messages.
 func _receive(message: Dictionary) -> void:
-	if message["type"] == "error":
-		push_warning("kouxing: " + message["text"])
-	if message["type"] not in ["weights", "rest"]:
-		return
-	for shape: String in message["weights"]:
-		for target: Array in _targets.get(shape, []):
-			target[0].set_blend_shape_value(target[1], message["weights"][shape])
+	match message["type"]:
+		"error":
+			push_warning("kouxing: " + message["text"])
+		"avatar":
+			_targets = message["targets"]
+		"weights", "rest":
+			for index in range(_targets.size()):
+				var target: Array = _targets[index]
+				var mesh: MeshInstance3D = _meshes[int(target[0])]
+				mesh.set_blend_shape_value(int(target[1]), message["weights"][index])

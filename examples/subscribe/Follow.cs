@@ -16,14 +16,13 @@ static class Follow
     {
         string session = arguments.ElementAtOrDefault(0) ?? "";
         string gateway = arguments.ElementAtOrDefault(1) ?? "ws://127.0.0.1:8080";
-        using (var stream = new KouxingStream(gateway, session))
+        var avatar = new[] { new[] { "jawOpen" } }; // one mesh with one shape
+        using (var stream = new KouxingStream(gateway, session, avatar))
             for (int tries = 0; ; tries++, Thread.Sleep(50))
             {
-                var (names, weights) = (stream.Names, stream.Weights);
-                if (tries == 60 && names.Count == 0)
+                if (tries == 60 && stream.Targets.Length == 0)
                     Console.Error.WriteLine($"waiting for the gateway at {gateway}; start it with: kouxing run");
-                int jaw = names.ToList().IndexOf("jawOpen");
-                if (jaw >= 0 && jaw < weights.Length) Console.WriteLine(weights[jaw].ToString("0.00"));
+                foreach (float weight in stream.Weights) Console.WriteLine(weight.ToString("0.00"));
             }
     }
 }

@@ -1,8 +1,6 @@
 // Unity 2021 or newer: add this component to an avatar. It moves every SkinnedMeshRenderer below the
 // avatar that has blendshapes of ARKit, Oculus or VRM, also under the names of other programs.
 
-using System;
-using System.Collections.Generic;
 using System.Linq;
 using UnityEngine;
 
@@ -12,27 +10,14 @@ public sealed class KouxingFace : MonoBehaviour
     [SerializeField, Tooltip("Session to follow; if empty, the newest")] string session = "";
     [SerializeField, Tooltip("Unity's blendshapes range from 0 to 100")] float fullWeight = 100f;
 
-    readonly List<(SkinnedMeshRenderer mesh, int shape, string name)> _shapes =
-        new List<(SkinnedMeshRenderer, int, string)>();
+    SkinnedMeshRenderer[] _meshes;
     KouxingStream _stream;
 
     void OnEnable()
     {
-        _shapes.Clear();
-        var names = GetComponentsInChildren<SkinnedMeshRenderer>().Where(mesh => mesh.sharedMesh).ToDictionary(mesh => mesh, mesh =>
-            Enumerable.Range(0, mesh.sharedMesh.blendShapeCount).Select(mesh.sharedMesh.GetBlendShapeName).ToList());
-        string set;
-        try { set = KouxingShapeNames.ChooseSet(names.Values.SelectMany(list => list).ToList()); }
-        catch (InvalidOperationException error)
-        {
-            Debug.LogError($"kouxing: {error.Message}", this);
-            enabled = false;
-            return;
-        }
-        foreach (var mesh in names)
-            foreach (var shape in KouxingShapeNames.FindShapes(set, mesh.Value))
-                _shapes.Add((mesh.Key, mesh.Value.IndexOf(shape.Key), shape.Value));
-        _stream = new KouxingStream(gateway, session, set);
+        _meshes = GetComponentsInChildren<SkinnedMeshRenderer>().Where(mesh => mesh.sharedMesh).ToArray();
+        _stream = new KouxingStream(gateway, session, _meshes.Select(mesh =>
+            Enumerable.Range(0, mesh.sharedMesh.blendShapeCount).Select(mesh.sharedMesh.GetBlendShapeName)));
     }
 
     void OnDisable()
@@ -44,13 +29,16 @@ public sealed class KouxingFace : MonoBehaviour
     void LateUpdate() // after the Animator
     {
         if (_stream == null) return;
-        IReadOnlyList<string> names = _stream.Names;
+        if (_stream.Error != "")
+        {
+            Debug.LogError($"kouxing: {_stream.Error}", this);
+            enabled = false;
+            return;
+        }
+        int[][] targets = _stream.Targets;
         float[] weights = _stream.Weights;
-        if (weights.Length != names.Count) return;
-        var face = new Dictionary<string, float>();
-        for (int i = 0; i < weights.Length; i++) face[names[i]] = weights[i];
-        foreach (var target in _shapes)
-            if (face.TryGetValue(target.name, out float weight))
-                target.mesh.SetBlendShapeWeight(target.shape, fullWeight * weight);
+        if (weights.Length != targets.Length) return;
+        for (int i = 0; i < weights.Length; i++)
+            _meshes[targets[i][0]].SetBlendShapeWeight(targets[i][1], fullWeight * weights[i]);
     }
 }

@@ -4,33 +4,42 @@
 using System;
 using System.Collections.Generic;
 using System.IO;
+using System.Linq;
 using System.Net.WebSockets;
 using System.Text;
 using System.Text.RegularExpressions;
 using System.Threading;
 using System.Threading.Tasks;
 
-/// <summary>The current face: the names of the shapes and their weights, 0 to 1.</summary>
+/// <summary>The current face of an avatar: which of its shapes move, and their weights, 0 to 1.</summary>
 public sealed class KouxingStream : IDisposable
 {
     const int WeightsOfFrame = 4, WeightsAtRest = 5; // types of binary messages, proto/GATEWAY.md
     const int HeaderBytes = 16;
     const int RetryMs = 1000;
-    static readonly Regex Quoted = new Regex("\"([^\"]*)\"");
+    static readonly Regex Target = new Regex(@"\[(\d+),(\d+)\]");
+    static readonly Regex ErrorText = new Regex(@"""text"":""((?:[^""\\]|\\.)*)""");
 
     readonly Uri _url;
+    readonly byte[] _avatar;
     readonly CancellationTokenSource _stop = new CancellationTokenSource();
 
-    /// <summary>Names in the order of the weights; empty until connected.</summary>
-    public IReadOnlyList<string> Names { get; private set; } = Array.Empty<string>();
+    /// <summary>What each weight moves: a mesh and a shape within it, counted from 0.</summary>
+    public int[][] Targets { get; private set; } = Array.Empty<int[]>();
 
     /// <summary>Weights of the newest face. The array is replaced, never changed, so any thread may read it.</summary>
     public float[] Weights { get; private set; } = Array.Empty<float>();
 
-    /// <summary>Follow a session until disposed; an empty name means the newest. Shapes: arkit, oculus or vrm.</summary>
-    public KouxingStream(string gateway = "ws://127.0.0.1:8080", string session = "", string shapes = "arkit")
+    /// <summary>Why the avatar cannot speak; empty if it can.</summary>
+    public string Error { get; private set; } = "";
+
+    /// <summary>Follow a session until disposed; an empty name means the newest.</summary>
+    /// <param name="meshes">Names of the shapes of each mesh: ARKit's, Oculus', VRM's, or other programs' names.</param>
+    public KouxingStream(string gateway, string session, IEnumerable<IEnumerable<string>> meshes)
     {
-        _url = new Uri(gateway + "/viewer?shapes=" + shapes + "&session=" + Uri.EscapeDataString(session));
+        _url = new Uri(gateway + "/viewer?session=" + Uri.EscapeDataString(session));
+        var lists = meshes.Select(names => "[" + string.Join(",", names.Select(Quote)) + "]");
+        _avatar = Encoding.UTF8.GetBytes("{\"avatar\": [" + string.Join(",", lists) + "]}");
         _ = Task.Run(RunAsync);
     }
 
@@ -45,6 +54,8 @@ public sealed class KouxingStream : IDisposable
                 using (var socket = new ClientWebSocket())
                 {
                     await socket.ConnectAsync(_url, _stop.Token);
+                    var avatar = new ArraySegment<byte>(_avatar);
+                    await socket.SendAsync(avatar, WebSocketMessageType.Text, true, _stop.Token);
                     await ReceiveAsync(socket);
                 }
             }
@@ -71,15 +82,17 @@ public sealed class KouxingStream : IDisposable
         }
     }
 
-    // {"type": "shapes", "set": "arkit", "names": ["browDownLeft", ...]}
+    // {"type":"avatar","set":"arkit","targets":[[0,3],[0,17], ...]}
     void ReadText(string text)
     {
-        int names = text.IndexOf("\"names\"", StringComparison.Ordinal);
-        if (!text.Contains("\"shapes\"") || names < 0) return;
-        var list = new List<string>();
-        foreach (Match match in Quoted.Matches(text, text.IndexOf('[', names))) list.Add(match.Groups[1].Value);
-        Names = list;
+        if (text.Contains("\"avatar\""))
+            Targets = Target.Matches(text).Cast<Match>().Select(match => match.Groups)
+                .Select(groups => new[] { int.Parse(groups[1].Value), int.Parse(groups[2].Value) }).ToArray();
+        else if (text.Contains("\"error\"") && Targets.Length == 0)
+            Error = Regex.Unescape(ErrorText.Match(text).Groups[1].Value);
     }
+
+    static string Quote(string text) => "\"" + text.Replace("\\", "\\\\").Replace("\"", "\\\"") + "\"";
 
     void ReadBinary(byte[] message)
     {

@@ -3,27 +3,35 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
 from kouxing.services.gateway import wire
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS
 
 FORMATS = ("binary", "json", "msgpack")
+MAX_AVATAR_SHAPES = 1024
+_MeshShapes = list[Annotated[str, msgspec.Meta(max_length=128)]]  # names of the shapes of one mesh
 _BINARY_TYPES = {"weights": wire.SHAPES_TYPE, "rest": wire.REST_SHAPES_TYPE}
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeEncoder:
-    """Encodes frames as weights of one shape set."""
+    """Encodes frames as weights of one shape set, or of the shapes of an avatar."""
 
     shape_set: str
     message_format: str  # one of FORMATS
+    targets: tuple[tuple[int, int], ...] = ()  # an avatar's meshes and the shapes within them
+    indices: tuple[int, ...] = ()  # of their weights in the set
 
-    def names_message(self) -> str:
-        """Return the message with the names of the shapes, in the order of binary weights."""
+    def announcement(self) -> str:
+        """Return the message with the names or the targets, in the order of the weights."""
+        if self.targets:
+            return wire.text("avatar", set=self.shape_set, targets=self.targets)
         return wire.text("shapes", set=self.shape_set, names=SHAPE_SETS[self.shape_set].names)
 
     def encode(self, kind: str, epoch: int, media_time: int, faps: bytes) -> str | bytes:
@@ -33,18 +41,18 @@ class ShapeEncoder:
         """
         shapes = SHAPE_SETS[self.shape_set]
         weights = shapes.weights(np.frombuffer(faps, "<f4"))
+        if self.targets:
+            weights = weights[[*self.indices]]
         if self.message_format == "binary":
             payload = weights.astype("<f4").tobytes()
             return wire.binary(_BINARY_TYPES[kind], epoch, media_time, payload)
+        rounded = [round(float(weight), 4) for weight in weights]
         fields = {
             "type": kind,
             "set": self.shape_set,
             "epoch": epoch,
             "media_time": media_time,
-            "weights": {
-                name: round(float(weight), 4)
-                for name, weight in zip(shapes.names, weights, strict=True)
-            },
+            "weights": rounded if self.targets else dict(zip(shapes.names, rounded, strict=True)),
         }
         encode = json.dumps if self.message_format == "json" else msgspec.msgpack.encode
         return encode(fields)
@@ -61,3 +69,27 @@ def parse_shape_query(query: Mapping[str, str]) -> ShapeEncoder | None:
     if message_format not in FORMATS:
         raise UserError(f"format must be one of {', '.join(FORMATS)}")
     return ShapeEncoder(shape_set, message_format) if shape_set else None
+
+
+def parse_avatar(command: Mapping[str, object]) -> ShapeEncoder:
+    """Return the encoder for an avatar; the command lists the shape names of its meshes.
+
+    Raises ``UserError`` if the command is malformed, or the avatar cannot speak.
+    """
+    try:
+        meshes = msgspec.convert(command["avatar"], list[_MeshShapes])
+    except msgspec.ValidationError as error:
+        raise UserError(f"avatar must list the shape names of each mesh: {error}") from None
+    names = [name for mesh in meshes for name in mesh]
+    if len(names) > MAX_AVATAR_SHAPES:
+        raise UserError(f"the avatar has more than {MAX_AVATAR_SHAPES} shapes; send fewer")
+    message_format = command.get("format", FORMATS[0])
+    if message_format not in FORMATS:
+        raise UserError(f"format must be one of {', '.join(FORMATS)}")
+    shape_set = choose_set(names)
+    indices = {
+        (number, mesh.index(name)): SHAPE_SETS[shape_set].names.index(shape)
+        for number, mesh in enumerate(meshes)
+        for name, shape in find_shapes(shape_set, mesh).items()
+    }
+    return ShapeEncoder(shape_set, str(message_format), tuple(indices), tuple(indices.values()))

@@ -13,7 +13,7 @@ from kouxing.services.gateway import wire
 from kouxing.services.gateway.http import WebSockets
 from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.services.gateway.sample import SampleSentence
-from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
+from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_avatar, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
@@ -179,7 +179,7 @@ class Viewers:
         try:
             self._put(viewer, MessageKind.TEXT, self._status())
             if shape_encoder is not None:
-                self._put(viewer, MessageKind.TEXT, shape_encoder.names_message())
+                self._put(viewer, MessageKind.TEXT, shape_encoder.announcement())
             self._notify_viewer(viewer)
             yield viewer
         finally:
@@ -215,10 +215,13 @@ class Viewers:
                 self._set_face(viewer.shown[0] if viewer.shown else "", settings)
             elif isinstance(session, str) and (not session or is_name(session)):
                 viewer.chosen = session
+            elif "avatar" in command:
+                viewer.shape_encoder = parse_avatar(command)
+                self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.announcement())
             else:
                 raise UserError(
-                    "expected 'follow' with a session's name, 'play', 'lips', 'acoustic', "
-                    "'express', 'expressiveness', 'feeling', 'still', 'eye_contact', "
+                    "expected 'follow' with a session's name, 'avatar', 'play', 'lips', "
+                    "'acoustic', 'express', 'expressiveness', 'feeling', 'still', 'eye_contact', "
                     "'listen_to' or 'listening'"
                 )
         except UserError as error:

@@ -1,9 +1,10 @@
 """Names of the blendshape sets, and the names that avatars give to their shapes.
 
-``shape_names.txt`` is the only table of names. The JavaScript client, Blender, Unity and Godot
-contain the same table. Each line or continuation belongs to a set. An entry is a shape and its
-other names, ``shape=OTHER=PART+PART``; a sum of parts also forms the shape. An avatar can speak if
-it has the first shape of a set, and speaks well if it has all shapes with ``*``.
+``shape_names.txt`` is the only table of names. The JavaScript client and Blender contain the same
+table; Unity and Godot send the names of their avatar to the gateway. Each line or continuation
+belongs to a set. An entry is a shape and its other names, ``shape=OTHER=PART+PART``; a sum of parts
+also forms the shape. An avatar can speak if it has the first shape of a set, and speaks well if it
+has all shapes with ``*``.
 
 Names match in any case, after any prefix, before a number (``.001``), and with ``_L``, ``.L`` or
 ``Left`` at the end. A name of one letter matches only without a prefix or after ``.``, ``:``, ``|``
@@ -11,8 +12,9 @@ or ``/``. After a prefix without a separator (``bsJawOpen``), only names of 7 or
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from enum import StrEnum
+from functools import lru_cache
 from pathlib import Path
 
 from kouxing.shared.errors import UserError
@@ -89,15 +91,17 @@ def _sided(name: str) -> str:
     )
 
 
-def _candidates(name: str) -> Iterator[str]:
-    """Yield the keys of a name without none, one, two, ... words at its beginning."""
+@lru_cache(maxsize=1024)
+def _candidates(name: str) -> list[str]:
+    """Return the keys of a name without none, one, two, ... words at its beginning."""
     name = _sided(name)
-    yield _key(name)
+    keys = [_key(name)]
     for separator in _SEPARATOR.finditer(name):
         key = _key(name[separator.end() :])
         mark = separator[0]
         if len(key) > (1 if mark else 6) or mark in tuple(".:|/"):
-            yield key
+            keys.append(key)
+    return keys
 
 
 def _read_table() -> tuple[dict[str, dict[str, list[list[str]]]], dict[str, list[str]]]:

@@ -274,6 +274,7 @@ def test_follow_a_session_that_moves_to_its_end(system: System, programs: list[l
 
 def test_the_csharp_program_follows_through_the_gateway(system: System, tmp_path: Path) -> None:
     program = tmp_path / "follow.exe"
+    subprocess.run(["mcs", "--parse", *STREAM.parent.glob("*.cs")], check=True)
     subprocess.run(["mcs", f"-out:{program}", FOLDER / "Follow.cs", STREAM], check=True)
     address = system.page.replace("http", "ws").rstrip("/")
     name, jaw, samples = "followed-by-c-sharp", 0.0, SAMPLES

@@ -151,8 +151,6 @@ def test_knows_all_shapes_and_every_program_has_the_same_table() -> None:
     for path in (
         "clients/javascript/shape-names.js",
         "examples/blender/kouxing_face.py",
-        "examples/godot/kouxing_shape_names.gd",
-        "examples/unity/KouxingShapeNames.cs",
     ):
         text = (ROOT / path).read_text(encoding="utf-8")
         assert TABLE in text, f"copy shared/face/shape_names.txt into {path}"
