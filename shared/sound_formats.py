@@ -11,16 +11,20 @@ _MAX_LEADING_ZEROS = 4  # that are part of a format
 MAX_ZERO_BYTES = 131_072  # padding before a format
 _NUM_FRAMED_BYTES = 8192  # size of the checked start of a stream that may begin within a frame
 _NUM_HEADER_BYTES = 4096  # size of the checked start of a WAV or MP4 file
+_COMMON = {
+    (0, b"RIFF"): "a WAV file", (0, b"RF64"): "a WAV file", (0, b"OggS"): "an Ogg file",
+    (0, b"fLaC"): "a FLAC file", (0, b"ID3"): "an MP3 file", (0, b"FORM"): "an AIFF file",
+    (0, b".snd"): "an AU file", (0, b"caff"): "a CAF file", (4, b"ftyp"): "an MP4 file",
+    (0, b"\x1a\x45\xdf\xa3"): "WebM, the format of MediaRecorder",
+}  # fmt: skip
 _SOUND = (
-    (0, b"RIFF"), (0, b"RIFX"), (0, b"RF64"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"),
-    (0, b"OggS"), (0, b"fLaC"), (0, b"ID3"), (0, b"FORM"), (0, b"caff"), (0, b"#!AMR"),
-    (0, b".snd"), (0, b"\x1a\x45\xdf\xa3"), (0, b"\x30\x26\xb2\x75\x8e\x66\xcf\x11"), (0, b"FLV"),
-    (0, b"wvpk"), (0, b"TTA1"), (0, b"MAC "), (0, b"\0\0\1\xba"), (4, b"ftyp"), (4, b"moov"),
-    (4, b"mdat"), (4, b"wide"), (0, b".RMF"), (0, b".ra\xfd"), (0, b"Creative Voi"),
-    (0, b"nut/multimed"), (0, b"\0\0\0\0\1\xbc"), (0, b"\6\x0e\x2b\x34"), (0, b"NIST_1A"),
-    (0, b"\xb7\xd8\0\x20\x37\x49\xda\x11"), (0, b".SoX"), (0, b"XoS."), (0, b"MMMD"),
-    (0, b"STRM\0"), (0, b"DSD "), (0, b"FRM8"), (0, b"tBaK"), (0, b"MPCK"), (0, b"#!iLBC"),
-    (0, b" paf"), (0, b"fap "), (0, b"PVF1"), (0, b"2BIT"),
+    *_COMMON, (0, b"RIFX"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"), (0, b"#!AMR"),
+    (0, b"\x30\x26\xb2\x75\x8e\x66\xcf\x11"), (0, b"FLV"), (0, b"wvpk"), (0, b"TTA1"),
+    (0, b"MAC "), (0, b"\0\0\1\xba"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b".RMF"),
+    (0, b".ra\xfd"), (0, b"Creative Voi"), (0, b"nut/multimed"), (0, b"\0\0\0\0\1\xbc"),
+    (0, b"\6\x0e\x2b\x34"), (0, b"NIST_1A"), (0, b"\xb7\xd8\0\x20\x37\x49\xda\x11"), (0, b".SoX"),
+    (0, b"XoS."), (0, b"MMMD"), (0, b"STRM\0"), (0, b"DSD "), (0, b"FRM8"), (0, b"tBaK"),
+    (0, b"MPCK"), (0, b"#!iLBC"), (0, b" paf"), (0, b"fap "), (0, b"PVF1"), (0, b"2BIT"),
     (0, b"\2dss"), (0, b"\3ds2"), (0, b"\x72\xf8\x1f\x4e"), (0, b"MP+"), (0, b"ajkg"),
     *((0, bytes([0x64, 0xA3, kind, 0])) for kind in (1, 2, 3, 4)),  # IRCAM
     *((0, bytes([0, kind, 0xA3, 0x64])) for kind in (1, 2, 3, 4)),
@@ -79,6 +83,12 @@ def is_sound(begin: bytes) -> bool:
         or is_transport_stream(begin)
         or _consists_of_frames(begin)
     )
+
+
+def audio_file_kind(begin: bytes) -> str:
+    """Return the kind of a common file of sound or video in words; empty for all other data."""
+    kinds = (kind for (offset, mark), kind in _COMMON.items() if begin.startswith(mark, offset))
+    return next(kinds, "")
 
 
 def find_sound_start(begin: bytes) -> int | None:

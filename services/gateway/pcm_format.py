@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.sound_formats import audio_file_kind
 from kouxing.shared.user_file import parse_json
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
@@ -13,17 +14,6 @@ MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
 RATES_HZ = (8000, 48000)
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file
-_FILES = {  # by their first bytes
-    b"RIFF": "a WAV file",
-    b"RF64": "a WAV file",
-    b"OggS": "an Ogg file",
-    b"fLaC": "a FLAC file",
-    b"ID3": "an MP3 file",
-    b"FORM": "an AIFF file",
-    b".snd": "an AU file",
-    b"caff": "a CAF file",
-    b"\x1aE\xdf\xa3": "WebM, the format of MediaRecorder",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +62,7 @@ class PcmFormat:
 
         Raises ``UserError`` if they do not have this format; the text says what was expected.
         """
-        if is_first and (kind := _file_kind(pcm)):
+        if is_first and (kind := audio_file_kind(pcm)):
             raise UserError(f"expected {self}; this looks like the start of {kind}")
         if self.encoding == "f32le":
             self._check_level(np.frombuffer(pcm, "<f4"))
@@ -93,11 +83,6 @@ def check_text(text: str) -> None:
             "expected binary messages of samples, or a JSON object; this text looks like base64:"
             " send the bytes as a binary message"
         )
-
-
-def _file_kind(pcm: bytes) -> str:
-    kinds = (kind for prefix, kind in _FILES.items() if pcm.startswith(prefix))
-    return next(kinds, "an MP4 file" if pcm[4:8] == b"ftyp" else "")
 
 
 def _is_json(pcm: bytes) -> bool:
