@@ -6,12 +6,12 @@ import pytest
 from kouxing_client import SHAPE_NAMES, FapFrame
 from kouxing_client.audio import ANSWER_LIMITS_S
 from kouxing_client.core import RETRY_S, ClientCore
+from kouxing_client.inbox import Inbox
 from kouxing_client.messages import Joined
 from kouxing_client.session_core import (
     MOVE_LIMIT_S,
     RESUBSCRIBE_S,
     SILENT_S,
-    Inbox,
     SessionCore,
     Subscription,
 )
@@ -41,17 +41,12 @@ CONTROL_STATE = {
 }
 
 
-class NoSignal:
-    def notify(self) -> None:
-        pass
-
-
 class Scene:
     """A core with one session."""
 
     def __init__(self, *, paced: bool = True) -> None:
         self.sockets = FakeSockets()
-        self.core = ClientCore(cast(Any, self.sockets), "control", 10.0, NoSignal)
+        self.core = ClientCore(cast(Any, self.sockets), "control", 10.0)
         opening = self.core.open_session({"sample_rate_hz": 16000, "paced": paced})
         self.answer("session-opened", **OPENED)
         self.session: SessionCore = opening.result()
@@ -80,9 +75,8 @@ class Scene:
 
     def subscribe(self) -> Inbox:
         """Subscribe to frames."""
-        inbox = Inbox(NoSignal(), None)
-        subscription = Subscription(self.session, (FapFrame,), "", inbox, lambda _: None)
-        self.session.subscribe(subscription)
+        inbox = Inbox(None)
+        self.session.subscribe(Subscription(self.session, (FapFrame,), "", inbox))
         return inbox
 
     def confirm(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from kouxing_client.base import (
@@ -24,32 +24,8 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound=Result | Event)
 
 
-class AsyncSignal:
-    """Wakes the waiting tasks of one event loop."""
-
-    def __init__(self) -> None:
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._event = asyncio.Event()
-
-    def notify(self) -> None:
-        """Wake all waiting tasks; any thread may call this."""
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the event loop is closed
-                self._loop.call_soon_threadsafe(self._event.set)
-
-    async def wait(self, condition: Callable[[], bool]) -> None:
-        """Wait until a condition holds."""
-        self._loop = asyncio.get_running_loop()
-        while not condition():
-            self._event.clear()
-            if not condition():
-                await self._event.wait()
-
-
 class AsyncClient(BaseClient):
     """A connection to a running system; ``BaseClient`` describes the parameters."""
-
-    _make_signal = AsyncSignal
 
     async def __aenter__(self) -> AsyncClient:
         return self
@@ -97,8 +73,6 @@ class AsyncClient(BaseClient):
 class AsyncSession(BaseSession):
     """One session. ``BaseSession`` describes the common behavior."""
 
-    _signal: AsyncSignal
-
     async def __aenter__(self) -> AsyncSession:
         return self
 
@@ -108,7 +82,7 @@ class AsyncSession(BaseSession):
     async def push(self, audio: Any) -> None:
         """Send audio, as ``Session.push``."""
         for pcm, num_frames in self._chunks(audio):
-            await self._signal.wait(self._can_push)
+            await self._signal.wait_async(self._can_push)
             if not self._has_room():
                 self._check()
             self._add(pcm, num_frames)
@@ -131,7 +105,7 @@ class AsyncSession(BaseSession):
             return
         if self._options is not None:
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._signal.wait(self._is_delivered), LAST_ANSWER_S)
+                await asyncio.wait_for(self._signal.wait_async(self._is_delivered), LAST_ANSWER_S)
             with contextlib.suppress(Refused):  # already closed
                 await asyncio.wrap_future(self._close())
         await asyncio.wrap_future(self._thread.forget(self._core))
@@ -174,13 +148,11 @@ class AsyncSession(BaseSession):
 class AsyncResults(BaseResults, Generic[T]):
     """Results of one session. Iteration ends with the session's last frame."""
 
-    _signal: AsyncSignal
-
     def __aiter__(self) -> AsyncResults[T]:
         return self
 
     async def __anext__(self) -> T:
-        await self._signal.wait(self._has_news)
+        await self._signal.wait_async(self._has_news)
         result = self._take()
         if result is None:
             raise StopAsyncIteration

@@ -3,14 +3,16 @@
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from functools import partial
 from typing import Any, TypedDict
 
 from kouxing_client.audio import SAMPLE_BYTES, split, to_pcm
-from kouxing_client.core import ClientCore, new_future
+from kouxing_client.core import ClientCore
 from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.inbox import Inbox
 from kouxing_client.keys import Key, find_key
 from kouxing_client.messages import Fields, Result
-from kouxing_client.session_core import Inbox, SessionCore, Signal, Subscription
+from kouxing_client.session_core import SessionCore, Subscription
 from kouxing_client.thread import ClientThread
 
 CONTROL = "tcp://127.0.0.1:5550"
@@ -69,8 +71,6 @@ class BaseClient:
         If no key is found, or the address is invalid.
     """
 
-    _make_signal: Callable[[], Signal]
-
     def __init__(
         self,
         control: str | None = None,
@@ -81,7 +81,7 @@ class BaseClient:
     ) -> None:
         control = control or os.environ.get("KOUXING_CONTROL") or CONTROL
         key = None if insecure else key or find_key()
-        self._thread = ClientThread(control, key, timeout_s, type(self)._make_signal)
+        self._thread = ClientThread(control, key, timeout_s)
 
     @property
     def is_closed(self) -> bool:
@@ -98,8 +98,6 @@ class BaseSession:
     Lost messages are resent. Results continue when the session moves to another worker. The session
     is a context manager that closes it at the end.
     """
-
-    _signal: Any  # wakes callers that wait for the session
 
     def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
         self._thread = thread
@@ -232,18 +230,12 @@ class BaseSession:
         on_result: Callable[[Any], None] | None = None,
     ) -> tuple[Inbox, Callable[[], None], Future[None]]:
         """Start a subscription; return its inbox, how to close it, and when it is in effect."""
-        thread, core, joined = self._thread, self._core, new_future()
-
-        def on_joined(failure: KouxingError | None) -> None:
-            if failure is None:
-                joined.set_result(None)
-            else:
-                joined.set_exception(failure)
-
-        inbox = Inbox(thread.make_signal(), MAX_LIVE if core.is_live and not keep_all else None)
-        subscription = Subscription(core, classes, shape_set, inbox, on_joined, on_result)
+        thread, core = self._thread, self._core
+        inbox = Inbox(MAX_LIVE if core.is_live and not keep_all else None)
+        subscription = Subscription(core, classes, shape_set, inbox, on_result)
         thread.call(lambda: core.subscribe(subscription))
-        return inbox, lambda: thread.call(lambda: core.unsubscribe(subscription)), joined
+        close = partial(thread.call, lambda: core.unsubscribe(subscription))
+        return inbox, close, subscription.joined
 
     def _not_joined(self) -> KouxingError:
         """Return the error of a subscription that is not confirmed."""
@@ -263,7 +255,7 @@ class BaseSession:
     def _read_events(self) -> tuple[Inbox, Callable[[], None]]:
         """Return an inbox, and the function that closes it."""
         thread, core = self._thread, self._thread.core
-        inbox = Inbox(thread.make_signal(), MAX_EVENTS)
+        inbox = Inbox(MAX_EVENTS)
         thread.call(lambda: core.add_inbox(self.name, inbox))
         return inbox, lambda: thread.call(lambda: core.remove_inbox(self.name, inbox))
 
@@ -295,8 +287,6 @@ class BaseSession:
 
 class BaseResults:
     """Results or events of one session. After ``close()``, no more arrive."""
-
-    _signal: Any  # wakes callers that wait for results
 
     def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
         self._inbox = inbox

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import TimeoutError as FutureTimeout
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
@@ -25,31 +24,12 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound=Result | Event)
 
 
-class ThreadSignal:
-    """Wakes threads."""
-
-    def __init__(self) -> None:
-        self._condition = threading.Condition()
-
-    def notify(self) -> None:
-        """Wake all waiting threads."""
-        with self._condition:
-            self._condition.notify_all()
-
-    def wait(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until a condition holds; return whether it does."""
-        with self._condition:
-            return self._condition.wait_for(condition, timeout_s)
-
-
 class Client(BaseClient):
     """A connection to a running system; ``BaseClient`` describes the parameters.
 
     All requests raise ``Refused`` if control rejects them, and ``KouxingError`` if control does not
     answer.
     """
-
-    _make_signal = ThreadSignal
 
     def __enter__(self) -> Client:
         return self
@@ -115,8 +95,6 @@ class Client(BaseClient):
 
 class Session(BaseSession):
     """One session. ``BaseSession`` describes the common behavior."""
-
-    _signal: ThreadSignal
 
     def __enter__(self) -> Session:
         return self
@@ -232,8 +210,6 @@ class Session(BaseSession):
 
 class Results(BaseResults, Generic[T]):
     """Results of one session. Iteration ends with the session's last frame."""
-
-    _signal: ThreadSignal
 
     def __iter__(self) -> Results[T]:
         return self

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.inbox import Inbox, new_future
 from kouxing_client.messages import (
     Decoders,
     Event,
@@ -25,7 +26,7 @@ from kouxing_client.messages import (
     kind_of,
     topic,
 )
-from kouxing_client.session_core import SILENT_S, Inbox, SessionCore, Signal, refused
+from kouxing_client.session_core import SILENT_S, SessionCore, refused
 
 if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
@@ -51,14 +52,11 @@ class ClientCore:
     For the parameters, see ``ClientThread``; ``control`` includes control's public key.
     """
 
-    def __init__(
-        self, sockets: Sockets, control: str, timeout_s: float, make_signal: Callable[[], Signal]
-    ) -> None:
+    def __init__(self, sockets: Sockets, control: str, timeout_s: float) -> None:
         self.sessions: list[SessionCore] = []
         self._sockets = sockets
         self._control = control
         self._timeout_s = timeout_s
-        self._make_signal = make_signal
         self._requests: dict[str, _Request] = {}
         self._refused_s = math.inf  # when control started to reject this key
         self._is_explaining = False  # finding out why control does not answer
@@ -199,8 +197,7 @@ class ClientCore:
         )
 
     def _add(self, opened: Fields, options: Fields | None, *, is_live: bool) -> SessionCore:
-        signal = self._make_signal()
-        session = SessionCore(self._sockets, opened, options, signal, is_live=is_live)
+        session = SessionCore(self._sockets, opened, options, is_live=is_live)
         if self._events is None:
             self._events = self._sockets.connect_events(opened["events"], self._on_event)
         self.sessions.append(session)
@@ -301,13 +298,6 @@ def newest_session(status: Status, name: str) -> Fields:
         "epoch": 0,
         "facts": msgspec.to_builtins(newest.facts),
     }
-
-
-def new_future() -> Future[Any]:
-    """Return a future that the waiting thread cannot cancel."""
-    future: Future[Any] = Future()
-    future.set_running_or_notify_cancel()
-    return future
 
 
 @contextlib.contextmanager

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any
 
 from kouxing_client.audio import AudioStream
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.follower import Follower
+from kouxing_client.inbox import Inbox, Signal, new_future
 from kouxing_client.messages import (
     EndOfFaps,
     FapFrame,
@@ -37,34 +39,6 @@ AUDIO_QUEUE = 500  # messages
 SILENT_S = 2.0  # without results for this time, a session may have moved or ended
 
 
-class Signal(Protocol):
-    """Wakes threads or tasks that wait for a change."""
-
-    def notify(self) -> None:
-        """Report a change; any thread may call this."""
-
-
-class Inbox:
-    """Messages that wait for the program; any thread may use it."""
-
-    def __init__(self, signal: Signal, capacity: int | None) -> None:
-        self.messages: deque[Any] = deque(maxlen=capacity)
-        self.is_over = False  # no more messages arrive
-        self.failure: KouxingError | None = None  # reason for an early end
-        self.num_missed = 0  # frames and phones that did not arrive
-        self.signal = signal
-
-    def add(self, message: Any) -> None:
-        """Add a message."""
-        self.messages.append(message)
-        self.signal.notify()
-
-    def end(self, failure: KouxingError | None) -> None:
-        """Add no more messages."""
-        self.is_over, self.failure = True, self.failure or failure
-        self.signal.notify()
-
-
 class Subscription:
     """Passes on the results of one session, in order of arrival.
 
@@ -74,10 +48,13 @@ class Subscription:
         Name of the set of blendshapes, if ``classes`` has ``Shapes``.
     inbox
         Gets the results; ends with the session.
-    on_joined
-        Called once: with None when the subscription is in effect, with an error when it fails.
     on_result
         Called with each result, in place of the inbox.
+
+    Attributes
+    ----------
+    joined
+        Done when the subscription is in effect, or has failed.
     """
 
     def __init__(
@@ -86,13 +63,12 @@ class Subscription:
         classes: tuple[type[Result], ...],
         shape_set: str,
         inbox: Inbox,
-        on_joined: Callable[[KouxingError | None], None],
         on_result: Callable[[Any], None] | None = None,
     ) -> None:
         self.inbox = inbox
+        self.joined: Future[None] = new_future()
         self._session = session
         self._shape_set = shape_set
-        self._on_joined: Callable[[KouxingError | None], None] | None = on_joined
         self._on_result = on_result or inbox.add
         self._classes = classes
         self._phones = PhoneTrack()
@@ -126,12 +102,8 @@ class Subscription:
         self.follower.drain()
         self.follower.close()
         self.inbox.end(None if self.follower.has_ended else failure)
-        self._join(failure or KouxingError("the subscription is closed"))
-
-    def _join(self, failure: KouxingError | None) -> None:
-        if self._on_joined is not None:
-            on_joined, self._on_joined = self._on_joined, None
-            on_joined(failure)
+        if not self.joined.done():
+            self.joined.set_exception(failure or KouxingError("the subscription is closed"))
 
     def _on_message(self, message: Any) -> None:
         if isinstance(message, EndOfFaps):
@@ -166,7 +138,8 @@ class Subscription:
     def _on_complete(self) -> None:
         if self.follower.has_ended:
             self.inbox.end(None)
-        self._join(None)
+        if not self.joined.done():
+            self.joined.set_result(None)
 
     def _pass_on(self, phones: list[Phone]) -> None:
         for phone in phones:
@@ -184,8 +157,6 @@ class SessionCore:
         Control's answer: ``session``, ``epoch``, and endpoints by name.
     options
         Fields of ``open-session``; None if another program opened the session.
-    signal
-        Notified of changes.
     is_live
         Whether results are worthless when they are late.
     """
@@ -195,7 +166,6 @@ class SessionCore:
         sockets: Sockets,
         opened: Fields,
         options: Fields | None,
-        signal: Signal,
         *,
         is_live: bool,
     ) -> None:
@@ -208,7 +178,7 @@ class SessionCore:
         self.stream: AudioStream | None = None
         if options is not None:
             self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_live)
-        self.signal = signal
+        self.signal = Signal()  # notified of changes
         self.errors: deque[Refused] = deque()  # errors about the audio
         self.failure: KouxingError | None = None  # reason for the end; None: closed
         self.is_over = False

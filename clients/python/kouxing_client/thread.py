@@ -5,10 +5,11 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-from kouxing_client.core import ClientCore, new_future, then
+from kouxing_client.core import ClientCore, then
 from kouxing_client.errors import KouxingError
+from kouxing_client.inbox import new_future
 from kouxing_client.keys import Key
-from kouxing_client.session_core import SessionCore, Signal
+from kouxing_client.session_core import SessionCore
 from kouxing_client.sockets import Sockets
 
 TICK_S = 0.05
@@ -27,8 +28,6 @@ class ClientThread:
         The key of this program; None if nothing is encrypted.
     timeout_s
         Time limit for an answer.
-    make_signal
-        Creates what wakes the threads or tasks that wait for a session.
 
     Raises
     ------
@@ -36,17 +35,14 @@ class ClientThread:
         If the address is invalid.
     """
 
-    def __init__(
-        self, control: str, key: Key | None, timeout_s: float, make_signal: Callable[[], Signal]
-    ) -> None:
+    def __init__(self, control: str, key: Key | None, timeout_s: float) -> None:
         if key is not None and " " not in control:
             control = f"{control} {key.control}"
         self.timeout_s = timeout_s
         self._sockets = Sockets(key)
         self._tick_s = 0.0
         self._is_stopping = False
-        self.make_signal = make_signal
-        self.core = ClientCore(self._sockets, control, timeout_s, make_signal)
+        self.core = ClientCore(self._sockets, control, timeout_s)
         self._thread = threading.Thread(target=self._run, name="kouxing-client", daemon=True)
         self._thread.start()
 

@@ -1,0 +1,69 @@
+"""What waits for the program: the messages of a session, and the threads or tasks to wake."""
+
+import asyncio
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+from kouxing_client.errors import KouxingError
+
+
+def new_future() -> Future[Any]:
+    """Return a future that the waiting thread cannot cancel."""
+    future: Future[Any] = Future()
+    future.set_running_or_notify_cancel()
+    return future
+
+
+class Signal:
+    """Wakes the threads, and the tasks of one event loop, that wait for a change."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._event = asyncio.Event()
+
+    def notify(self) -> None:
+        """Report a change; any thread may call this."""
+        with self._condition:
+            self._condition.notify_all()
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the event loop is closed
+                self._loop.call_soon_threadsafe(self._event.set)
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
+        """Block the thread until a condition holds; return whether it does."""
+        with self._condition:
+            return self._condition.wait_for(condition, timeout_s)
+
+    async def wait_async(self, condition: Callable[[], bool]) -> None:
+        """Wait in a task until a condition holds."""
+        self._loop = asyncio.get_running_loop()
+        while not condition():
+            self._event.clear()
+            if not condition():
+                await self._event.wait()
+
+
+class Inbox:
+    """Messages that wait for the program; any thread may use it."""
+
+    def __init__(self, capacity: int | None) -> None:
+        self.messages: deque[Any] = deque(maxlen=capacity)
+        self.is_over = False  # no more messages arrive
+        self.failure: KouxingError | None = None  # reason for an early end
+        self.num_missed = 0  # frames and phones that did not arrive
+        self.signal = Signal()
+
+    def add(self, message: Any) -> None:
+        """Add a message."""
+        self.messages.append(message)
+        self.signal.notify()
+
+    def end(self, failure: KouxingError | None) -> None:
+        """Add no more messages."""
+        self.is_over, self.failure = True, self.failure or failure
+        self.signal.notify()
