@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.names import NAME, NAME_RULE, is_name
+from kouxing.shared.output_file import write_private
 from kouxing.shared.user_file import parse_json, read_text
 
 if TYPE_CHECKING:
@@ -416,15 +417,7 @@ def _read(path: Path) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a private file atomically."""
-    new = path.with_name(f"{path.name}.new")
     try:
-        new.unlink(missing_ok=True)
-        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            file.write(text)
-        new.replace(path)
+        write_private(path, text.encode("ascii"))
     except OSError as error:
-        with contextlib.suppress(OSError):
-            new.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}") from None

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -31,6 +32,24 @@ def delete_on_error(path: Path) -> Iterator[None]:
     except BaseException:
         if path.is_file():  # not a device
             path.unlink()
+        raise
+
+
+def write_private(path: Path, content: bytes) -> None:
+    """Write a file that only this user can read. Other processes see it only when it is complete.
+
+    Raises ``OSError`` if the file cannot be written.
+    """
+    new = path.with_name(f"{path.name}.new")
+    try:
+        new.unlink(missing_ok=True)
+        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+        new.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            new.unlink()
         raise
 
 

@@ -2,7 +2,6 @@
 
 import datetime
 import ipaddress
-import os
 import ssl
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,6 +12,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.output_file import write_private
 from kouxing.shared.user_file import open_file
 
 _MAX_BYTES = 1 << 20
@@ -28,7 +28,7 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     """
     try:
         if not certificate.exists():
-            _write_private(certificate, _self_signed(hosts))
+            write_private(certificate, _self_signed(hosts))
         open_file(certificate, _MAX_BYTES).close()  # OpenSSL would block on a FIFO
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         context.load_cert_chain(certificate)
@@ -69,13 +69,3 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
-
-
-def _write_private(path: Path, content: bytes) -> None:
-    """Write a private file. Other processes see it only when it is complete."""
-    new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-    new.replace(path)

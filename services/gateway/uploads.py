@@ -16,7 +16,6 @@ from kouxing.shared.errors import UserError
 UPLOAD_LIMIT_S = 60.0
 PRESENCE_CHECK_S = 0.5  # interval at which a disconnected browser is noticed
 NICENESS = 19  # lowest priority, so that live streams do not suffer
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 class Uploads(ABC):
@@ -76,7 +75,6 @@ class Uploads(ABC):
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.PIPE,
-            env={**os.environ, **_ONE_THREAD},
             start_new_session=True,  # Ctrl-C in the terminal must reach only the gateway
         )
         with contextlib.suppress(ProcessLookupError):  # it has ended already
