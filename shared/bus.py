@@ -12,6 +12,7 @@ from typing import Self
 
 import zmq
 from kouxing_client.keys import Key
+from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
 from zmq.utils.monitor import recv_monitor_message
 
 from kouxing.shared.connections import KIB, ConnectionLimiter, Limits
@@ -22,16 +23,11 @@ from kouxing.shared.waker import Waker
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
 from kouxing.shared.zap import Zap, answer_handshakes
 
-QUEUE_LENGTH = 20_000  # messages: a subscriber to a recording may pause for 400 s
-LIVE_BUFFER = 65_536  # bytes in the kernel: a few seconds of FAP frames
 # Few answers to audio wait: not every client reads them.
 AUDIO = Limits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
 COMMANDS = Limits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
 PHONES = Limits(part_bytes=4 * KIB, queue_length=64)
 SUBSCRIPTIONS = Limits(part_bytes=512, queue_length=32, cost=1.0)  # most of it for the handshake
-RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to connect
-CONNECT_MS = 300  # for one attempt; limits the round-trip time
-HANDSHAKE_MS = 2000
 
 
 class ProbeResult(Enum):
@@ -147,13 +143,7 @@ class Bus:
         except zmq.ZMQError as error:  # out of files
             raise OSError(error.errno, error.strerror) from None
         raw.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        raw.setsockopt(zmq.SNDHWM, queue_length)
-        raw.setsockopt(zmq.RCVHWM, queue_length)
-        raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
-        raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
-        raw.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_MS)
-        raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
-        raw.setsockopt(zmq.LINGER, 0)
+        set_limits(raw, queue_length)
         return raw
 
     def _bind(
@@ -201,7 +191,7 @@ class Bus:
         self._sockets.append(socket)
         return socket
 
-    def _connect(self, kind: int, *endpoints: str, queue_length: int = QUEUE_LENGTH) -> Socket:
+    def _connect(self, kind: int, *endpoints: str, queue_length: int = QUEUE) -> Socket:
         raw = self._open(kind, queue_length)
         if kind == zmq.DEALER:  # a router recognizes this peer after a reconnect
             raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))

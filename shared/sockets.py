@@ -9,7 +9,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import TypeVar
 
 import zmq
+from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
+from kouxing_client.sockets import connect
 
 from kouxing.shared.connections import KIB, LONG_PENALTY_S, PENALTY_S, Connection, LimitedSocket
 from kouxing.shared.endpoints import split_endpoint
@@ -211,20 +213,11 @@ class Socket:
 
         Raises ``UserError`` if the endpoint is malformed, or only one side uses encryption.
         """
-        address, _, server_key = endpoint.partition(" ")
-        split_endpoint(address, "endpoint")
-        if bool(server_key) != (self._key is not None):
-            side = "this process" if server_key else f"the service at {address}"
-            raise UserError(f"only {side} has insecure = true; set it for both or for neither")
+        split_endpoint(endpoint.partition(" ")[0], "endpoint")
         try:
-            if self._key is not None:
-                self.raw.setsockopt_string(zmq.CURVE_SERVERKEY, server_key)
-                self.raw.setsockopt_string(zmq.CURVE_PUBLICKEY, self._key.public)
-                self.raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
-            self.raw.setsockopt(zmq.IPV6, "[" in address)
-            self.raw.connect(address)
-        except zmq.ZMQError as error:
-            raise UserError(f"cannot connect to {endpoint}: {error.strerror}") from None
+            connect(self.raw, endpoint, self._key)
+        except KouxingError as error:
+            raise UserError(str(error)) from None
 
     def close(self, *, linger_s: float = 1.0) -> None:
         """Close. Queued messages are dropped after ``linger_s``."""

@@ -17,7 +17,7 @@ from kouxing_client.keys import Key
 from kouxing_client.messages import Decoders, Joined, Message, topic
 from kouxing_client.reach import reach_error
 
-QUEUE = 20_000  # messages
+QUEUE = 20_000  # messages: a subscriber to a recording may pause for 400 s
 LIVE_BUFFER = 65_536  # bytes in the kernel: some seconds of FAP frames, over any distance
 RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to connect
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
@@ -27,6 +27,35 @@ SUSPENDED_S = 0.5  # a wait that takes this much longer than requested: the proc
 _MONITORED = zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CONNECT_RETRIED
 
 Connection = zmq.Socket[bytes]
+
+
+def set_limits(raw: Connection, queue: int, connect_ms: int = CONNECT_MS) -> None:
+    """Set the limits of a socket: messages in its queue, and the times to connect."""
+    raw.linger, raw.sndhwm, raw.rcvhwm = 0, queue, queue
+    raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
+    raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
+    raw.setsockopt(zmq.CONNECT_TIMEOUT, connect_ms)
+    raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+
+
+def connect(raw: Connection, endpoint: str, key: Key | None) -> None:
+    """Connect a socket to an address, which the server's public key may follow after a space.
+
+    Raises ``KouxingError`` if the address is malformed, or only one side uses encryption.
+    """
+    address, _, server = endpoint.partition(" ")
+    if bool(server) != (key is not None):
+        side = "this process" if server else f"the service at {address}"
+        raise KouxingError(f"only {side} has insecure = true; set it for both or for neither")
+    try:
+        if key is not None:
+            raw.setsockopt_string(zmq.CURVE_SERVERKEY, server)
+            raw.setsockopt_string(zmq.CURVE_PUBLICKEY, key.public)
+            raw.setsockopt_string(zmq.CURVE_SECRETKEY, key.secret)
+        raw.setsockopt(zmq.IPV6, "[" in address)
+        raw.connect(address)
+    except zmq.ZMQError as error:
+        raise KouxingError(f"cannot connect to {address!r}: {error.strerror}") from None
 
 
 class Sockets:
@@ -185,33 +214,17 @@ class Sockets:
             raw: Connection = self._context.socket(kind)
         except zmq.ZMQError as error:  # such as too many open files
             raise KouxingError(f"cannot open a socket: {error.strerror}") from None
-        raw.linger, raw.sndhwm, raw.rcvhwm = 0, queue, queue
-        raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
-        raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
-        raw.setsockopt(zmq.CONNECT_TIMEOUT, self.connect_ms)
-        raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        set_limits(raw, queue, self.connect_ms)
         self._handlers[raw] = on_message
         self._poller.register(raw, zmq.POLLIN)
         return raw
 
     def _connect(self, raw: Connection, endpoint: str) -> None:
-        address, _, server = endpoint.partition(" ")
         try:
-            if bool(server) != (self._key is not None):
-                raise KouxingError(
-                    f"{address}: only one end has 'insecure = true'; set it for both or neither"
-                )
-            if self._key is not None:
-                raw.setsockopt_string(zmq.CURVE_SERVERKEY, server)
-                raw.setsockopt_string(zmq.CURVE_PUBLICKEY, self._key.public)
-                raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
-            raw.setsockopt(zmq.IPV6, "[" in address)
-            raw.connect(address)
-        except (KouxingError, zmq.ZMQError) as error:
+            connect(raw, endpoint, self._key)
+        except KouxingError:
             self.close_connection(raw)
-            if isinstance(error, KouxingError):
-                raise
-            raise KouxingError(f"cannot connect to {address!r}: {error.strerror}") from None
+            raise
 
     def _monitor(self, raw: Connection, on_refused: Callable[[bool], None]) -> None:
         """Report refusals: a server that refuses a key accepts the connection, then closes it."""
