@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from kouxing_client.base import (
@@ -13,6 +12,7 @@ from kouxing_client.base import (
     BaseResults,
     BaseSession,
     FaceSettings,
+    SessionOptions,
     open_fields,
 )
 from kouxing_client.errors import Refused
@@ -37,18 +37,9 @@ class AsyncClient(BaseClient):
         """Close all connections, as ``Client.close``."""
         await asyncio.to_thread(self._thread.close)
 
-    async def open_session(
-        self,
-        name: str = "",
-        *,
-        sample_rate_hz: int = 16000,
-        num_channels: int = 1,
-        encoding: str = "s16le",
-        shapes: Sequence[str] = (),
-        **options: object,
-    ) -> AsyncSession:
+    async def open_session(self, name: str = "", **options: Unpack[SessionOptions]) -> AsyncSession:
         """Open a session, as ``Client.open_session``."""
-        fields = open_fields(name, sample_rate_hz, num_channels, encoding, shapes, options)
+        fields = open_fields(name, options)
         opened = self._thread.submit(lambda core: core.open_session(fields))
         return AsyncSession(self._thread, await asyncio.wrap_future(opened), fields)
 

@@ -11,7 +11,7 @@ from kouxing_client.core import ClientCore
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.inbox import Inbox
 from kouxing_client.keys import Key, find_key
-from kouxing_client.messages import Fields, Result
+from kouxing_client.messages import MEDIA_RATE_HZ, Fields, Result
 from kouxing_client.session_core import SessionCore, Subscription
 from kouxing_client.thread import ClientThread
 
@@ -48,6 +48,29 @@ class FaceSettings(TypedDict, total=False):
     """whether a person without a session is speaking, so that the face listens"""
     shapes: Sequence[str]
     """blendshape sets to publish in addition to FAPs"""
+
+
+class SessionOptions(TypedDict, total=False):
+    """How to open a session."""
+
+    sample_rate_hz: int
+    """of the audio, 8000 to 48000; default: 16000"""
+    num_channels: int
+    """of the audio: 1 (the default) or 2"""
+    encoding: str
+    """of pushed bytes and of messages: ``s16le`` (the default) or ``f32le``"""
+    paced: bool
+    """False: audio arrives faster than real time"""
+    language: str | None
+    """spoken language: ``auto``, a code or a name; None: the recognizer's"""
+    shapes: Sequence[str]
+    """sets of blendshapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``"""
+    face: FaceSettings
+    """settings of the face"""
+    mouth_profile: bytes | None
+    """the speaker's, from ``kouxing adapt``"""
+    record: bool
+    """whether the driver writes a video"""
 
 
 class BaseClient:
@@ -315,22 +338,17 @@ class BaseResults:
         return None
 
 
-def open_fields(
-    name: str,
-    sample_rate_hz: int,
-    num_channels: int,
-    encoding: str,
-    shapes: Sequence[str],
-    options: Mapping[str, Any],
-) -> Fields:
+def open_fields(name: str, options: SessionOptions) -> Fields:
     """Return the fields of ``open-session``."""
-    if encoding not in SAMPLE_BYTES:
-        raise KouxingError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
-    return {
+    fields: Fields = {
         "session": name,
-        "sample_rate_hz": sample_rate_hz,
-        "num_channels": num_channels,
-        "encoding": encoding,
+        "sample_rate_hz": MEDIA_RATE_HZ,
+        "num_channels": 1,
+        "encoding": "s16le",
         **options,
-        **({"face": {**options.get("face", {}), "shapes": list(shapes)}} if shapes else {}),
     }
+    if fields["encoding"] not in SAMPLE_BYTES:
+        raise KouxingError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
+    if shapes := fields.pop("shapes", ()):
+        fields["face"] = {**fields.get("face", {}), "shapes": list(shapes)}
+    return fields

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import TimeoutError as FutureTimeout
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
@@ -13,6 +13,7 @@ from kouxing_client.base import (
     BaseResults,
     BaseSession,
     FaceSettings,
+    SessionOptions,
     open_fields,
 )
 from kouxing_client.errors import KouxingError, Refused
@@ -41,33 +42,12 @@ class Client(BaseClient):
         """Close all connections. After a minute, control closes sessions that are still open."""
         self._thread.close()
 
-    def open_session(
-        self,
-        name: str = "",
-        *,
-        sample_rate_hz: int = 16000,
-        num_channels: int = 1,
-        encoding: str = "s16le",
-        shapes: Sequence[str] = (),
-        **options: object,
-    ) -> Session:
+    def open_session(self, name: str = "", **options: Unpack[SessionOptions]) -> Session:
         """Open a session, to which this program can send audio.
 
-        Parameters
-        ----------
-        name
-            Session name. If empty, control chooses one.
-        sample_rate_hz, num_channels
-            Format of the audio: 8000 to 48000 Hz, 1 or 2 channels.
-        encoding
-            Encoding of pushed bytes and of messages: ``s16le`` or ``f32le``.
-        shapes
-            Sets of blendshapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``.
-        options
-            Other fields of ``open-session``, such as ``paced=False`` for audio that arrives faster
-            than real time, or ``language="de"``.
+        If the name is empty, control chooses one. ``SessionOptions`` lists the keywords.
         """
-        fields = open_fields(name, sample_rate_hz, num_channels, encoding, shapes, options)
+        fields = open_fields(name, options)
         core = self._thread.submit(lambda core: core.open_session(fields)).result()
         return Session(self._thread, core, fields)
 
