@@ -192,7 +192,8 @@ class Viewers:
             async for message in browser:
                 if message.type is WSMsgType.TEXT:
                     self._handle_command(viewer, message.data)
-                await rate_limit.wait(COMMAND_S)
+                num_kib = len(message.data) >> 10  # long names of an avatar take time to find
+                await rate_limit.wait(COMMAND_S * (1 + num_kib))
         finally:
             writer.cancel()
 
