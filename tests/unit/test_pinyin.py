@@ -99,6 +99,8 @@ def test_splits_a_syllable_into_phones() -> None:
         ("(021)55556666，010 6552 9988", "零二一五五五五六六六六零一零六五五二九九八八"),
         ("编号0123，6222021234567890", "编号零一二三六二二二零二一二三四五六七八九零"),
         ("12：30分，9:05分，.5米，6*7", "十二点三十分九点零五分零点五米六乘七"),
+        ("AM8:00，上午AM 8:00，pm 9：15", "上午八点上午八点下午九点十五分"),
+        ("+86 13812345678，138-1234-5678", "加八六幺三八幺二三四五六七八幺三八幺二三四五六七八"),
         ("1.2.3版，9·11，08:05，0.25", "一点二点三版九一一八点零五分零点二五"),
     ],
 )
@@ -126,6 +128,25 @@ def test_reads_the_particle_only_after_an_adverb(texts: str, spelling: str) -> N
     for text in texts.split():
         read = [syllable.spelling for syllable in transcribe(text).syllables]
         assert read[text.index("地")] == spelling, text
+
+
+@pytest.mark.parametrize(
+    ("texts", "phone"),
+    [
+        (
+            "我得走了 他还得回家 他得出门 我得知道 大家都得来 我得天天练 我覺得他得來",
+            "ei",
+        ),
+        (
+            "他得了第一 他得出结论 我得知消息 她得奖了 我得一百分 使他得以生存 唱得好 值得",
+            "e",
+        ),
+    ],
+)
+def test_reads_must_only_between_a_pronoun_and_a_verb(texts: str, phone: str) -> None:
+    for text in texts.split():
+        last = [syllable for syllable in transcribe(text).syllables if syllable.text == "得"][-1]
+        assert last.phones == ("d", phone), text
 
 
 @pytest.mark.parametrize(

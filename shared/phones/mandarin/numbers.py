@@ -14,7 +14,9 @@ _SENTENCE = re.compile(
     r"[^。！？]{1,500}(?![^。！？])[。！？]*|.{1,500}(?<!\d)|.{1,500}", re.DOTALL
 )
 _HALF_WIDTH = str.maketrans("０１２３４５６７８９．％￥", "0123456789.%¥")
-_PHONE_NUMBER = re.compile(r"(?<!\d)(1\d\d|0\d{2,3}) (\d{4}) (\d{4})(?!\d)")
+_PHONE_NUMBER = re.compile(
+    r"(?<!\d)(?:(?P<prefix>\+86)[ -]?)?(1\d\d|0\d{2,3})(?P<gap>[ -]?)(\d{4})(?P=gap)(\d{4})(?!\d)"
+)
 _DIGITS = str.maketrans("0123456789.", "零一二三四五六七八九点", "·")
 _DATE = (
     r"(?<![\d.:/-])((?:19|20)\d\d)([-/.])(0?[1-9]|1[0-2])\2(0?[1-9]|[12]\d|3[01])"
@@ -37,7 +39,7 @@ _RANGE = (
 
 def unambiguous_numbers(text: str) -> str:
     """Rewrite the numbers that wetext 0.1 reads wrongly."""
-    text = _PHONE_NUMBER.sub(r"\1\2\3", text.translate(_HALF_WIDTH))
+    text = _PHONE_NUMBER.sub(_join_phone_number, text.translate(_HALF_WIDTH))
     text = re.sub(r"(?<=\d)\s+(?=\d)", "、", text)  # different numbers
     for pattern, replacement in _NUMBER_SPELLINGS:
         text = pattern.sub(replacement, text)
@@ -70,6 +72,11 @@ def _read_date(match: re.Match[str]) -> str:
     return f"{year}年{int(month)}月{int(day)}日"
 
 
+def _join_phone_number(match: re.Match[str]) -> str:
+    prefix, *parts = match.group("prefix", 2, 4, 5)
+    return f"{'加八六' if prefix else ''}{''.join(parts)}"
+
+
 def _read_digits(number: str) -> str:
     return number.translate(_DIGITS)
 
@@ -79,6 +86,8 @@ _NUMBER_SPELLINGS = tuple(
     (re.compile(pattern), replacement)
     for pattern, replacement in (
         (r"(?<=\d)：(?=\d)", ":"),
+        (r"(?<![A-Za-z])(?:上午)? ?[Aa][Mm] ?(?=\d{1,2}:\d\d(?!\d))", "上午"),
+        (r"(?<![A-Za-z])(?:下午)? ?[Pp][Mm] ?(?=\d{1,2}:\d\d(?!\d))", "下午"),
         (r"(?<!\d)(\d{1,2}):(\d\d)分(?!\d)", r"\1点\2分"),
         (r"(?<![^\s约负，、（(-])\.(?=\d)", "0."),
         (r"(?<=\d) ?[*＊] ?(?=\d)", "×"),

@@ -23,9 +23,9 @@ from dataclasses import replace
 from functools import lru_cache
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.mandarin.adverbs import adverb_particles
 from kouxing.shared.phones.mandarin.bopomofo import WORDS_IN_BOPOMOFO, read_bopomofo
 from kouxing.shared.phones.mandarin.numbers import numbers_as_words, unambiguous_numbers
+from kouxing.shared.phones.mandarin.particles import readings_in_context
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
 # Longest first, so that zh is not read as z + h.
@@ -370,8 +370,8 @@ def _pinyin_of(characters: str) -> list[str]:
         neutral_tone_with_five=True,
         v_to_u=False,
     )
-    for index in adverb_particles(simplified):
-        syllables[index] = "de5"
+    for index, reading in readings_in_context(simplified):
+        syllables[index] = reading
     return syllables
 
 

@@ -1,7 +1,8 @@
-"""The particle 地, read de5 after adverbs; elsewhere the character is the noun di4.
+"""Readings of 地 and 得 that depend on the words before and after.
 
-Adverbs are doubled characters, degree and adjective, and common adjectives. After other words, the
-usual reading is kept.
+地 is the particle de5 after adverbs, and otherwise the noun di4. Adverbs are doubled characters,
+degree and adjective, and common adjectives. 得 is dei3 (must) between a pronoun and a verb, as in
+我得走了. After other words, the usual readings are kept.
 """
 
 import re
@@ -29,8 +30,22 @@ _ADVERB = re.compile(
     rf"(?P<rest>{_VERBS}|\w?)"
 )
 
+_MUST = re.compile(
+    r"(?:[我你您他她它咱谁]们?|大家|自己|还|就|都|总|也|必须|可能)得(?=\w)"
+    r"(?![了过到着的地得奖分病意罪以逞失胜体名救益手志宠票冠金银铜势第〇零一二三四五六七八九十百千两满])"
+    r"(?!知(?!道)|出(?![门去来发差国院席面场])|天(?!天)|当(?![心面场天着])|道(?![歉谢别])|利(?!用)|证(?!明))"
+)
 
-def adverb_particles(characters: str) -> Iterator[int]:
+
+def readings_in_context(characters: str) -> Iterator[tuple[int, str]]:
+    """Yield the index and the pinyin of 地 and 得; the characters are simplified."""
+    for index in _adverb_particles(characters):
+        yield index, "de5"
+    for match in _MUST.finditer(characters):
+        yield match.end() - 1, "dei3"
+
+
+def _adverb_particles(characters: str) -> Iterator[int]:
     """Yield the indices of 地 after an adverb, as in 慢慢地走; the characters are simplified."""
     from pypinyin.constants import PHRASES_DICT  # noqa: PLC0415 (takes 0.3 s with pypinyin)
 
