@@ -140,7 +140,7 @@ lips-demo: setup $(LIPS_MODELS) $(patsubst %,%/node_modules/.package-lock.json,$
 # CLIPS, CORPUS, NATURAL and LANGUAGES are folders of recordings. STEPS names steps; QUICK=1 and FRESH=1 are options.
 report: .venv/installed-dev setup $(LIPS_MODELS) $(RIVALS)/.venv/installed \
 		$(patsubst %,%/node_modules/.package-lock.json,$(RIVALS) $(LIPS))
-	$(BIN)/kouxing evaluate report $(STEPS) $(CLIPS:%=--lips %) $(CORPUS:%=--corpus %) $(NATURAL:%=--natural %) \
+	$(BIN)/kouxing evaluate report $(STEPS) $(CLIPS:%=--clips %) $(CORPUS:%=--corpus %) $(NATURAL:%=--conversation %) \
 		$(LANGUAGES:%=--languages %) $(QUICK:1=--quick) $(FRESH:1=--fresh)
 
 ovrlipsync: setup $(LIPS_MODELS)
@@ -208,7 +208,7 @@ $(BLENDER)/installed: $(BLENDER_LOCK)
 	touch $@
 
 $(HEADS): $(HEAD_SOURCES) | .venv/installed
-	$(BIN)/kouxing head export --all --force $(PAGE)
+	$(BIN)/kouxing head export --force $(PAGE)
 
 $(LIPS_MODELS): services/cli/web_model.py $(wildcard services/recognizer/models/*.npz \
 		services/recognizer/*.py services/recognizer/*/*.py services/synthesizer/*.py \

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from kouxing.services.cli.options import AudioTrack
+from kouxing.services.cli.options import AudioTrack, Panel
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import (
     CONSOLE,
@@ -28,7 +28,7 @@ track_app = typer.Typer(add_completion=False)
 adapt_app = typer.Typer(add_completion=False)
 
 
-@adapt_app.command()
+@adapt_app.command(rich_help_panel=Panel.RECORDINGS)
 def adapt(
     sources: Annotated[
         list[Path],
@@ -72,7 +72,7 @@ def _read(source: Path) -> FilmedSpeech:
         raise UserError(f"{source}: {error}") from error
 
 
-@track_app.command()
+@track_app.command(rich_help_panel=Panel.RECORDINGS)
 def track(
     video: Annotated[Path, typer.Argument(help="Video of a speaker who faces the camera.")],
     output: Annotated[

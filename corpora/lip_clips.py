@@ -156,7 +156,8 @@ def training_clips(clips: Iterable[LipClip], *, any_license: bool = False) -> li
 def no_clip_error(folder: Path) -> UserError:
     """Make the error that a model cannot be trained on any clip of a folder."""
     return UserError(
-        f"no clip in {folder} may be used; use clips with a free license, or add --any-license"
+        f"no clip in {folder} may be used; use clips with a free license, or kouxing train"
+        " --any-license"
     )
 
 

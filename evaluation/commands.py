@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from kouxing.corpora.options import (
+    Clips,
+    EmotionalSpeech,
+    OptionalClips,
+    OptionalSounds,
+    Picture,
+)
 from kouxing.evaluation.system.commands import SENTENCE, attacks, faults
+from kouxing.services.cli.options import ACOUSTIC_MODEL
 from kouxing.shared.terminal import (
     Force,
     JsonFile,
@@ -30,42 +38,44 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure mode
 plot_app = typer.Typer(no_args_is_help=True, add_completion=False)
 
 
-Manifest = Annotated[Path, typer.Option(help="Manifest or corpus folder.")]
-AudioFolder = Annotated[
-    Path | None, typer.Option(help="Folder of the audio files. Default: the manifest's folder.")
-]
+_CORPUS = typer.Option("--corpus", "--manifest", help="Corpus folder or manifest.")
+Corpus = Annotated[Path, _CORPUS]
+OptionalCorpus = Annotated[Path | None, _CORPUS]
 Split = Annotated[str, typer.Option(help="Split of the corpus.")]
-Acoustic = Annotated[
+Acoustic = Annotated[list[str] | None, typer.Option(help=f"{ACOUSTIC_MODEL}; repeatable.")]
+Conditions = Annotated[
     list[str] | None,
-    typer.Option(help="Model: blocks, light, gmm, universal or a file; repeatable."),
+    typer.Option(
+        "--condition",
+        help='Condition of the sound, such as clean or "babble 10 dB"; repeatable. Default: all.',
+    ),
 ]
-Sounds = Annotated[
+Tables = Annotated[
     list[Path] | None,
-    typer.Option(help="Folder of sounds; only held-out sounds are used. Default: synthesized."),
+    typer.Option(
+        "--from-csv", help="Folder with CLIP.csv, the curves of another program; repeatable."
+    ),
 ]
-Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
-Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]
 
 
 @app.command()
 def recognizer(
-    manifest: Manifest,
-    audio: AudioFolder = None,
+    corpus: Corpus,
+    audio: Annotated[
+        Path | None, typer.Option(help="Folder of the audio files. Default: the corpus folder.")
+    ] = None,
     split: Split = "test",
     acoustic: Acoustic = None,
-    sounds: Sounds = None,
-    condition: Annotated[
-        list[str] | None,
-        typer.Option(help='Disturbance, such as "babble 10 dB"; repeatable. Default: all.'),
-    ] = None,
+    sounds: OptionalSounds = None,
+    conditions: Conditions = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Compare phone and viseme errors and delays of acoustic models.
 
     The speech is clean, disturbed by noise, music, other voices, a room or a telephone band, and
-    grouped by speaking rate. The JSON file also contains figures by speaker and for other output
-    rules.
+    grouped by speaking rate. Without --sounds, the music is synthesized. The JSON file also
+    contains figures by speaker and for other output rules.
     """
     from kouxing.evaluation.recognizer.disturbances import (
         check_conditions,
@@ -76,12 +86,12 @@ def recognizer(
     from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.recognizer.report import print_figures
 
-    check_output(json_file, inputs=[manifest], force=force)
-    check_conditions(condition or ())
+    check_output(json_file, inputs=[corpus], force=force)
+    check_conditions(conditions or ())
     models = list(_models(acoustic))
     music = music_from(_read_sounds(sounds))
-    references = align_corpus(models[0][1], manifest, split, audio)
-    disturbances = disturbances_for(references, music, condition or ())
+    references = align_corpus(models[0][1], corpus, split, audio)
+    disturbances = disturbances_for(references, music, conditions or ())
     results = {
         name: {"split": split, **evaluate_recognizer(model, references, disturbances, rule)}
         for name, model, rule in models
@@ -92,48 +102,42 @@ def recognizer(
 
 @app.command()
 def languages(
-    audio: Annotated[Path, typer.Option(help="Folder of the audio files that the manifest lists.")],
-    manifest: Annotated[
-        Path | None,
-        typer.Option(help="Manifest with a language column. Default: corpora/languages.tsv."),
-    ] = None,
-    hama: Annotated[
-        bool, typer.Option("--hama", help="Also run the package hama on the English recordings.")
-    ] = False,
+    audio: Annotated[
+        Path, typer.Option(help="Folder of the audio files that corpora/languages.tsv lists.")
+    ],
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Measure live feature and viseme errors of universal phones by language.
 
-    Each recording is recognized twice: with no language chosen, and with its own language.
+    Each recording is recognized twice: with no language chosen, and with its own language. If the
+    package hama is installed (make report), it also recognizes the English recordings.
     """
     from kouxing.corpora.speech_corpus import LANGUAGES
     from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
     from kouxing.evaluation.recognizer.references import align_corpus
+    from kouxing.evaluation.rivals.tables import FOLDER
 
-    manifest = manifest or LANGUAGES
-    check_output(json_file, inputs=[manifest], force=force)
+    check_output(json_file, force=force)
     ((_, model, rule),) = _models(["universal"])
-    references = align_corpus(model, manifest, "test", audio)
-    results = evaluate_languages(references, rule, with_hama=hama)
+    references = align_corpus(model, LANGUAGES, "test", audio)
+    results = evaluate_languages(references, rule, with_hama=(FOLDER / ".venv").exists())
     print_languages(results, Console())
     write_json(json_file, results)
 
 
 @app.command()
 def voice(
-    manifest: Manifest,
-    audio: AudioFolder = None,
+    corpus: Corpus,
     split: Split = "test",
-    acoustic: Acoustic = None,
-    sounds: Sounds = None,
+    sounds: OptionalSounds = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Measure the fraction of time with voice activity, by kind of audio.
 
-    The audio consists of clean and disturbed speech, held-out sounds, and synthesized voices and
-    noises.
+    The audio consists of clean and disturbed speech, the held-out files of --sounds, and
+    synthesized voices and noises.
     """
     from kouxing.evaluation.recognizer.disturbances import (
         BABBLE,
@@ -144,22 +148,21 @@ def voice(
     from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.recognizer.voice import evaluate_voice, materials_of, print_voice
 
-    check_output(json_file, inputs=[manifest], force=force)
-    models = {name: model for name, model, _ in _models(acoustic)}
+    check_output(json_file, inputs=[corpus], force=force)
+    ((name, model, _),) = _models(None)
     recorded = _read_sounds(sounds)
     music = music_from(recorded)
-    references = align_corpus(next(iter(models.values())), manifest, split, audio)
+    references = align_corpus(model, corpus, split)
     disturbances = disturbances_for(references, music, (MUSIC, BABBLE))
-    results = evaluate_voice(models, materials_of(references, disturbances, music, recorded))
+    materials = materials_of(references, disturbances, music, recorded)
+    results = evaluate_voice({name: model}, materials)
     print_voice(results, split, Console())
     write_json(json_file, results)
 
 
 @app.command()
 def face(
-    recordings: Annotated[
-        Path, typer.Option(help="Folder of speech whose manifest names emotions.")
-    ],
+    recordings: EmotionalSpeech,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -204,38 +207,32 @@ def lips(
     delay_ms: Annotated[
         list[float] | None,
         typer.Option(
-            min=0.0, max=300.0, help="Delay of the face; repeatable. Default: the lip model's."
+            min=0.0,
+            max=300.0,
+            help="Delay of the face in ms; repeatable. Default: the lip model's.",
         ),
     ] = None,
-    sounds: Sounds = None,
-    condition: Annotated[
-        list[str] | None,
-        typer.Option(help='"clean", "babble 10 dB" or "music 10 dB"; repeatable. Default: all.'),
-    ] = None,
-    from_csv: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder with CLIP.csv, the curves of another program; repeatable."),
-    ] = None,
-    every: Annotated[int, typer.Option(min=1, help="Score only each N-th clip.")] = 1,
+    sounds: OptionalSounds = None,
+    conditions: Conditions = None,
+    tables: Tables = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Compare live lips with the real ones on held-out clips, in one table.
 
-    The sound is clean, or has babble or music 10 dB below the speech. The JSON file also contains
-    the figures by source and speaker. docs/benchmark.md explains how to score another program.
+    The sound is clean, or has babble or music 10 dB below the speech. Without --sounds, the music
+    is synthesized. The JSON file also contains the figures by source and speaker. docs/benchmark.md
+    explains how to score another program.
     """
     from kouxing.evaluation.lips.lip_scores import CONDITIONS, score_lips
     from kouxing.evaluation.lips.lip_table import print_scores
     from kouxing.evaluation.recognizer.disturbances import check_conditions, music_from
 
     check_output(json_file, force=force)
-    conditions = condition or CONDITIONS
+    conditions = conditions or list(CONDITIONS)
     check_conditions(conditions, CONDITIONS)
     music = music_from(_read_sounds(sounds))
-    results = score_lips(
-        clips, lips or (), delay_ms or (), music, conditions, from_csv or (), every
-    )
+    results = score_lips(clips, lips or (), delay_ms or (), music, conditions, tables or ())
     print_scores(results, Console())
     write_json(json_file, results)
 
@@ -243,22 +240,18 @@ def lips(
 @app.command(name="lips-package")
 def lips_package(
     clips: Clips,
-    manifest: Annotated[
-        Path | None, typer.Option(help="Manifest or corpus folder, to also compare the phones.")
-    ] = None,
-    audio: AudioFolder = None,
-    split: Split = "test",
+    corpus: OptionalCorpus = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Compare the package kouxing-lips with the server, on held-out clips and a corpus.
+    """Compare the package kouxing-lips with the server: lips of clips, and phones of a corpus.
 
     Needs Node.
     """
     from kouxing.evaluation.system.lips_package import compare, show
 
     check_output(json_file, force=force)
-    comparison = compare(clips, manifest, split, audio)
+    comparison = compare(clips, corpus)
     show(comparison, Console())
     write_json(json_file, asdict(comparison))
 
@@ -287,7 +280,7 @@ def rivals(
         list[str] | None, typer.Option(help="Name of a program; repeatable. Default: all.")
     ] = None,
 ) -> None:
-    """Run other lip-sync programs on the clips, and write curves for ``lips --from-csv``.
+    """Run other lip-sync programs on the clips, and write curves for evaluate lips --from-csv.
 
     Programs: headaudio, wlipsync, wawa, live2d, pylipsync, openfacefx, loudness, and rhubarb if it
     is on the path.
@@ -300,11 +293,15 @@ def rivals(
 @app.command()
 def report(
     step: Annotated[list[str] | None, typer.Argument(help="Name of a step. Default: all.")] = None,
-    lips: Annotated[Path | None, typer.Option(help="Folder of clips with tracked lips.")] = None,
-    corpus: Annotated[Path | None, typer.Option(help="Corpus of read speech.")] = None,
-    natural: Annotated[Path | None, typer.Option(help="Folder of conversation.")] = None,
+    clips: OptionalClips = None,
+    corpus: OptionalCorpus = None,
+    conversation: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the audio files that corpora/conversation.tsv lists."),
+    ] = None,
     languages: Annotated[
-        Path | None, typer.Option(help="Folder of the recordings listed in corpora/languages.tsv.")
+        Path | None,
+        typer.Option(help="Folder of the audio files that corpora/languages.tsv lists."),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Use parts of the data; ten minutes.")
@@ -330,9 +327,9 @@ def report(
         raise UserError("the report needs the source tree; run 'make report' there")
     folder = ROOT / "out" / "report" if quick else ROOT / "docs"
     data = {
-        "lips": lips,
+        "lips": clips,
         "corpus": corpus,
-        "natural": natural,
+        "natural": conversation,
         "languages": languages,
         "rivals": ROOT / "out" / "rivals",
     }
@@ -346,13 +343,8 @@ def report(
 
 @app.command()
 def schemes(
-    manifest: Annotated[
-        Path | None,
-        typer.Option(help="Manifest or corpus folder; 20 sentences of its split test are used."),
-    ] = None,
-    clips: Annotated[
-        Path | None, typer.Option(help="Folder of clips with tracked lips, instead of a corpus.")
-    ] = None,
+    corpus: OptionalCorpus = None,
+    clips: OptionalClips = None,
     acoustic: Acoustic = None,
     lips: Annotated[
         list[str] | None, typer.Option(help="Lip model; repeatable. Default: all.")
@@ -363,18 +355,14 @@ def schemes(
     videos: Annotated[
         Path | None, typer.Option(help="Folder for CONDITION/SENTENCE.mp4; skips existing files.")
     ] = None,
-    from_csv: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder with CLIP.csv: also write videos of another program's curves; repeatable."
-        ),
-    ] = None,
+    tables: Tables = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Compare the four schemes of Li et al. 2011: aligned, recognized, live, next phone.
 
-    By default, the shipped samples are used, with the recognizers blocks and gmm.
+    The sentences are the shipped samples, 20 of the corpus's split test, or the held-out clips.
+    The default models are blocks and gmm. With --videos, --from-csv adds videos of other programs.
     """
     from kouxing.evaluation.lips import sentences
     from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
@@ -385,14 +373,14 @@ def schemes(
     from kouxing.services.recognizer.acoustic.load import load_model
     from kouxing.shared.errors import UserError
 
-    check_output(json_file, inputs=[manifest], force=force)
-    if manifest and clips:
-        raise UserError("use either --manifest or --clips, not both")
-    if from_csv and not (videos and clips):
+    check_output(json_file, inputs=[corpus], force=force)
+    if corpus and clips:
+        raise UserError("use either --corpus or --clips, not both")
+    if tables and not (videos and clips):
         raise UserError("--from-csv applies to videos of clips; add --videos FOLDER and --clips")
     model = load_model()
-    if manifest:
-        chosen = sentences.corpus_sentences(model, manifest)
+    if corpus:
+        chosen = sentences.corpus_sentences(model, corpus)
     elif clips:
         chosen = sentences.clip_sentences(model, clips)
     else:
@@ -404,7 +392,7 @@ def schemes(
     print_outcome(outcome, Console())
     write_json(json_file, asdict(outcome))
     if videos:
-        written = write_videos(recognized, recognizers, names, videos, from_csv or ())
+        written = write_videos(recognized, recognizers, names, videos, tables or ())
         print_message(f"wrote {plural(len(written), 'video')} to {videos}")
         unaligned = [one.sentence.clip.name for one in recognized if one.aligned is None]
         if unaligned:
@@ -429,10 +417,7 @@ def ferguson(
 @app.command()
 def visemes(
     clips: Clips,
-    parameters: Parameters = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Plot measured and modeled curves (.png).")
-    ] = None,
+    picture: Picture = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -446,7 +431,7 @@ def visemes(
     )
 
     check_output(picture, json_file, force=force)
-    fitted = fit_folder(clips, parameters)
+    fitted = fit_folder(clips)
     errors = viseme_errors(fitted)
     print_errors(errors, Console())
     if picture is not None:

@@ -25,22 +25,17 @@ _LENGTH_S = 60.0
 _MIN_PAUSE_S = 0.6  # long enough for the face to finish a phrase
 
 
-def write_head_videos(
-    folder: Path, model: AcousticModel, recordings: Sequence[Path], heads: Sequence[str]
-) -> None:
-    """Write ``HEAD/minute.mp4`` for each head, with the frames of the live services.
+def write_head_videos(folder: Path, model: AcousticModel, recordings: Sequence[Path]) -> None:
+    """Write ``HEAD/minute.mp4`` for each built-in head, with the frames of the live services.
 
-    ``heads`` are names of built-in heads. By default, all are drawn. Raises ``UserError`` if
-    a file cannot be read or written, or the recordings are too long.
+    Raises ``UserError`` if a file cannot be read or written, or the recordings are too long.
     """
-    names = heads or HEAD_NAMES
-    loaded = {name: scene.load_head(name) for name in names}
+    loaded = {name: scene.load_head(name) for name in HEAD_NAMES}
     samples = join_recordings([read_mono_16k(path) for path in recordings])
     chain = LiveChain(model, load_lip_model(model.inventory.language))
     show = partial(track, description="recognizing", console=CONSOLE, transient=True)
     frames = chain.animate(samples, show)
-    for name in track(names, "drawing", console=CONSOLE, transient=True):
-        head = loaded[name]
+    for name, head in track(loaded.items(), "drawing", console=CONSOLE, transient=True):
         renderer = Renderer(head, *VIDEO_PX, camera=scene.camera(head))
         with contextlib.closing(renderer):
             write_video(folder / name / "minute.mp4", frames, samples, renderer)

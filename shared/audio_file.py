@@ -65,29 +65,26 @@ def open_audio(
     *,
     track: int | None = None,
     raw: RawFormat | None = None,
-    is_raw: bool = False,
 ) -> AudioSource:
     """Open an audio file, the audio of a video, or a pipe, for reading block by block.
 
     FFmpeg decodes it. Silence fills the gaps that the file's timestamps have. Rates above 48 kHz
     are resampled to 48 kHz, and more than two channels are mixed to two. ``track`` counts from 1.
     The path ``-`` is standard input. Pipes are decoded while they arrive. If no format fits, a pipe
-    is read as raw samples; ``raw`` is their format. ``is_raw``: the content is raw samples.
+    is read as raw samples. ``raw``: the content is raw samples of this format.
 
-    Raises ``UserError`` if the file is missing, empty, too large, not audio, or below 8 kHz, or if
-    ``raw`` is given and another format fits. While reading, raises it if samples are not finite.
+    Raises ``UserError`` if the file is missing, empty, too large, not audio, or below 8 kHz. While
+    reading, raises it if samples are not finite.
     """
     file = sys.stdin.buffer if path == _PIPE else open_file(path, MAX_FILE_BYTES, pipe=True)
     is_pipe = path == _PIPE or path.is_fifo()
     name = "standard input" if path == _PIPE else path.name
 
     def open_source() -> AudioSource:
-        if is_raw:
-            return raw_audio(_Pipe(file), raw or RawFormat(), name)
-        if is_pipe:
-            return _open_pipe(file, name, block_s, track, raw)
         if raw is not None:
-            raise UserError(f"{path}: --rate and --channels apply to raw samples; add --raw")
+            return raw_audio(_Pipe(file), raw, name)
+        if is_pipe:
+            return _open_pipe(file, name, block_s, track)
         return _open_file(file, str(path), name, block_s, track)
 
     with check_content(path, "audio"):
@@ -125,9 +122,7 @@ def _open_file(
     return _source(sound, path, name, block_s, begin, lambda: num_bytes)
 
 
-def _open_pipe(
-    stream: BinaryIO, name: str, block_s: float, track: int | None, raw: RawFormat | None
-) -> AudioSource:
+def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -> AudioSource:
     if stream.isatty():
         raise UserError(f"{name}: this is a terminal; pipe sound into the command")
     pipe = _Pipe(stream)
@@ -138,19 +133,12 @@ def _open_pipe(
     if start is None:
         if kind := non_audio_kind(begin):
             raise UserError(f"{name}: this is {kind}")
-        raw = raw or RawFormat()
-        source = raw_audio(pipe, raw, name)
+        source = raw_audio(pipe, raw := RawFormat(), name)
         source.notices.append(
-            f"{name}: no sound format fits, so this is read as raw samples: 16-bit,"
-            f" {raw.sample_rate_hz} Hz, channels: {raw.num_channels}; for other samples use"
-            " kouxing speak with --raw, --rate and --channels"
+            f"{name}: no sound format fits, so this is read as raw samples: 16-bit, mono,"
+            f" {raw.sample_rate_hz} Hz; for another rate use kouxing speak with --raw and --rate"
         )
         return source
-    if raw is not None:
-        raise UserError(
-            f"{name}: the format of this sound states its rate and channels; leave out --rate and"
-            " --channels, or add --raw if these are raw samples"
-        )
     begin = pipe.skip(start)
     if stream.seekable() or needs_whole_file(begin):
         file = stream if stream.seekable() else pipe.read_all()

@@ -7,24 +7,24 @@ from typing import Annotated
 
 import typer
 
+from kouxing.corpora.options import Clips, EmotionalSpeech, OptionalClips, OptionalSounds, Sounds
+from kouxing.services.cli.options import Language
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.terminal import Force, check_output
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+)
 
-Corpora = Annotated[
-    list[Path], typer.Option("--corpus", help="Corpus folder or manifest; repeatable.")
-]
-Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")]
-Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
-Language = Annotated[str, typer.Option(help="Language of the corpora and texts.")]
+_CORPORA = typer.Option("--corpus", help="Corpus folder or manifest; repeatable.")
+Corpora = Annotated[list[Path], _CORPORA]
+OptionalCorpora = Annotated[list[Path] | None, _CORPORA]
+Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write.")]
 PhoneLm = Annotated[
     Path | None,
     typer.Option(help="Phone language model: phone_lm.npz, or the file of an acoustic model."),
-]
-AnyLicense = Annotated[
-    bool, typer.Option("--any-license", help="Also use data whose license forbids distribution.")
 ]
 Whisper = Annotated[
     Path, typer.Option(help="Folder of Whisper base for faster-whisper, for its encoder.")
@@ -32,19 +32,28 @@ Whisper = Annotated[
 StartFrom = Annotated[
     Path | None,
     typer.Option(
-        help="Acoustic model that aligns the recordings and provides the phone language model. "
-        "Default: the shipped block model."
+        help="Acoustic model that aligns the recordings. Default: the shipped block model."
     ),
 ]
 Untranscribed = Annotated[
     list[Path] | None,
-    typer.Option(
-        help="Folder of recordings in any language, for the teacher to label; repeatable."
-    ),
+    typer.Option(help="Folder of speech in any language, without texts; repeatable."),
 ]
-Sounds = Annotated[
-    list[Path], typer.Option(help="Folder of music, noise and laughter; repeatable.")
-]
+
+
+@app.callback()
+def train(
+    context: typer.Context,
+    any_license: Annotated[
+        bool,
+        typer.Option(
+            "--any-license",
+            help="Also train on recordings whose license does not allow distributing the model.",
+        ),
+    ] = False,
+) -> None:
+    """Train the models."""
+    context.obj = any_license
 
 
 @contextmanager
@@ -61,78 +70,69 @@ def _neural_training(output: Path | None = None, *, force: bool = False) -> Iter
 
 @app.command()
 def phone_lm(
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to write (.npz).")],
-    corpus: Annotated[
-        list[Path] | None,
-        typer.Option("--corpus", help="Corpus whose sentences are counted; repeatable."),
-    ] = None,
+    output: Model,
+    corpora: OptionalCorpora = None,
     text: Annotated[
         list[Path] | None, typer.Option("--text", help="Text file, UTF-8; repeatable.")
     ] = None,
-    ngrams: Annotated[
-        Path | None, typer.Option(help="Output of `tslminfo -v`, to sample words from.")
+    word_model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of a word language model to draw sentences from: pydict_sc.bin of"
+            " SunPinyin, and ngrams.txt, the output of tslminfo -v."
+        ),
     ] = None,
-    dictionary: Annotated[
-        Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, with the words of --ngrams.")
-    ] = None,
-    language: Language = DEFAULT_LANGUAGE,
+    language: Language = None,
     force: Force = False,
 ) -> None:
-    """Train a phone language model on texts."""
-    from kouxing.training.phone_lm.open_gram import draw_phones
+    """Train a phone language model (.npz) on the texts of corpora, on text files, or both."""
+    from kouxing.training.phone_lm.open_gram import DICTIONARY, NGRAMS, draw_phones
     from kouxing.training.phone_lm.recipe import train_phone_lm
 
-    inputs = [*(corpus or []), *(text or []), ngrams, dictionary]
-    check_output(output, inputs=inputs, force=force)
-    if (ngrams is None) != (dictionary is None):
-        raise UserError("use --ngrams and --dictionary together")
-    inventory = load_inventory(language)
-    drawn = None
-    if ngrams and dictionary:
-        drawn = draw_phones(ngrams, dictionary, inventory)
-    train_phone_lm(corpus or [], text or [], output, inventory, drawn=drawn)
+    words = [word_model / name for name in (NGRAMS, DICTIONARY)] if word_model else []
+    check_output(output, inputs=[*(corpora or []), *(text or []), *words], force=force)
+    inventory = load_inventory(language or DEFAULT_LANGUAGE)
+    drawn = draw_phones(word_model, inventory) if word_model else None
+    train_phone_lm(corpora or [], text or [], output, inventory, drawn=drawn)
 
 
 @app.command()
 def gmm(
-    corpus: Corpora,
+    context: typer.Context,
+    corpora: Corpora,
     output: Model,
     phone_lm: PhoneLm = None,
-    language: Language = DEFAULT_LANGUAGE,
-    any_license: AnyLicense = False,
+    language: Language = None,
     force: Force = False,
 ) -> None:
-    """Train the Gaussian mixture recognizer, and write its model card."""
+    """Train the Gaussian mixture recognizer (.npz), and write its model card."""
     from kouxing.training.gmm.recipe import train_gmm
 
-    check_output(output, inputs=[*corpus, phone_lm], force=force)
+    check_output(output, inputs=[*corpora, phone_lm], force=force)
     train_gmm(
-        corpus,
+        corpora,
         output,
-        load_inventory(language),
+        load_inventory(language or DEFAULT_LANGUAGE),
         phone_lm=phone_lm,
-        shipping=not any_license,
+        shipping=not context.obj,
     )
 
 
 @app.command()
 def blocks(
-    corpus: Corpora,
+    context: typer.Context,
+    corpora: Corpora,
     output: Model,
     whisper: Whisper,
     start_from: StartFrom = None,
     untranscribed: Untranscribed = None,
-    sounds: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of music and noise for the background; repeatable."),
-    ] = None,
+    sounds: OptionalSounds = None,
     steps: Annotated[
         int, typer.Option(min=1, help="Number of steps, each with 256 s of audio.")
     ] = 1000,
-    any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
-    """Train the block model, and write its model card.
+    """Train the block model (.npz), and write its model card.
 
     Repeat the command to resume an interrupted run. The number of steps may change.
     """
@@ -140,20 +140,21 @@ def blocks(
         from kouxing.training.blocks.recipe import train_blocks
 
     train_blocks(
-        corpus,
+        corpora,
         output,
         whisper=whisper,
         start=start_from,
         untranscribed=untranscribed or [],
         sounds=sounds or [],
         num_steps=steps,
-        shipping=not any_license,
+        shipping=not context.obj,
     )
 
 
 @app.command()
 def universal(
-    corpus: Corpora,
+    context: typer.Context,
+    corpora: Corpora,
     output: Model,
     learners: Annotated[
         list[Path] | None,
@@ -161,46 +162,48 @@ def universal(
     ] = None,
     languages: Annotated[
         list[Path] | None,
-        typer.Option(help="Corpus with a column of languages; repeatable."),
+        typer.Option(help="Corpus of other languages, named in its manifest; repeatable."),
     ] = None,
-    clips: Annotated[Path | None, typer.Option(help="Folder of clips of GRID.")] = None,
+    clips: OptionalClips = None,
     steps: Annotated[
         int, typer.Option(min=1, help="Number of steps, each with 19 s of audio.")
     ] = 2000,
     force: Force = False,
 ) -> None:
-    """Train the universal phones, a readout of the shipped block model, and write its model card.
+    """Train the universal phones (.npz), and write their model card.
 
-    Give Mandarin corpora with --corpus. Repeat the command to resume an interrupted run.
+    They are a second readout of the shipped block model. The corpora of --corpus are Mandarin; of
+    the clips, those of GRID are used. Repeat the command to resume an interrupted run.
     """
     with _neural_training(output, force=force):
         from kouxing.training.universal.recipe import train_universal
 
     train_universal(
-        corpus,
+        corpora,
         output,
         learners=learners or [],
         languages=languages or [],
         clips=clips,
         num_steps=steps,
+        shipping=not context.obj,
     )
 
 
 @app.command()
 def encoder(
-    corpus: Corpora,
+    context: typer.Context,
+    corpora: Corpora,
     output: Model,
     whisper: Whisper,
     sounds: Sounds,
     clips: Clips,
     untranscribed: Untranscribed = None,
     steps: Annotated[
-        int, typer.Option(min=1, help="Number of batches, each with 140 s of audio.")
+        int, typer.Option(min=1, help="Number of steps, each with 140 s of audio.")
     ] = 7000,
-    any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
-    """Train the audio encoder, a network for lips and voice, and write its model card.
+    """Train the audio encoder (.npz), and write its model card.
 
     Repeat the command to resume an interrupted run.
     """
@@ -208,77 +211,73 @@ def encoder(
         from kouxing.training.encoder.recipe import train_encoder
 
     train_encoder(
-        corpus,
+        corpora,
         output,
         whisper=whisper,
         clips=clips,
         untranscribed=untranscribed or [],
         sounds=sounds,
         num_steps=steps,
-        shipping=not any_license,
+        shipping=not context.obj,
     )
 
 
 @app.command()
 def visemes(
+    context: typer.Context,
     clips: Clips,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],
-    any_license: AnyLicense = False,
+    output: Model,
     force: Force = False,
 ) -> None:
-    """Train the parameters of the dynamic visemes on tracked lips."""
+    """Train the parameters of the dynamic visemes (.json) on tracked lips."""
     from kouxing.training.visemes.recipe import train_visemes
 
     check_output(output, force=force)
-    train_visemes(clips, output, any_license=any_license)
+    train_visemes(clips, output, any_license=context.obj)
 
 
 @app.command()
 def lips(
+    context: typer.Context,
     clips: Clips,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Model file to write (.npz).")
-    ] = Path("services/recognizer/models/lips.npz"),
-    any_license: AnyLicense = False,
+    output: Model,
     force: Force = False,
 ) -> None:
-    """Train the lip model on tracked lips, and write its model card."""
+    """Train the lip model learned (.npz) on tracked lips, and write its model card."""
     with _neural_training(output, force=force):
         from kouxing.training.lips.recipe import train_lips
 
-    train_lips(clips, output, any_license=any_license)
+    train_lips(clips, output, any_license=context.obj)
 
 
 @app.command()
 def ferguson(
+    context: typer.Context,
     clips: Clips,
-    corpus: Corpora,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Table to write (.tsv).")],
-    any_license: AnyLicense = False,
+    corpora: Corpora,
+    output: Model,
     force: Force = False,
 ) -> None:
-    """Train the table of the ferguson lip model: openings, durations and influence factors."""
+    """Train the lip model ferguson (.tsv): its openings, durations and influence factors."""
     from kouxing.training.ferguson.recipe import train_ferguson
 
     check_output(output, force=force)
-    train_ferguson(clips, corpus, output, any_license=any_license)
+    train_ferguson(clips, corpora, output, any_license=context.obj)
 
 
 @app.command()
 def traits(
-    recordings: Annotated[
-        Path, typer.Option(help="Folder of speech whose manifest names emotions.")
-    ],
+    context: typer.Context,
+    recordings: EmotionalSpeech,
     sounds: Sounds,
     output: Model,
-    any_license: AnyLicense = False,
     force: Force = False,
 ) -> None:
-    """Train the readout of arousal, valence, laughter and breath, and write its model card."""
+    """Train the readout of arousal, valence, laughter and breath (.npz), with its model card."""
     from kouxing.training.traits import train_traits
 
     check_output(output, force=force)
-    train_traits(recordings, sounds, output, shipping=not any_license)
+    train_traits(recordings, sounds, output, shipping=not context.obj)
 
 
 @app.command()
@@ -286,10 +285,8 @@ def heads(
     parts: Annotated[
         Path, typer.Option(help="Folder with MakeHuman's hair, brows, lashes, eyes and skins.")
     ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the heads, NAME.npz.")],
     names: Annotated[list[str] | None, typer.Argument(help="Heads to build. Default: all.")] = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the heads.")] = Path(
-        "services/driver/head/assets"
-    ),
     force: Force = False,
 ) -> None:
     """Build the built-in heads from MakeHuman data."""

@@ -92,7 +92,6 @@ def score_lips(
     music: Samples,
     conditions: Sequence[str],
     tables: Sequence[Path] = (),
-    every: int = 1,
 ) -> Results:
     """Score faces (see ``load_faces``) on the held-out clips of a folder.
 
@@ -102,8 +101,7 @@ def score_lips(
     model = load_model()
     faces = {} if tables and not names else load_faces(names, delays_ms, model.inventory)
     parameters = [Path(name) for name in names if name.endswith(".json")]
-    held_out, training = read_parts(folder, parameters)
-    clips = held_out[::every]
+    clips, training = read_parts(folder, parameters)
     programs = load_programs(tables, clips, training)
     known = {clip.speaker for clip in training}
     disturbances: dict[str, Disturb] = {CLEAN: lambda samples: samples}

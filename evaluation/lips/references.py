@@ -120,31 +120,27 @@ def reference_of(
     )
 
 
-def clips_to_score(
-    folder: Path,
-    parameters: Collection[Path | None] = (),
-    *,
-    language: str | None = None,
-) -> list[LipClip]:
-    """Read the held-out clips of a folder that no viseme parameters were trained on.
+def clips_to_score(folder: Path, *, language: str | None = None) -> list[LipClip]:
+    """Read the held-out clips of a folder that the shipped viseme parameters were not trained on.
 
-    ``parameters`` are files; the package's own file is always included. Clips with sound out of
-    sync are left out. Raises UserError if no clip is left.
+    Clips with sound out of sync are left out. Raises UserError if no clip is left.
     """
-    return _held_out(folder, read_clips(folder, language=language), parameters)
+    return _held_out(folder, read_clips(folder, language=language), ())
 
 
 def read_parts(
-    folder: Path, parameters: Collection[Path | None] = ()
+    folder: Path, parameters: Collection[Path] = ()
 ) -> tuple[list[LipClip], list[LipClip]]:
-    """Read the clips to score (see ``clips_to_score``) and those for training."""
+    """Read the clips to score (see ``clips_to_score``) and those for training.
+
+    ``parameters`` are other files of viseme parameters; clips that they were trained on are also
+    left out.
+    """
     clips = read_clips(folder, language=None)
     return _held_out(folder, clips, parameters), training_clips(clips)
 
 
-def _held_out(
-    folder: Path, clips: list[LipClip], parameters: Collection[Path | None]
-) -> list[LipClip]:
+def _held_out(folder: Path, clips: list[LipClip], parameters: Collection[Path]) -> list[LipClip]:
     seen = {name for path in {None, *parameters} for name in clips_seen(path)}
     clips = [clip for clip in clips if clip.split == "held"]
     if not clips:

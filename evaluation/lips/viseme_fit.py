@@ -69,14 +69,14 @@ class FittedClip:
         return real, learned, guessed
 
 
-def fit_folder(folder: Path, parameters: Path | None) -> list[FittedClip]:
-    """Model all clips of a folder that the parameters were not trained on."""
+def fit_folder(folder: Path) -> list[FittedClip]:
+    """Model all clips of a folder that the shipped parameters were not trained on."""
     model = load_model()
     learned, guessed = (
         DynamicVisemes(values, model.inventory)
-        for values in (load_parameters(parameters), initial_parameters())
+        for values in (load_parameters(), initial_parameters())
     )
-    clips = clips_to_score(folder, [parameters], language=model.inventory.code)
+    clips = clips_to_score(folder, language=model.inventory.code)
     return [
         fit_clip(clip, label_clip(model, clip), learned, guessed)
         for clip in track(clips, description="clips", transient=True)

@@ -49,10 +49,6 @@ def heads(
             metavar="SOUND...", help="Speech and laughter. Pauses fill the rest of a minute."
         ),
     ],
-    head: Annotated[
-        list[str] | None,
-        typer.Option(help="Name of a built-in head; repeatable. Default: all heads."),
-    ] = None,
     language: Language = None,
 ) -> None:
     """Create a study of the built-in heads, with a one-minute video of each head."""
@@ -61,7 +57,7 @@ def heads(
     from kouxing.services.recognizer.acoustic.languages import model_of_language
 
     check_no_study(folder)
-    write_head_videos(folder, model_of_language(language), recordings, head or [])
+    write_head_videos(folder, model_of_language(language), recordings)
     study = new_study(folder)
     count = plural(len(study.conditions), "head")
     print_message(f"created a study of {count}; next: kouxing mos serve {folder}")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.evaluation.report.code_hash import code_hash
-from kouxing.evaluation.report.steps import ROOT, STEPS
+from kouxing.evaluation.report.steps import FOLDER_OPTIONS, ROOT, STEPS
 from kouxing.shared.terminal import print_message
 
 _DROPPED = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
@@ -49,7 +49,11 @@ def run_steps(
         command_lines = [f"kouxing {_without_braces(command)}" for command in commands]
         code = code_hash(step.code)
         if not commands or missing:
-            reason = f"add --{missing[0]}" if missing else "it is not part of a quick report"
+            reason = (
+                f"add {FOLDER_OPTIONS[missing[0]]}"
+                if missing
+                else "it is not part of a quick report"
+            )
             print_message(f"{name}: skipped ({reason})")
         elif not is_fresh and _is_up_to_date(path, command_lines, code):
             print_message(f"{name}: up to date")

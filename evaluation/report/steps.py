@@ -10,6 +10,13 @@ ROOT = Path(__file__).resolve().parents[2]  # root of the source tree, behind it
 CONVERSATION = ROOT / "corpora" / "conversation.tsv"
 SAMPLE = ROOT / "shared" / "demo" / "hello-female.wav"
 
+# Options of ``kouxing evaluate report`` that give the folders of recordings.
+FOLDER_OPTIONS = {
+    "lips": "--clips",
+    "corpus": "--corpus",
+    "natural": "--conversation",
+    "languages": "--languages",
+}
 DELAYS_MS = (0, 30, 60, 100, 160, 220, 300)
 _MODELS = "--acoustic blocks --acoustic light --acoustic gmm"
 _DELAYS = " ".join(f"--delay-ms {delay}" for delay in DELAYS_MS)
@@ -71,7 +78,7 @@ STEPS: Mapping[str, Step] = {
     ),
     "disturbed": Step(("evaluate recognizer --manifest {corpus} --split dev",), _RECOGNIZER, ()),
     "languages": Step(
-        ("evaluate languages --audio {languages} --hama",),
+        ("evaluate languages --audio {languages}",),
         (
             "evaluation/recognizer/languages.py",
             "evaluation/rivals/hama_phones.py",
@@ -84,12 +91,12 @@ STEPS: Mapping[str, Step] = {
     "lips": Step(
         (_LIP_SCORES,),
         _LIP_SCORES_CODE,
-        (_LIP_SCORES + " --condition clean --every 8",),
+        (_LIP_SCORES + " --condition clean",),
     ),
     "lookahead": Step(
         (f"{_LIP_SCORES} --condition clean {_DELAYS}",),
         _LIP_SCORES_CODE,
-        (f"{_LIP_SCORES} --condition clean {_DELAYS} --every 16",),
+        (),
     ),
     "rivals": Step(
         (
@@ -100,7 +107,7 @@ STEPS: Mapping[str, Step] = {
         (
             "evaluate rivals {rivals} --clips {lips} --program headaudio --program loudness",
             f"{_LIP_SCORES} --condition clean --lips learned --from-csv {{rivals}}/headaudio"
-            " --from-csv {rivals}/loudness --every 8",
+            " --from-csv {rivals}/loudness",
         ),
     ),
     "schemes": Step((_SCHEMES,), _SCHEMES_CODE, ("evaluate schemes",)),
@@ -118,7 +125,6 @@ STEPS: Mapping[str, Step] = {
             "services/gateway",
             *_SERVICES,
         ),
-        (f"bench chain {SAMPLE.relative_to(ROOT)} --repeats 1",),
     ),
     "load": Step(
         ("bench load",),

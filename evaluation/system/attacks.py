@@ -15,7 +15,7 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -94,17 +94,14 @@ class AttackResult:
     p95_ms: dict[str, float | None]  # the other client's p95, by phase; None: no frame in time
 
 
-def measure(path: Path, names: Collection[str], console: Console) -> list[AttackResult]:
-    """Start the services, attack them and return the figures.
+def measure(path: Path, console: Console) -> list[AttackResult]:
+    """Start the services, attack them in each way and return the figures.
 
-    The other client streams the file. ``names`` are keys of ``ATTACKS``; if empty, all run. Raises
-    UserError for an unknown attack, or if the file is not audio.
+    The other client streams the file. Raises UserError if the file is not audio.
     """
-    if unknown := [name for name in names if name not in ATTACKS]:
-        raise UserError(f"no attack is named {unknown[0]!r}; choose from {', '.join(ATTACKS)}")
     length_s = len(PHASES) * PHASE_S + 2 * SESSION_START_S
     speech = np.resize(to_16_khz(*read_audio(path)), round(length_s * MEDIA_RATE_HZ))
-    runs = [(name, target) for name in names or ATTACKS for target in ATTACKS[name].targets]
+    runs = [(name, target) for name, attack in ATTACKS.items() for target in attack.targets]
     with tempfile.TemporaryDirectory() as folder, LocalSystem(Path(folder), console) as system:
         _delays_ms(system.control, speech)  # the first session of a process is slow
         results = []

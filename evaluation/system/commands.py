@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
+from kouxing.corpora.options import OptionalClips, Picture
 from kouxing.services.cli.options import Language
 from kouxing.shared.overload import MAX_HOP
 from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output, write_json
@@ -17,6 +18,10 @@ from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output, writ
 SENTENCE = Path(__file__).parents[2] / "shared" / "demo" / "hello-female.wav"
 
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
+AudioFiles = Annotated[
+    list[Path] | None, typer.Argument(help="Audio files to stream. Default: the samples.")
+]
+Seconds = Annotated[float, typer.Option(min=1.0, help="Duration of each step, seconds.")]
 
 
 class BenchGroup(TyperGroup):
@@ -29,26 +34,28 @@ class BenchGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(cls=BenchGroup, add_completion=False, help="Measure the running system.")
+app = typer.Typer(
+    cls=BenchGroup,
+    add_completion=False,
+    help="Measure speed and load. Without the name of a command, run chain.",
+)
 
 
 @app.command()
 def chain(
     audio: AudioFile,
-    repeats: Annotated[int, typer.Option(min=1, help="Times to stream the file.")] = 3,
     language: Language = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Measure latency, CPU time and images per second of the whole chain on this machine.
 
-    If Chromium is installed, the page is also measured. ``--language`` is the language of the
-    streamed session; the other tables have their own.
+    If Chromium is installed, the page is also measured. Only the latency uses --language.
     """
     from kouxing.evaluation.system import chromium, costs, latency, page
 
     check_output(json_file, force=force)
-    delays = latency.measure(audio, repeats, CONSOLE, language)
+    delays = latency.measure(audio, CONSOLE, language)
     sessions = costs.measure_sessions(audio)
     images = costs.measure_images()
     drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
@@ -68,10 +75,7 @@ def chain(
 @app.command(name="lips-page")
 def lips_page(
     audio: AudioFile,
-    clips: Annotated[
-        Path | None,
-        typer.Option(help="Folder of clips with tracked lips, to also measure the accuracy."),
-    ] = None,
+    clips: OptionalClips = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -103,23 +107,20 @@ def sizes(json_file: JsonFile = None, force: Force = False) -> None:
 
 @app.command()
 def load(
-    audio: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings to stream. Default: the samples.")
-    ] = None,
+    audio: AudioFiles = None,
     sessions: Annotated[
         int, typer.Option(min=1, max=1000, help="Number of sessions in the last step.")
     ] = 24,
-    seconds: Annotated[
-        float, typer.Option(min=1.0, help="Duration of each of up to 9 steps, in seconds.")
-    ] = 12.0,
+    seconds: Seconds = 12.0,
     language: Language = None,
-    picture: Annotated[Path | None, typer.Option(help="Plot the figures (.png).")] = None,
+    picture: Picture = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
     """Measure how many live sessions all services can serve here.
 
-    A single client process streams to all sessions, with different voices.
+    A single client process streams to all sessions, with different voices. The number of sessions
+    grows in up to 9 steps.
     """
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.system.load import draw, measure, show
@@ -135,14 +136,12 @@ def load(
 
 @app.command()
 def busy(
-    audio: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings to stream. Default: the samples.")
-    ] = None,
+    audio: AudioFiles = None,
     programs: Annotated[
         list[int] | None,
         typer.Option(min=0, max=100, help="Number of busy programs; repeatable. Default: 0, 2, 6."),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=1.0, help="Duration of each load.")] = 30.0,
+    seconds: Seconds = 30.0,
     language: Language = None,
     json_file: JsonFile = None,
     force: Force = False,
@@ -161,9 +160,6 @@ def busy(
 
 
 def attacks(
-    attack: Annotated[
-        list[str] | None, typer.Option(help="Name of an attack; repeatable. Default: all.")
-    ] = None,
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
@@ -171,7 +167,7 @@ def attacks(
     from kouxing.evaluation.system.attacks import measure, show
 
     check_output(json_file, force=force)
-    results = measure(SENTENCE, attack or (), CONSOLE)
+    results = measure(SENTENCE, CONSOLE)
     show(results, Console())
     write_json(json_file, [asdict(result) for result in results])
 

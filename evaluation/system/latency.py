@@ -32,6 +32,8 @@ from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
+NUM_REPEATS = 3  # number of times that the file is streamed
+
 
 @dataclass(frozen=True, slots=True)
 class Latency:
@@ -44,7 +46,7 @@ class Latency:
     cpu_s_per_audio_s: dict[str, float]
 
 
-def measure(path: Path, num_repeats: int, console: Console, language: str | None = None) -> Latency:
+def measure(path: Path, console: Console, language: str | None = None) -> Latency:
     """Start the services, stream the file and return the figures; UserError if that fails.
 
     ``language`` is the language of the speech. If None, it is the recognizer's.
@@ -57,10 +59,10 @@ def measure(path: Path, num_repeats: int, console: Console, language: str | None
         connect(system.control) as client,
     ):
         before = _cpu_s(client)
-        delays = [stream(client, sound, delay_s, language)[1:] for _ in range(num_repeats)]
+        delays = [stream(client, sound, delay_s, language)[1:] for _ in range(NUM_REPEATS)]
         time.sleep(1.0)  # for the last heartbeats
         after = _cpu_s(client)
-    audio_s = num_repeats * len(sound) / MEDIA_RATE_HZ
+    audio_s = NUM_REPEATS * len(sound) / MEDIA_RATE_HZ
     to_frame_ms, from_sound_ms = (np.concatenate(part) * 1e3 for part in zip(*delays, strict=True))
     return Latency(
         chunk_to_frame_ms=percentiles(to_frame_ms),

@@ -132,17 +132,15 @@ def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> F
     return np.array([faps for _, faps in animate_live(face, events)])
 
 
-def compare(
-    clips: Path, manifest: Path | None = None, split: str = "test", audio: Path | None = None
-) -> Comparison:
-    """Compare on held-out clips with tracked lips and, if given, one split of a corpus.
+def compare(clips: Path, corpus: Path | None = None) -> Comparison:
+    """Compare on held-out clips with tracked lips and, if given, the split test of a corpus.
 
     Raises ``UserError`` if a folder has no recordings, if Node is not installed, or outside a
     checkout, which has the package.
     """
     if not _SCRIPT.is_file():
         raise UserError("kouxing-lips is missing; run this command in a checkout of kouxing")
-    references = align_corpus(load_model("blocks"), manifest, split, audio) if manifest else []
+    references = align_corpus(load_model("blocks"), corpus, "test") if corpus else []
     with exported_models() as models:
         num_clips, agreements = _compare_lips(models, clips)
         counts = {name: _compare_phones(models, references, name) for name in _PHONES if references}

@@ -19,7 +19,6 @@ from kouxing.services.cli.options import (
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
-from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 from kouxing.shared.keys import control_endpoint
@@ -43,13 +42,6 @@ SHOWN_METRICS = {
     *("load", "network_hop", "light_sessions"),
 }
 
-Control = Annotated[
-    str,
-    typer.Option(
-        help="Address of control. Default: $KOUXING_CONTROL, or your system on this machine."
-    ),
-]
-
 
 def speak(
     source: Annotated[
@@ -70,25 +62,21 @@ def speak(
     device: Annotated[
         str,
         typer.Option(
-            help="Device for 'mic' or 'monitor', by part of its name in 'kouxing devices'."
+            help="Part of the name of a device or program for mic or monitor, as in 'kouxing"
+            " devices'. Default: the system's default device."
         ),
     ] = "",
     raw: Annotated[
-        bool, typer.Option("--raw", help="Read raw samples: 16-bit integers, little-endian.")
+        bool, typer.Option("--raw", help="Read raw samples: 16-bit integers, mono, little-endian.")
     ] = False,
     rate: Annotated[
         int | None, typer.Option(help="Sample rate of raw samples, Hz. Default: 16000.")
     ] = None,
-    channels: Annotated[
-        int | None,
-        typer.Option(min=1, max=8, help="Number of channels of raw samples. Default: 1."),
-    ] = None,
     track: AudioTrack = None,
     mouth: MouthFile = None,
     language: Language = None,
-    control: Control = "",
 ) -> None:
-    """Stream a file, standard input, a microphone or this machine's sound to a running system."""
+    """Stream a file, a pipe, the microphone or this machine's sound to a running system."""
     from kouxing.services.cli.streaming import stream
     from kouxing.services.recognizer.mouth_profile import read_mouth_profile
     from kouxing.shared.audio_file import open_audio
@@ -98,14 +86,14 @@ def speak(
     profile = b"" if mouth is None else read_mouth_profile(mouth)
     if device and source not in ("mic", "monitor"):
         raise UserError("--device applies to mic and monitor: kouxing speak mic --device NAME")
-    if source in ("mic", "monitor") and (raw or rate or channels or track):
-        raise UserError(
-            f"--raw, --rate, --channels and --track do not apply to {source}; leave them out"
-        )
+    if source in ("mic", "monitor") and (raw or rate or track):
+        raise UserError(f"--raw, --rate and --track do not apply to {source}; leave them out")
     if source in ("mic", "monitor") and fast:
         raise UserError(
             f"--fast does not apply to {source}: its sound arrives in real time; leave it out"
         )
+    if rate is not None and not raw:
+        raise UserError("--rate applies to raw samples; add --raw")
     if raw and track is not None:
         raise UserError("--track does not apply to raw samples; leave out --raw or --track")
     if source == "mic":
@@ -113,13 +101,11 @@ def speak(
     elif source == "monitor":
         audio = monitor(device)
     else:
-        raw_format = (
-            None if rate is None and channels is None else RawFormat(rate or 16_000, channels or 1)
-        )
-        audio = open_audio(Path(source), track=track, raw=raw_format, is_raw=raw)
+        raw_format = (RawFormat() if rate is None else RawFormat(rate)) if raw else None
+        audio = open_audio(Path(source), track=track, raw=raw_format)
     summary = stream(
         audio,
-        control_address(control),
+        control_address(),
         CONSOLE,
         session=_session_name(session),
         record=record,
@@ -165,20 +151,22 @@ def listen(
         ListenFormat | None,
         typer.Option(
             "--as",
-            help="Values to print or record. Shapes are printed as JSON lines, rhubarb's mouths"
-            " when they change, and syllables and phones once they are final. Default:"
-            " faps, or the first that the file's format supports.",
+            help="Values to print or record. Default: faps, or the first that the file's format"
+            " supports.",
         ),
     ] = None,
     alphabet: PhoneAlphabet = None,
     force: Force = False,
-    control: Control = "",
 ) -> None:
-    """Print or record the output of a session until it ends."""
+    """Print or record the output of a session until it ends.
+
+    Shapes are printed as JSON lines, rhubarb's mouths when they change, and syllables and phones
+    once they are final.
+    """
     from kouxing.services.cli.follow import follow
 
     check_output(output, force=force)
-    follow(_session_name(session), output, form, control_address(control), alphabet)
+    follow(_session_name(session), output, form, control_address(), alphabet)
 
 
 def send(
@@ -192,9 +180,8 @@ def send(
     session: Annotated[
         str, typer.Option(help="Name of the session. Default: always the newest.")
     ] = "",
-    control: Control = "",
 ) -> None:
-    """Animate avatars in other programs, over VMC, Live Link Face, OSC or VTube Studio's API."""
+    """Animate avatars in other programs, over VMC, Live Link Face, OSC or VTube Studio."""
     from kouxing.services.cli.send import send_to
     from kouxing.services.senders.protocols import parse_target
     from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -203,7 +190,7 @@ def send(
     send_to(
         [parse_target(url) for url in targets],
         _session_name(session),
-        control_address(control),
+        control_address(),
         config.idle_motion_seed,
     )
 
@@ -221,9 +208,8 @@ def express(
         float | None,
         typer.Option(help=f"Seconds until the expressions fade. Default: {DEFAULT_HOLD_S:g}."),
     ] = None,
-    control: Control = "",
 ) -> None:
-    """Show expressions on a face. With no expressions given, clear the current ones."""
+    """Show expressions on a face; without expressions, clear the current ones."""
     from kouxing.shared.control_client import connect
 
     words = list(arguments or ())
@@ -233,7 +219,7 @@ def express(
         raise UserError("--hold needs an expression: kouxing express joy=0.4 --hold 2")
     hold_s = DEFAULT_HOLD_S if hold is None else hold
     check_expressions(strengths, hold_s)
-    with connect(control_address(control)) as client:
+    with connect(control_address()) as client:
         all_sessions = [state.session for state in client.status().sessions]
         for name in [session] if session else ["", *all_sessions]:
             client.set_face(name, expressions=strengths, hold_s=hold_s)
@@ -247,12 +233,12 @@ def _parse_strength(text: str) -> tuple[str, float]:
         raise UserError(f"{text!r}: write NAME=STRENGTH, for example joy=0.4") from None
 
 
-def status(control: Control = "", json_file: JsonFile = None, force: Force = False) -> None:
+def status(json_file: JsonFile = None, force: Force = False) -> None:
     """Show services, sessions, rates and latencies."""
     from kouxing.shared.control_client import connect
 
     check_output(json_file, force=force)
-    with connect(control_address(control), timeout_s=3.0) as client:
+    with connect(control_address(), timeout_s=3.0) as client:
         report = client.status()
     out = Console()
     services = []
@@ -284,12 +270,12 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
     write_json(json_file, asdict(report))
 
 
-def doctor(control: Control = "") -> None:
+def doctor() -> None:
     """Check keys, addresses, clocks and versions from this machine, and print what to do."""
     from kouxing.services.cli.doctor import examine
 
     num_checks = num_failed = 0
-    for finding in examine(control):
+    for finding in examine():
         num_checks += 1
         num_failed += bool(finding.fix)
         typer.echo(f"{'FAIL' if finding.fix else 'ok  '} {finding.subject}: {finding.result}")
@@ -315,24 +301,23 @@ def _is_drop_counter(name: str) -> bool:
     return name.startswith("dropped_") and not name.endswith("_per_s")
 
 
-def control_address(address: str) -> str:
+def control_address() -> str:
     """Return the address of control, followed by its public key unless connections are insecure.
 
-    Without ``address`` and a setting, it is the address of the user's newest system.
+    Without a setting, it is the address of the user's newest system.
     """
-    running, config = find_system(address)
+    running, config = find_system()
     return running or control_endpoint(config.control, insecure=config.insecure)
 
 
-def find_system(address: str) -> tuple[str, ServiceConfig]:
+def find_system() -> tuple[str, ServiceConfig]:
     """Return control's endpoint in the user's newest system, if it applies, and the settings."""
-    if address:
-        split_endpoint(address, "--control")
-    settings, overrides = read_settings(), {"control": address} if address else {}
-    keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
+    settings = read_settings()
+    keys = {setting.key: setting for setting in settings.describe(ServiceConfig)}
     running = find_control() if keys["control"].is_default else ""
-    config = settings.load(ServiceConfig, overrides)
+    config = settings.load(ServiceConfig)
     if "*" in config.control:
-        key = "--control" if address else "common.control"
-        raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
+        raise UserError(
+            f"common.control: {config.control!r} is not a host and port; write tcp://HOST:PORT"
+        )
     return running, config

@@ -11,15 +11,14 @@ from kouxing.shared.config import parse_assignments
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.terminal import print_table
 
-NumWorkers = Annotated[int | None, typer.Option(min=0, max=1000, help="Number to run.")]
+NumWorkers = Annotated[
+    int | None, typer.Option(min=0, max=1000, help="Number to run. Default: the current number.")
+]
 
 
 def cluster(
     recognizers: NumWorkers = None,
     synthesizers: NumWorkers = None,
-    address: Annotated[
-        str, typer.Option(help="Address of the Ray cluster. 'auto': the cluster of this host.")
-    ] = "auto",
     config: ConfigFile = None,
     assignments: ServiceAssignments = None,
 ) -> None:
@@ -32,7 +31,7 @@ def cluster(
         raise UserError(
             f"Ray is not installed; on every host of the cluster, run: {command}"
         ) from None
-    with RayWorkers(address) as workers:
+    with RayWorkers() as workers:
         for name, number in (("recognizer", recognizers), ("synthesizer", synthesizers)):
             if number is not None:
                 workers.scale(KINDS[name], number, settings)

@@ -15,7 +15,8 @@ from kouxing.shared.errors import UserError
 PAGE_HEAD = """\
 # Configuration
 
-`kouxing config --markdown > docs/configuration.md` generates this page. A test checks it.
+A test checks this page. `python -m kouxing.services.cli.configuration > docs/configuration.md`
+writes it.
 
 The sources of a value, from weakest to strongest:
 
@@ -42,19 +43,12 @@ def config(
     service: Annotated[str, typer.Argument(help=f"{', '.join(CONFIG_TYPES)}. Default: all.")] = "",
     config: ConfigFile = None,
     assignments: Assignments = None,
-    markdown: Annotated[
-        bool, typer.Option("--markdown", help="Print docs/configuration.md instead.")
-    ] = False,
 ) -> None:
-    """Print all keys with their meaning, allowed values, default, current value and its origin."""
+    """Print every setting with its meaning, allowed values, default, value and source."""
     if service and service not in CONFIG_TYPES:
         raise UserError(f"unknown service {service!r}; choose one of {', '.join(CONFIG_TYPES)}")
-    if markdown and (service or config or assignments):
-        raise UserError("--markdown prints all defaults; leave out the service, --config and --set")
     values = parse_assignments(assignments or [])
-    if markdown:
-        text = markdown_page()
-    elif service:
+    if service:
         text = _toml_table(service, read_settings(config).describe(CONFIG_TYPES[service], values))
     else:
         tables = _all_settings(read_settings(config, values))
@@ -98,3 +92,7 @@ def _toml_table(name: str, settings: list[Setting]) -> str:
 
 def _as_toml(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown_page())

@@ -29,23 +29,21 @@ def export_head(
     glb: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="File to write: .glb, or .vrm for an avatar. With --all, a folder."
+            metavar="FILE",
+            help="File to write: .glb, or .vrm for an avatar. An existing folder gets all heads.",
         ),
     ],
     head: HeadName = DEFAULT_HEAD,
-    all_heads: Annotated[
-        bool, typer.Option("--all", help="Export all built-in heads, for the page.")
-    ] = False,
     force: Force = False,
 ) -> None:
     """Write a head for a game engine: a GLB with FAPs and ARKit shapes, or a VRM 1.0 avatar."""
     from kouxing.services.driver.head.glb_export import export_glb
     from kouxing.services.driver.render.scene import load_head
 
-    if all_heads:
+    if glb.is_dir():
         if head != DEFAULT_HEAD:
-            raise UserError("--all exports every built-in head; leave out --head or --all")
-        check_output(*(glb / file for file in _page_files().values() if glb.is_dir()), force=force)
+            raise UserError(f"{glb} is a folder, which gets all heads; leave out --head")
+        check_output(*(glb / file for file in _page_files().values()), force=force)
         export_page_heads(glb)
         print_message(f"wrote the heads to {glb}")
         return

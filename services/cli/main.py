@@ -5,7 +5,7 @@ import errno
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
 from typing import Annotated, Any
@@ -17,14 +17,13 @@ from kouxing.services.cli import clients, cluster, configuration, offline, run
 from kouxing.services.cli.export import app as export_app
 from kouxing.services.cli.heads import app as head_app
 from kouxing.services.cli.keys import app as keys_app
-from kouxing.services.cli.options import Assignments, ConfigFile
+from kouxing.services.cli.options import Assignments, ConfigFile, Panel
 from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.terminal import CONSOLE
 
-SERVICES = "A single service (run starts all of them)"
 ENTRY_POINTS = "kouxing.commands"  # such as training and evaluation
 _VALUE_NAMES = {"bool": "", "str": "TEXT", "path": "PATH", "int": "NUMBER", "float": "NUMBER"}
 _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
@@ -38,9 +37,13 @@ class CommandGroup(TyperGroup):
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of all commands."""
+        """Return the names of all commands, in the order of their panels."""
         self._add_entry_points()
-        return super().list_commands(ctx)
+        order = {panel.value: number for number, panel in enumerate(Panel)}
+        commands: Mapping[str, Any] = self.commands
+        return sorted(
+            commands, key=lambda name: order.get(commands[name].rich_help_panel, len(order))
+        )
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command, or None."""
@@ -62,8 +65,9 @@ class CommandGroup(TyperGroup):
     def _add_entry_points(self) -> None:
         for entry_point in entry_points(group=ENTRY_POINTS):
             if entry_point.name not in self.commands:
-                command = typer.main.get_command(entry_point.load())
+                command: Any = typer.main.get_command(entry_point.load())
                 command.name = entry_point.name
+                command.rich_help_panel = command.rich_help_panel or Panel.MEASURE
                 self.add_command(command)
 
 
@@ -117,17 +121,22 @@ def _service_command(kind: ServiceKind) -> Callable[..., None]:
     return command
 
 
-for command in (
-    run.run, clients.speak, offline.render, offline.lips, clients.listen, clients.send,
-    clients.express, offline.phones, offline.align, clients.devices, clients.status, clients.doctor,
-    cluster.cluster, configuration.config,
-):  # fmt: skip
-    app.command()(command)
-app.add_typer(head_app, name="head")
-app.add_typer(export_app, name="export")
-app.add_typer(keys_app, name="keys")
+_COMMANDS: Mapping[Panel, Sequence[Callable[..., None]]] = {
+    Panel.RUN: (
+        run.run, clients.speak, clients.listen, clients.send, clients.express, clients.devices,
+        clients.status, clients.doctor, configuration.config, cluster.cluster,
+    ),
+    Panel.RECORDINGS: (offline.render, offline.lips, offline.phones, offline.align),
+}  # fmt: skip
+for panel, commands in _COMMANDS.items():
+    for command in commands:
+        app.command(rich_help_panel=panel)(command)
+app.add_typer(keys_app, name="keys", rich_help_panel=Panel.RUN)
+app.add_typer(head_app, name="head", rich_help_panel=Panel.RECORDINGS)
+app.add_typer(export_app, name="export", rich_help_panel=Panel.RECORDINGS)
 for kind in KINDS.values():
-    app.command(kind.name, help=kind.summary, rich_help_panel=SERVICES)(_service_command(kind))
+    add = app.command(kind.name, help=kind.summary, rich_help_panel=Panel.SERVICES)
+    add(_service_command(kind))
 
 
 def main() -> None:

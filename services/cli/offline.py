@@ -9,6 +9,7 @@ import typer
 
 from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.options import (
+    ACOUSTIC_MODEL,
     DEFAULT_HEAD,
     AudioTrack,
     CaptionKind,
@@ -39,10 +40,7 @@ from kouxing.shared.terminal import (
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
 Acoustic = Annotated[
     str | None,
-    typer.Option(
-        help="Acoustic model: blocks, light, gmm, universal, or a model file. Default: the model of"
-        " the language."
-    ),
+    typer.Option(help=f"{ACOUSTIC_MODEL}. Default: the model of the language."),
 ]
 
 
@@ -73,11 +71,8 @@ def render(
         list[Path],
         typer.Argument(
             metavar="SOUND|CURVES... [OUTPUT]",
-            help="Audio or video files, or curves (.fap, .csv, .jsonl) of kouxing or of the app"
-            " Live Link Face; '-' is standard input. Then, for a single file, the output: a video"
-            " (.mp4, .mov, .webm, or .webp without sound), one picture (.png), numbered pictures"
-            " (a folder, or a pattern such as face%05d.png), curves (.fap, .csv, .jsonl), an"
-            " animated head (.glb) or drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).",
+            help="Audio or video files, or curves (.fap, .csv, .jsonl); '-' is standard input."
+            " Then, for a single file, the output.",
         ),
     ],
     output: Annotated[
@@ -91,8 +86,8 @@ def render(
     lips: Annotated[
         list[str] | None,
         typer.Option(
-            help="Lip model, such as learned or dynamic-visemes. Repeat the option to show several"
-            " faces side by side."
+            help="Lip model, such as learned or dynamic-visemes; repeat it to show several faces"
+            " side by side."
         ),
     ] = None,
     live: Annotated[
@@ -101,8 +96,8 @@ def render(
     text: Annotated[
         str | None,
         typer.Option(
-            help="Spoken text, or a file that contains it; Mandarin in characters or pinyin. It is"
-            " aligned with the recording and improves the lips."
+            help="Spoken text for better lips, or a file that contains it; Mandarin in characters"
+            " or pinyin."
         ),
     ] = None,
     language: Language = None,
@@ -115,9 +110,14 @@ def render(
         ),
     ] = None,
     head: HeadName = DEFAULT_HEAD,
-    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "1280x720",
+    size: Annotated[
+        str, typer.Option(help="Size of the picture, WIDTHxHEIGHT in pixels.")
+    ] = "1280x720",
     background: Annotated[
-        str, typer.Option(help="studio, transparent (not for .mp4), #rrggbb, or a color name.")
+        str,
+        typer.Option(
+            help="Background: studio, transparent (not for .mp4), #rrggbb, or a color name."
+        ),
     ] = "studio",
     camera: Annotated[
         Framing, typer.Option(help="Part that fills the picture, or the head from the side.")
@@ -133,11 +133,11 @@ def render(
         typer.Option(help="Captions below the face: pinyin, phones, or the characters of --text."),
     ] = None,
     speed: Annotated[
-        float, typer.Option(min=0.25, max=1, help="0.5 is half as fast, at the same pitch.")
+        float, typer.Option(min=0.25, max=1, help="Speed at the same pitch; 0.5 is half as fast.")
     ] = 1.0,
     track: AudioTrack = None,
-    sound: Annotated[Path | None, typer.Option(help="Sound to add to curves.")] = None,
-    at: Annotated[float | None, typer.Option(help="Time of a single picture, in seconds.")] = None,
+    sound: Annotated[Path | None, typer.Option(help="Sound file to add to curves.")] = None,
+    at: Annotated[float | None, typer.Option(help="Time of a single picture, seconds.")] = None,
     mouth: MouthFile = None,
     expressiveness: Annotated[
         float | None,
@@ -145,7 +145,13 @@ def render(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Make a video, pictures or curves from sound, or from curves."""
+    """Make a video, pictures or curves from sound, or from curves.
+
+    The output is a video (.mp4, .mov, .webm, or .webp without sound), one picture (.png), numbered
+    pictures (a folder, or a pattern such as face%05d.png), curves (.fap, .csv, .jsonl), an animated
+    head (.glb) or drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync). Curves of the app Live Link
+    Face are also read.
+    """
     with show_loading():
         from kouxing.services.cli.exporters import existing_output, is_output
 
@@ -269,7 +275,10 @@ def align(
     track: AudioTrack = None,
     force: Force = False,
 ) -> None:
-    """Find the times of the phones of a known text. Exit with status 1 if the text does not fit."""
+    """Find the times of the phones of a known text.
+
+    The exit status is 1 if the text does not fit the sound.
+    """
     with show_loading():
         from kouxing.services.cli.spoken_text import read_text, report_mismatch
         from kouxing.services.mono_audio import read_mono_16k
@@ -312,17 +321,19 @@ def lips(
     lips: Annotated[
         WidthSource,
         typer.Option(
-            help="Lip model that gives the width of the mouth, which is round for u, ü and o."
-            " ferguson: always the same width."
+            help="Lip model that gives the width of the mouth; with ferguson, it is constant."
         ),
     ] = WidthSource.VISEMES,
     language: Language = None,
     timing: Annotated[
         TimingMethod | None,
-        typer.Option(help="Times of the text by energy and zero crossings, or forced alignment."),
+        typer.Option(
+            help="Method that times the text: endpoints (energy and zero crossings), or forced"
+            " alignment. Default: endpoints, or align for long texts."
+        ),
     ] = None,
     speech_to_text: Annotated[
-        Path | None, typer.Option(help="Folder of a sherpa-onnx model, to transcribe the text.")
+        Path | None, typer.Option(help="Folder of a sherpa-onnx model that transcribes the text.")
     ] = None,
     track: AudioTrack = None,
     force: Force = False,

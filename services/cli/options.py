@@ -16,6 +16,15 @@ from kouxing.shared.phones.inventory import find_language, language_codes
 DEFAULT_HEAD = DriverConfig().head
 
 
+class Panel(StrEnum):
+    """Parts of the list of all commands, in their order."""
+
+    RUN = "Run and speak"
+    RECORDINGS = "Recordings (no running system is needed)"
+    MEASURE = "Measure and train"
+    SERVICES = "A single service (run starts all of them)"
+
+
 def _find_language(name: str | None) -> str | None:
     return None if name is None else find_language(name)
 
@@ -23,13 +32,16 @@ def _find_language(name: str | None) -> str | None:
 HeadName = Annotated[
     str,
     typer.Option(
-        "--head", help=f"{', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz)."
+        "--head",
+        help=f"Head: {', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz).",
     ),
 ]
 AudioTrack = Annotated[
     int | None,
     typer.Option(
-        "--track", metavar="N", help="Audio track of the file. Default: the file's default track."
+        "--track",
+        metavar="N",
+        help="Number of the file's audio track, from 1. Default: the file's default track.",
     ),
 ]
 Language = Annotated[
@@ -38,18 +50,18 @@ Language = Annotated[
         "--language",
         callback=_find_language,
         help=f"Language of the speech: {', '.join(language_codes())}, or an installed language."
-        " auto: any language, with universal phones. Default: zh."
-        " docs/results.md has the errors of each language.",
+        " auto: any language. Default: zh.",
     ),
 ]
 PhoneAlphabet = Annotated[
     Alphabet | None,
     typer.Option(
         "--alphabet",
-        help="own (symbols of the language), ipa, or arpabet, for English. Default: own for zh, ipa"
-        " for other languages.",
+        help="Alphabet of the phones: own (the language's symbols), ipa, or arpabet (English only)."
+        " Default: own for zh, ipa for other languages.",
     ),
 ]
+ACOUSTIC_MODEL = "Acoustic model: blocks, light, gmm, universal, or a model file"  # for help texts
 Output = Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")]
 MouthFile = Annotated[
     Path | None, typer.Option("--mouth", help="Mouth profile of the speaker, from kouxing adapt.")

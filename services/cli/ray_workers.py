@@ -74,15 +74,15 @@ class Worker:
 class RayWorkers:
     """The workers of a Ray cluster. They continue to run after this process has ended.
 
-    Raises ``UserError`` if no cluster is found at ``address``, which is as for ``ray.init``.
+    Raises ``UserError`` if no cluster is found at ``$RAY_ADDRESS``, by default on this host.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self) -> None:
         try:
-            ray.init(address, namespace=NAMESPACE, log_to_driver=False, logging_level="error")
+            ray.init("auto", namespace=NAMESPACE, log_to_driver=False, logging_level="error")
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise UserError(
-                f"no Ray cluster was found at {address!r}; start one with 'ray start --head'"
+                "no Ray cluster was found; start one with 'ray start --head', or set RAY_ADDRESS"
                 f" ({str(error).partition('.')[0]})"
             ) from None
 

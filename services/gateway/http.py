@@ -227,8 +227,8 @@ def _page_head(name: str) -> Path:
         with contextlib.suppress(web.HTTPNotFound):
             return _find(folder, file, {".glb"})
     folder = page_heads_folder()
-    text = f"head {file} is missing; create all heads with 'kouxing head export --all {folder}'\n"
-    raise web.HTTPNotFound(text=text)
+    command = f"mkdir -p {folder} && kouxing head export {folder}"
+    raise web.HTTPNotFound(text=f"head {file} is missing; create all heads with '{command}'\n")
 
 
 def _content_policy(index: Path, frame_ancestors: str) -> str:

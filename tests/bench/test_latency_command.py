@@ -13,13 +13,14 @@ from tests.system import VOWELS_FILE
 def test_prints_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("kouxing.evaluation.system.latency.NUM_REPEATS", 1)
     monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_IMAGES", 3)
     monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_SESSIONS", (1,))
     monkeypatch.setattr("kouxing.evaluation.system.page.SIZE_PX", (320, 240))
     monkeypatch.setattr("kouxing.evaluation.system.page.SETTLE_S", 0.5)
     monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 1.0)
     figures = tmp_path / "latency.json"
-    arguments = [str(VOWELS_FILE), "--repeats", "1", "--json", str(figures)]
+    arguments = [str(VOWELS_FILE), "--json", str(figures)]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     latency = json.loads(figures.read_text(encoding="utf-8"))

@@ -43,9 +43,8 @@ def test_workers_are_placed_restarted_elsewhere_and_stopped(
 ) -> None:
     def scale(**numbers: int) -> str:
         options = [text for name, number in numbers.items() for text in (f"--{name}", number)]
-        done = kouxing(
-            "cluster", "--address", nodes.address, *options, environment=control.environment
-        )
+        environment = control.environment | {"RAY_ADDRESS": nodes.address}
+        done = kouxing("cluster", *options, environment=environment)
         assert done.returncode == 0, done.stderr
         return done.stdout
 

@@ -247,7 +247,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
 
 def test_the_page_in_the_docs_is_current() -> None:
     assert PAGE.read_text(encoding="utf-8") == markdown_page(), (
-        "run: kouxing config --markdown > docs/configuration.md"
+        "run: python -m kouxing.services.cli.configuration > docs/configuration.md"
     )
 
 

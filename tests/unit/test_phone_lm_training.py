@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from kouxing.shared.errors import UserError
-from kouxing.training.commands import app
 from kouxing.training.phone_lm import open_gram
-from kouxing.training.phone_lm.open_gram import draw_phones
+from kouxing.training.phone_lm.open_gram import DICTIONARY, NGRAMS, draw_phones
 from kouxing.training.phone_lm.recipe import (
     Stream,
     estimate_phone_lm,
@@ -107,9 +105,11 @@ def write_dictionary(path: Path) -> Path:
 
 
 @pytest.fixture
-def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(open_gram, "_NUM_CHAINS", 20)
-    return write_ngrams(tmp_path / "lm.txt"), write_dictionary(tmp_path / "pydict_sc.bin")
+    write_ngrams(tmp_path / NGRAMS)
+    write_dictionary(tmp_path / DICTIONARY)
+    return tmp_path
 
 
 def words_of(stream: Stream) -> list[str]:
@@ -126,8 +126,8 @@ def words_of(stream: Stream) -> list[str]:
     return found
 
 
-def test_draws_words_with_their_probabilities(model: tuple[Path, Path]) -> None:
-    stream = draw_phones(*model, MANDARIN, num_words=8000)
+def test_draws_words_with_their_probabilities(model: Path) -> None:
+    stream = draw_phones(model, MANDARIN, num_words=8000)
     assert stream.dtype == np.uint8
     assert not ((stream[1:] == SIL) & (stream[:-1] == SIL)).any()
     assert stream[0] == SIL
@@ -139,15 +139,23 @@ def test_draws_words_with_their_probabilities(model: tuple[Path, Path]) -> None:
     assert pairs["你好", "中国"] / hello == pytest.approx(0.9, abs=0.04)
     people = [after for before, after in pairwise(words) if before == "人"]
     assert people.count("人") / len(people) == pytest.approx(0.4, abs=0.04)
-    ngrams, dictionary = model
-    for files, message in (
-        ((dictionary, dictionary), "is not output of `tslminfo -v`"),
-        ((ngrams, ngrams), "use files of the same version"),
-    ):
-        with pytest.raises(UserError, match=message):
-            draw_phones(*files, MANDARIN, num_words=10)
     # a comma, Latin letters and word 0 are pauses
     assert people.count("") / len(people) == pytest.approx(0.15, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("source", "replaced", "message"),
+    [
+        (DICTIONARY, NGRAMS, "is not output of `tslminfo -v`"),
+        (NGRAMS, DICTIONARY, "use files of the same version"),
+    ],
+)
+def test_rejects_a_word_model_of_wrong_files(
+    model: Path, source: str, replaced: str, message: str
+) -> None:
+    (model / replaced).write_bytes((model / source).read_bytes())
+    with pytest.raises(UserError, match=message):
+        draw_phones(model, MANDARIN, num_words=10)
 
 
 # --- from files to a file
@@ -219,11 +227,3 @@ def test_rejects_unreadable_texts_and_empty_input(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no text to count"):
         train_phone_lm([], [], output, MANDARIN)
     assert not output.exists()
-
-
-@pytest.mark.parametrize("option", ["--ngrams", "--dictionary"])
-def test_n_grams_need_a_dictionary(option: str, tmp_path: Path) -> None:
-    arguments = ["phone-lm", "-o", str(tmp_path / "l.npz"), option, str(tmp_path / "file")]
-    result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, UserError)
-    assert "use --ngrams and --dictionary together" in str(result.exception)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
@@ -14,6 +15,7 @@ from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.page import TABLES
 from kouxing.evaluation.report.run import run_steps, write_result
 from kouxing.evaluation.report.steps import ROOT, STEPS, Step
+from kouxing.evaluation.system.commands import app as bench_app
 from kouxing.shared.errors import UserError
 
 SCORES = {"r_opening": 0.5, "closure_f1": 0.6, "mtm_ms": 50.0, "slcc": 0.0}
@@ -28,14 +30,15 @@ def step_file(result: Any) -> dict[str, Any]:
     return {"commands": ["kouxing x"], **about, **time, "code": "1", "result": result}
 
 
-def test_every_step_names_code_that_exists_and_a_command() -> None:
+def test_every_step_names_code_a_command_and_options_that_exist() -> None:
+    groups = {"evaluate": get_command(app), "bench": get_command(bench_app)}
     for step in STEPS.values():
         assert all([*ROOT.glob(pattern)] for pattern in step.code)
         for command in (*step.commands, *(step.quick or ())):
-            group = {"evaluate": app}.get(command.split()[0])
-            assert group is None or command.split()[1] in {
-                c.name or c.callback.__name__ for c in group.registered_commands if c.callback
-            }
+            group, name, *words = command.split()
+            parameters = groups[group].commands[name].params  # type: ignore[attr-defined]
+            known = {option for parameter in parameters for option in parameter.opts}
+            assert {word for word in words if word.startswith("--")} <= known
     assert {name for part in TABLES.values() for name in part.steps} | {"lips"} == {*STEPS}
 
 
@@ -44,7 +47,7 @@ def test_a_step_runs_only_if_its_code_has_changed(
 ) -> None:
     hashes = ["1", "1", "1", "2", "2"]
     monkeypatch.setattr(f"{run.__name__}.code_hash", lambda _: hashes.pop(0))
-    monkeypatch.setitem(STEPS, "mine", Step(("bench {data}",), ("code.py",)))
+    monkeypatch.setitem(STEPS, "mine", Step(("bench {corpus}",), ("code.py",)))
     commands: list[list[str]] = []
 
     def measure(command: list[str], **_: object) -> Any:
@@ -59,19 +62,19 @@ def test_a_step_runs_only_if_its_code_has_changed(
 
     def run_mine(**changed: Any) -> int:
         commands.clear()
-        assert run_steps(["mine"], {"data": Path("/d")}, tmp_path, **options | changed) == []
+        assert run_steps(["mine"], {"corpus": Path("/d")}, tmp_path, **options | changed) == []
         return sum(sys.executable in command for command in commands)
 
     assert run_mine() == 1
     assert ["kouxing", "bench", "/d"] in [command[2:5] for command in commands]
     stored = json.loads((tmp_path / "mine.json").read_text())
     assert stored["result"] == {"r": 0.12346}
-    assert stored["commands"] == ["kouxing bench data"]
+    assert stored["commands"] == ["kouxing bench corpus"]
     assert stored["commit"] == "abc"
     assert run_mine() == 0
     assert run_mine(is_fresh=True) == 1
     assert run_mine() == 1  # the code has changed
-    assert run_steps(["mine"], {"data": None}, tmp_path, **options) == []  # left out without data
+    assert run_steps(["mine"], {"corpus": None}, tmp_path, **options) == []  # left out without data
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from typer.testing import CliRunner
 
 from kouxing.corpora.speech_corpus import RowErrors, may_ship, read_corpus
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.forced_path import utterance_graph, viterbi_path
 from kouxing.shared.errors import UserError
+from kouxing.training.commands import app
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
 from tests.languages import MANDARIN, SIL
@@ -193,3 +195,18 @@ def test_trains_models_and_writes_cards(tmp_path: Path, capsys: pytest.CaptureFi
     np.testing.assert_array_equal(known[again].phone, welcome.phone)
     np.testing.assert_array_equal(known[again].log_prob, welcome.log_prob)
     assert len(known[gmm].phone) < len(welcome.phone)
+
+
+@pytest.mark.parametrize("options", [[], ["--any-license"]])
+def test_an_option_of_the_group_permits_any_license(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
+    permitted = []
+
+    def train(*_: Path, any_license: bool) -> None:
+        permitted.append(any_license)
+
+    monkeypatch.setattr("kouxing.training.visemes.recipe.train_visemes", train)
+    arguments = ["visemes", "--clips", str(tmp_path), "-o", str(tmp_path / "visemes.json")]
+    CliRunner().invoke(app, [*options, *arguments], catch_exceptions=False)
+    assert permitted == [bool(options)]

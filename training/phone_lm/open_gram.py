@@ -23,6 +23,7 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.user_file import open_file, read_file
 from kouxing.training.phone_lm.recipe import Stream, phones_of_text
 
+NGRAMS, DICTIONARY = "ngrams.txt", "pydict_sc.bin"  # files of a word model
 _MAX_BYTES = 4 << 30
 _BASE = 100_000  # base of the n-grams' codes, greater than the number of words
 _NUM_CHAINS = 100_000  # drawn in parallel
@@ -57,8 +58,7 @@ class _Level:
 
 
 def draw_phones(
-    ngrams: Path,
-    dictionary: Path,
+    folder: Path,
     inventory: PhoneInventory,
     *,
     num_words: int = 30_000_000,
@@ -66,9 +66,10 @@ def draw_phones(
 ) -> Stream:
     """Draw about ``num_words`` words; return their phones, with pauses between sentences.
 
-    ``ngrams`` is output of ``tslminfo -v``, ``dictionary`` the file ``pydict_sc.bin``. The same
+    ``folder`` has ``ngrams.txt``, the output of ``tslminfo -v``, and ``pydict_sc.bin``. The same
     seed draws the same words. Raises UserError if a file is missing or invalid.
     """
+    ngrams, dictionary = folder / NGRAMS, folder / DICTIONARY
     words = _words(dictionary)
     levels = _levels(ngrams)
     if max(int((level.code % _BASE).max()) for level in levels) >= len(words):

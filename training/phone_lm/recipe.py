@@ -227,7 +227,7 @@ def train_phone_lm(
     if len(corpus_stream):
         streams += [corpus_stream] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus_stream)))
     if not num_text + len(corpus_stream):
-        raise UserError("no text to count; add --text, --ngrams or a corpus with sentences")
+        raise UserError("no text to count; add --text, --word-model or a corpus with sentences")
     print_message(f"{num_text} phones of text, {len(corpus_stream)} of sentences of the corpora")
     phone_lm = estimate_phone_lm(streams, inventory)
     write_archive(output, phone_lm_arrays(phone_lm))

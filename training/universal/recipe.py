@@ -45,6 +45,7 @@ def train_universal(
     clips: Path | None = None,
     seed: int = 0,
     num_steps: int = 2000,
+    shipping: bool = True,
 ) -> None:
     """Train the universal readout of the shipped block model, and write it with its card.
 
@@ -58,7 +59,7 @@ def train_universal(
     torch.manual_seed(seed)
     errors = RowErrors()
     inventory = load_inventory(UNIVERSAL)
-    data = read_training_set(mandarin, learners, languages, clips, errors)
+    data = read_training_set(mandarin, learners, languages, clips, errors, shipping=shipping)
     folder, states_file, checkpoint = (
         output.with_suffix(end) for end in (".features", ".states.npz", ".readout.pt")
     )

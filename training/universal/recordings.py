@@ -52,16 +52,19 @@ def read_training_set(
     languages: Sequence[Path],
     clips: Path | None,
     errors: RowErrors,
+    *,
+    shipping: bool = True,
 ) -> TrainingSet:
-    """Read the recordings that are not held out and whose license allows distribution.
+    """Read the recordings that are not held out.
 
     ``mandarin`` are Mandarin corpora, ``learners`` English by native speakers of Mandarin,
-    ``languages`` corpora of several languages, and ``clips`` a folder with clips of GRID. Raises
-    UserError if nothing can be used.
+    ``languages`` corpora of several languages, and ``clips`` a folder with clips of GRID. By
+    default, their license must allow distributing the model. Raises UserError if nothing can be
+    used.
     """
     groups: dict[str, list[Utterance]] = defaultdict(list)
     for corpus in mandarin:
-        groups["mandarin"] += _some_mandarin(corpus, errors)
+        groups["mandarin"] += _some_mandarin(corpus, errors, shipping=shipping)
     for corpus in learners:
         groups["learners"] += _some_of_each_speaker(corpus, errors)
     universal = load_inventory(UNIVERSAL)
@@ -72,7 +75,7 @@ def read_training_set(
         groups["grid"] += _grid_clips(clips, errors)
     recordings, weights = [], []
     for name, group in sorted(groups.items()):
-        usable = [one for one in group if _may_train(one)]
+        usable = [one for one in group if _may_train(one, shipping=shipping)]
         minutes = sum(one.seconds for one in usable)
         recordings += usable
         fraction = _FRACTIONS.get(name, _SYNTHETIC_FRACTION)
@@ -86,9 +89,9 @@ def _group_of(recording: Utterance) -> str:
     return "synthetic" if is_synthetic(recording.license) else recording.language
 
 
-def _may_train(recording: Utterance) -> bool:
+def _may_train(recording: Utterance, *, shipping: bool) -> bool:
     return (
-        may_ship(recording.license)
+        (may_ship(recording.license) or not shipping)
         and recording.seconds <= _MAX_S
         and recording.language not in _HELD_OUT_LANGUAGES
         and recording.speaker not in _HELD_OUT_SPEAKERS
@@ -96,11 +99,13 @@ def _may_train(recording: Utterance) -> bool:
     )
 
 
-def _some_mandarin(corpus: Path, errors: RowErrors) -> list[Utterance]:
+def _some_mandarin(corpus: Path, errors: RowErrors, *, shipping: bool) -> list[Utterance]:
     """Draw some recordings of each kind, with universal phones."""
     mandarin, universal = load_inventory(), load_inventory(UNIVERSAL)
     rows = [
-        one for one in read_corpus(corpus, errors, mandarin, split="train") if may_ship(one.license)
+        one
+        for one in read_corpus(corpus, errors, mandarin, split="train")
+        if may_ship(one.license) or not shipping
     ]
     random.Random(3).shuffle(rows)  # noqa: S311 - reproducible
     by_kind: dict[str, list[Utterance]] = defaultdict(list)
