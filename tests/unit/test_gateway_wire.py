@@ -11,6 +11,7 @@ from kouxing.services.gateway import wire
 from kouxing.services.gateway.http import WebSockets
 from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.services.gateway.sample import SampleSentence
+from kouxing.services.gateway.shape_messages import parse_avatar
 from kouxing.services.gateway.viewer_queue import (
     MAX_QUEUED,
     NUM_FRAMES_KEPT,
@@ -21,6 +22,7 @@ from kouxing.services.gateway.viewers import PAUSE_S, Viewer, Viewers
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.face.shapes import VRM
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
 
@@ -118,13 +120,51 @@ def test_rejects_messages_that_are_not_objects(message: str) -> None:
 UNUSED: Any = lambda *_: None  # noqa: E731 - calls that these tests do not need
 
 
+@pytest.mark.parametrize("message_format", ["binary", "json"])
+def test_an_avatar_gets_the_weights_of_its_shapes(message_format: str) -> None:
+    meshes = [["Basis", "Fcl_MTH_A"], ["Blink", "A", "Fcl_MTH_U"]]
+    encoder = parse_avatar({"avatar": meshes, "format": message_format})
+    targets = json.loads(encoder.announcement())["targets"]
+    assert sorted(targets) == [[0, 1], [1, 0], [1, 1], [1, 2]]
+    faps = np.arange(68).astype("<f4")
+    weights = dict(zip(VRM.names, VRM.weights(faps).tolist(), strict=True))
+    shapes = {(0, 1): "aa", (1, 0): "blink", (1, 1): "aa", (1, 2): "ou"}
+    message = encoder.encode("weights", 1, 320, faps.tobytes())
+    received = (
+        np.frombuffer(message, "<f4", offset=16)
+        if isinstance(message, bytes)
+        else json.loads(message)["weights"]
+    )
+    expected = [weights[shapes[mesh, shape]] for mesh, shape in targets]
+    np.testing.assert_allclose(received, expected, atol=1e-4)
+    assert max(expected) > 0.01
+
+
+@pytest.mark.parametrize(
+    ("command", "error"),
+    [
+        ({"avatar": "jawOpen"}, "list the shape names of each mesh"),
+        ({"avatar": [["x" * 129]]}, "list the shape names of each mesh"),
+        ({"avatar": [["jawOpen"] * 600] * 2}, "more than 1024 shapes"),
+        ({"avatar": [["jawOpen"]], "format": "xml"}, "format must be one of"),
+        ({"avatar": [["Basis"], []]}, "the avatar cannot speak"),
+    ],
+)
+def test_rejects_an_avatar_that_cannot_be_shown(command: dict[str, object], error: str) -> None:
+    with pytest.raises(UserError, match=error):
+        parse_avatar(command)
+
+
+def drain(viewer_queue: ViewerQueue) -> list[str | bytes]:
+    async def take_all() -> list[str | bytes]:
+        return [await viewer_queue.get() for _ in range(len(viewer_queue))]
+
+    return asyncio.run(take_all())
+
+
 def binary_types(viewer: Viewer) -> list[int]:
     """Return the types of the queued binary messages."""
-
-    async def take_all() -> list[str | bytes]:
-        return [await viewer.queue.get() for _ in range(len(viewer.queue))]
-
-    return [message[0] for message in asyncio.run(take_all()) if isinstance(message, bytes)]
+    return [message[0] for message in drain(viewer.queue) if isinstance(message, bytes)]
 
 
 def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
@@ -143,13 +183,6 @@ def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
         assert viewers.rest_from_s == 0.02 + PAUSE_S
         viewers.show_rest(face, now_s=0.5)
         assert binary_types(viewer) == [wire.REST_TYPE]
-
-
-def drain(viewer_queue: ViewerQueue) -> list[str | bytes]:
-    async def take_all() -> list[str | bytes]:
-        return [await viewer_queue.get() for _ in range(len(viewer_queue))]
-
-    return asyncio.run(take_all())
 
 
 def test_drops_sound_and_old_frames_but_not_text() -> None:
