@@ -19,6 +19,7 @@ from kouxing.corpora.options import (
 )
 from kouxing.evaluation.system.commands import SENTENCE, attacks, faults
 from kouxing.services.cli.options import ACOUSTIC_MODEL
+from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import (
     Force,
     JsonFile,
@@ -37,6 +38,10 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure models and services.")
 plot_app = typer.Typer(no_args_is_help=True, add_completion=False)
 
+
+# panels of the help
+_RECOGNITION, _LIPS, _SYSTEM = "Recognition", "Lips", "Face and services"
+_ALL = "All evaluations"
 
 _CORPUS = typer.Option("--corpus", "--manifest", help="Corpus folder or manifest.")
 Corpus = Annotated[Path, _CORPUS]
@@ -58,7 +63,7 @@ Tables = Annotated[
 ]
 
 
-@app.command()
+@app.command(rich_help_panel=_RECOGNITION)
 def recognizer(
     corpus: Corpus,
     audio: Annotated[
@@ -100,7 +105,7 @@ def recognizer(
     write_json(json_file, results)
 
 
-@app.command()
+@app.command(rich_help_panel=_RECOGNITION)
 def languages(
     audio: Annotated[
         Path, typer.Option(help="Folder of the audio files that corpora/languages.tsv lists.")
@@ -126,7 +131,7 @@ def languages(
     write_json(json_file, results)
 
 
-@app.command()
+@app.command(rich_help_panel=_RECOGNITION)
 def voice(
     corpus: Corpus,
     split: Split = "test",
@@ -160,7 +165,7 @@ def voice(
     write_json(json_file, results)
 
 
-@app.command()
+@app.command(rich_help_panel=_SYSTEM)
 def face(
     recordings: EmotionalSpeech,
     json_file: JsonFile = None,
@@ -194,7 +199,7 @@ def _models(
         yield name, load_model(name), RecognizerConfig(acoustic=name).output_rule
 
 
-@app.command()
+@app.command(rich_help_panel=_LIPS)
 def lips(
     clips: Clips,
     lips: Annotated[
@@ -229,6 +234,8 @@ def lips(
     from kouxing.evaluation.recognizer.disturbances import check_conditions, music_from
 
     check_output(json_file, force=force)
+    if tables and delay_ms and not lips:
+        raise UserError("--delay-ms applies to lip models; add --lips MODEL")
     conditions = conditions or list(CONDITIONS)
     check_conditions(conditions, CONDITIONS)
     music = music_from(_read_sounds(sounds))
@@ -237,7 +244,7 @@ def lips(
     write_json(json_file, results)
 
 
-@app.command(name="lips-package")
+@app.command(name="lips-package", rich_help_panel=_LIPS)
 def lips_package(
     clips: Clips,
     corpus: OptionalCorpus = None,
@@ -256,7 +263,7 @@ def lips_package(
     write_json(json_file, asdict(comparison))
 
 
-@app.command(name="pack-clips")
+@app.command(name="pack-clips", rich_help_panel=_LIPS)
 def pack_clips(
     archive: Annotated[Path, typer.Argument(help="Archive to write (.zip).")],
     clips: Clips,
@@ -270,7 +277,7 @@ def pack_clips(
     print_message(f"wrote {plural(num_clips, 'clip')} to {archive}")
 
 
-@app.command()
+@app.command(rich_help_panel=_LIPS)
 def rivals(
     output: Annotated[
         Path, typer.Argument(help="Folder for PROGRAM/CLIP.csv; existing files are kept.")
@@ -290,7 +297,7 @@ def rivals(
     write_tables(clips, output, program or PROGRAMS)
 
 
-@app.command()
+@app.command(rich_help_panel=_ALL)
 def report(
     step: Annotated[list[str] | None, typer.Argument(help="Name of a step. Default: all.")] = None,
     clips: OptionalClips = None,
@@ -318,7 +325,6 @@ def report(
     from kouxing.evaluation.report.page import write_page
     from kouxing.evaluation.report.run import run_steps
     from kouxing.evaluation.report.steps import ROOT, STEPS
-    from kouxing.shared.errors import UserError
 
     unknown = {*(step or ())} - {*STEPS}
     if unknown:
@@ -341,7 +347,7 @@ def report(
         raise UserError(f"these steps failed: {', '.join(failed)}; their messages are above")
 
 
-@app.command()
+@app.command(rich_help_panel=_LIPS)
 def schemes(
     corpus: OptionalCorpus = None,
     clips: OptionalClips = None,
@@ -371,7 +377,6 @@ def schemes(
     from kouxing.evaluation.lips.scheme_videos import write_videos
     from kouxing.services.lip_models import lip_models
     from kouxing.services.recognizer.acoustic.load import load_model
-    from kouxing.shared.errors import UserError
 
     check_output(json_file, inputs=[corpus], force=force)
     if corpus and clips:
@@ -399,7 +404,7 @@ def schemes(
             print_message(f"no videos of scheme 1: no usable text for {', '.join(unaligned)}")
 
 
-@app.command()
+@app.command(rich_help_panel=_LIPS)
 def ferguson(
     clips: Clips,
     json_file: JsonFile = None,
@@ -414,7 +419,7 @@ def ferguson(
     write_json(json_file, [asdict(score) for score in scores])
 
 
-@app.command()
+@app.command(rich_help_panel=_LIPS)
 def visemes(
     clips: Clips,
     picture: Picture = None,
@@ -440,8 +445,8 @@ def visemes(
     write_json(json_file, {"clips": names, "errors": [asdict(error) for error in errors]})
 
 
-app.command()(attacks)
-app.command()(faults)
+app.command(rich_help_panel=_SYSTEM)(attacks)
+app.command(rich_help_panel=_SYSTEM)(faults)
 
 
 @plot_app.callback()

@@ -46,7 +46,7 @@ def heads(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SOUND...", help="Speech and laughter. Pauses fill the rest of a minute."
+            metavar="SOUND", help="Speech and laughter. Pauses fill the rest of a minute."
         ),
     ],
     language: Language = None,

@@ -62,21 +62,21 @@ class Step:
     quick: tuple[str, ...] | None = None  # None: the same as ``commands``; empty: skipped
 
 
-_READ = "evaluate recognizer --manifest {corpus} --condition clean " + _MODELS
+_READ = "evaluate recognizer --corpus {corpus} --condition clean " + _MODELS
 _LIP_SCORES = "evaluate lips --clips {lips}"
-_SCHEMES = "evaluate schemes --manifest {corpus} --acoustic blocks --acoustic gmm"
+_SCHEMES = "evaluate schemes --corpus {corpus} --acoustic blocks --acoustic gmm"
 
 STEPS: Mapping[str, Step] = {
     "read": Step((_READ + " --split test",), _RECOGNIZER, (_READ + " --split dev",)),
     "conversation": Step(
         (
-            f"evaluate recognizer --manifest {CONVERSATION.relative_to(ROOT)} --audio {{natural}}"
+            f"evaluate recognizer --corpus {CONVERSATION.relative_to(ROOT)} --audio {{natural}}"
             f" --split conversation --condition clean {_MODELS}",
         ),
         _RECOGNIZER,
         (),
     ),
-    "disturbed": Step(("evaluate recognizer --manifest {corpus} --split dev",), _RECOGNIZER, ()),
+    "disturbed": Step(("evaluate recognizer --corpus {corpus} --split dev",), _RECOGNIZER, ()),
     "languages": Step(
         ("evaluate languages --audio {languages}",),
         (
@@ -143,7 +143,7 @@ STEPS: Mapping[str, Step] = {
         (f"bench lips-page {SAMPLE.relative_to(ROOT)}",),
     ),
     "package": Step(
-        ("evaluate lips-package --clips {lips} --manifest {corpus}",),
+        ("evaluate lips-package --clips {lips} --corpus {corpus}",),
         ("clients/kouxing-lips/engine", "evaluation/system/lips_package.py", *_FACES),
         (),
     ),

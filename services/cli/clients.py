@@ -173,7 +173,7 @@ def send(
     targets: Annotated[
         list[str],
         typer.Argument(
-            metavar="URL...",
+            metavar="URL",
             help="Addresses of programs that show the face, such as vmc://HOST:PORT.",
         ),
     ],
@@ -199,7 +199,7 @@ def express(
     arguments: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[SESSION] [NAME=STRENGTH]...",
+            metavar="[SESSION] NAME=STRENGTH",
             help="Session (default: all faces), then expressions with strengths from 0 to 1, such"
             f" as joy=0.4: {', '.join(ExpressionName)}.",
         ),

@@ -70,7 +70,7 @@ def render(
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SOUND|CURVES... [OUTPUT]",
+            metavar="SOUND|CURVES [OUTPUT]",
             help="Audio or video files, or curves (.fap, .csv, .jsonl); '-' is standard input."
             " Then, for a single file, the output.",
         ),
@@ -147,10 +147,10 @@ def render(
 ) -> None:
     """Make a video, pictures or curves from sound, or from curves.
 
-    The output is a video (.mp4, .mov, .webm, or .webp without sound), one picture (.png), numbered
-    pictures (a folder, or a pattern such as face%05d.png), curves (.fap, .csv, .jsonl), an animated
-    head (.glb) or drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync). Curves of the app Live Link
-    Face are also read.
+    The output is a video (.mp4, .mov, .webm, or .webp without sound) or a picture (.png). Numbered
+    pictures go to a folder, or to a pattern such as face%05d.png. Curves (.fap, .csv, .jsonl), an
+    animated head (.glb) and drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync) are also written.
+    Curves of the app Live Link Face are also read.
     """
     with show_loading():
         from kouxing.services.cli.exporters import existing_output, is_output

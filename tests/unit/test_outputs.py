@@ -141,6 +141,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("head export . --head ada", "leave out --head"),
         ("keys add tablet", "tablet.key exists; add --force"),
         ("evaluate schemes --from-csv . --videos .", "add --videos FOLDER and --clips"),
+        ("evaluate lips --clips . --from-csv . --delay-ms 9", "--delay-ms applies to lip models"),
     ],
 )
 def test_refuses_an_option_without_effect(
