@@ -151,8 +151,9 @@ def listen(
         ListenFormat | None,
         typer.Option(
             "--as",
-            help="Values to print or record. Default: faps, or the first that the file's format"
-            " supports.",
+            metavar="VALUES",
+            help=f"Values to print or record: {', '.join(ListenFormat)}. Default: faps, or the"
+            " first that the file's format supports.",
         ),
     ] = None,
     alphabet: PhoneAlphabet = None,

@@ -105,8 +105,9 @@ def render(
         CurveFormat | None,
         typer.Option(
             "--as",
-            help="Values to write to a curve file. Default: faps; drawn mouths (rhubarb) in .tsv,"
-            " .xml and .json.",
+            metavar="VALUES",
+            help=f"Values of a curve file: {', '.join(CurveFormat)}. Default: faps; rhubarb (drawn"
+            " mouths) in .tsv, .xml and .json.",
         ),
     ] = None,
     head: HeadName = DEFAULT_HEAD,
@@ -147,9 +148,9 @@ def render(
 ) -> None:
     """Make a video, pictures or curves from sound, or from curves.
 
-    The output is a video (.mp4, .mov, .webm, or .webp without sound) or a picture (.png). Numbered
-    pictures go to a folder, or to a pattern such as face%05d.png. Curves (.fap, .csv, .jsonl), an
-    animated head (.glb) and drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync) are also written.
+    The output is a video (.mp4, .mov, .webm, or .webp without sound) or a picture (.png). Other
+    outputs are numbered pictures (a folder, or a pattern such as face%05d.png), curves (.fap, .csv,
+    .jsonl), an animated head (.glb) and drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).
     Curves of the app Live Link Face are also read.
     """
     with show_loading():
