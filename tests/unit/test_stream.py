@@ -12,7 +12,7 @@ from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.search import decoder, path_records
+from kouxing.services.recognizer.search import frame_search, path_records
 from kouxing.services.recognizer.stream import MAX_JITTER
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import (
@@ -282,7 +282,7 @@ def test_silence_and_noise_have_no_phones() -> None:
 def test_warm_up_compiles_everything_and_changes_no_result() -> None:
     expected = hello_phones()
     Recognizer(load_model()).warm_up()
-    assert decoder._steps.signatures
+    assert frame_search.advance_frames.signatures
     assert path_records.count_paths.signatures
     assert path_records.compact.signatures
     assert hello_phones() == expected
