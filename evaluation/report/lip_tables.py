@@ -94,15 +94,15 @@ def agreement(results: Results) -> Table:
     ]
 
 
-def better_programs(results: Results) -> list[str]:
-    """Return a sentence for each measure in which another program is better than ``_OWN``."""
+def better_programs(results: Results) -> list[list[str]]:
+    """Return a row for each measure in which another program is better than ``_OWN``."""
     faces = results.get("rivals", {})
     scores = _clean_scores(faces)
     own = next((face for face in scores if face.startswith(f"{_OWN}, ")), None)
     if own is None:
         return []
     others = [face for face in scores if face.partition(", ")[0] in _NAMES]
-    sentences = []
+    rows = []
     for group, group_title in _COMPARED_GROUPS.items():
         real = faces[REAL][CLEAN].get(group, {})
         for measure, name in _MEASURE_NAMES.items():
@@ -125,9 +125,9 @@ def better_programs(results: Results) -> list[str]:
                     ]
                 if measure in _LIKE_REAL:
                     figures.append(f"real lips {_format_measure(measure, real[measure])}")
-                sentence = f"{group_title}, {name}: {title_of(best)} ({figures[0]})"
-                sentences.append(f"{sentence}; {own} ({', '.join(figures[1:])})")
-    return sentences
+                program, ours = title_of(best), ", ".join(figures[1:])
+                rows.append([f"{group_title}, {name}", program, figures[0], ours])
+    return rows
 
 
 def _loss(measure: str, value: float, real: float | None) -> float:

@@ -57,9 +57,8 @@ def write_page(folder: Path, page: Path) -> None:
         *better_recognizers(results),
         *system_tables.better_packages(results),
     ]
-    text = _TEMPLATE.read_text("utf-8").replace(
-        "[[better]]\n", bullets(better or ["In no measure"])
-    )
+    columns = ("measure", "best other program", "its figure", "kouxing")
+    text = _TEMPLATE.read_text("utf-8").replace("[[better]]\n", markdown((columns, better)))
     parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _part(match[1], steps, results), text)
     page.write_text(parts, encoding="utf-8")
     if "lookahead" in results:

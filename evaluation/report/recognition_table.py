@@ -51,18 +51,16 @@ def recognition(results: Results) -> Table:
     return columns, [*rows, paper]
 
 
-def better_recognizers(results: Results) -> list[str]:
-    """Return a line for each error rate of a language in which hama is better."""
-    sentences = []
+def better_recognizers(results: Results) -> list[list[str]]:
+    """Return a row for each error rate of a language in which hama is better."""
+    rows = []
     for group, scores in _by_language(results).items():
         for unit, name in _ERRORS.items() if "hama" in scores else ():
             hama, own = (scores[key]["final"][f"{unit}_error_rate"] for key in ("hama", "own"))
             if hama < own:
-                sentences.append(
-                    f"{_SPEECH.get(group, group)}, {name}: hama 1.7.0, offline ({percent(hama)} %);"
-                    f" kouxing, live ({percent(own)} %)"
-                )
-    return sentences
+                measure, figures = f"{_SPEECH.get(group, group)}, {name}", (hama, own)
+                rows.append([measure, "hama 1.7.0, offline", *(f"{percent(f)} %" for f in figures)])
+    return rows
 
 
 def _by_language(results: Results) -> dict[str, dict[str, Results]]:

@@ -153,20 +153,18 @@ def _package(results: Results) -> Iterator[list[str]]:
         yield row(f"wrong phones ({model}), difference, %", [percent(r) for r in rates.values()])
 
 
-def better_packages(results: Results) -> list[str]:
-    """Return a line for each figure in the browser in which another package is better."""
+def better_packages(results: Results) -> list[list[str]]:
+    """Return a row for each figure in the browser in which another package is better."""
     browser = results.get("browser")
     if not browser:
         return []
-    sentences = []
+    rows = []
     for key, (name, scale, unit) in _PACKAGE_FIGURES.items():
         best = min((browser, *browser["others"]), key=lambda package: package[key])
         if best is not browser:
             figures = [f"{format_number(p[key] * scale, '.1f')} {unit}" for p in (best, browser)]
-            sentences.append(
-                f"browser, {name}: {best['name']} ({figures[0]}); {browser['name']} ({figures[1]})"
-            )
-    return sentences
+            rows.append([f"browser, {name}", best["name"], *figures])
+    return rows
 
 
 def _sizes(results: Results) -> Iterator[list[str]]:
