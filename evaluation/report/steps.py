@@ -119,7 +119,7 @@ STEPS: Mapping[str, Step] = {
         ("evaluate ferguson --clips {lips}",), ("evaluation/lips/speaking_rates.py", *_FACES), ()
     ),
     "chain": Step(
-        (f"bench chain {SAMPLE.relative_to(ROOT)}",),
+        (f"bench latency {SAMPLE.relative_to(ROOT)}",),
         (
             *(f"evaluation/system/{name}.py" for name in ("latency", "costs", "page")),
             "services/gateway",

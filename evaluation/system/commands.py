@@ -25,24 +25,24 @@ Seconds = Annotated[float, typer.Option(min=1.0, help="Duration of each step, se
 
 
 class BenchGroup(TyperGroup):
-    """Accepts ``kouxing bench my.wav`` for ``kouxing bench chain my.wav``."""
+    """Accepts ``kouxing bench my.wav`` for ``kouxing bench latency my.wav``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert the command if it is missing."""
         if args and args[0] not in {*self.commands, *self.get_help_option_names(ctx)}:
-            args = ["chain", *args]
+            args = ["latency", *args]
         return super().parse_args(ctx, args)
 
 
 app = typer.Typer(
     cls=BenchGroup,
     add_completion=False,
-    help="Measure speed and load. Without the name of a command, run chain.",
+    help="Measure speed and load. Without the name of a command, run latency.",
 )
 
 
-@app.command()
-def chain(
+@app.command(name="latency")
+def measure_latency(
     audio: AudioFile,
     language: Language = None,
     json_file: JsonFile = None,

@@ -190,6 +190,10 @@ def _run_command() -> None:
 
 def _usage_text(error: Any) -> str:
     """Return what is wrong with a command line; empty if the help was printed instead."""
-    problem = error.format_message().removesuffix(".")
+    problem = error.format_message().removesuffix(".").replace("Value error, ", "")
     command = error.ctx.command_path if error.ctx else "kouxing COMMAND"
+    option, group = getattr(error, "option_name", None), error.ctx and error.ctx.parent
+    if group and any(option in parameter.opts for parameter in group.command.params):
+        path = group.command_path
+        return f"{option} is an option of {path}; write {path} {option} {error.ctx.info_name}"
     return problem and f"{problem[0].lower()}{problem[1:]}; see {command} -h"

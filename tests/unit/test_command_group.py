@@ -49,6 +49,19 @@ def test_an_added_command_runs_and_is_listed(added: list[str]) -> None:
     assert "wave" in result.output, "a suggestion"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("train gmm --any-license", "train --any-license gmm"),
+        ("listen --as words", "'--as': 'words' is not one of 'faps'"),
+    ],
+)
+def test_explains_a_wrong_option(arguments: str, message: str) -> None:
+    with pytest.raises(command_line._UsageError) as refused:
+        command_line.app(arguments.split(), standalone_mode=False)
+    assert message in command_line._usage_text(refused.value)
+
+
 def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> None:
     assert CliRunner().invoke(command_line.app, ["phones", "--help"]).exit_code == 0
     result = CliRunner().invoke(command_line.app, ["--version"])
