@@ -20,7 +20,7 @@ SOURCES = (
     *("services/senders/vtube_studio.py", "clients/python/kouxing_client/base.py"),
     *("clients/python/kouxing_client/core.py", "clients/python/kouxing_client/session_core.py"),
 )
-ERROR_SOURCES = (  # the page also translates frequent errors of these
+CONTROL_SOURCES = (  # their errors reach the page through control's messages
     *("services/control/lifecycle.py", "services/control/placement.py"),
     *("services/control/registry.py", "services/control/requests.py"),
     *("services/control/sessions.py", "services/recognizer/service.py"),
@@ -30,6 +30,7 @@ OTHERS = re.compile(
     r"--rate|^this is \{\}$|--raw$|--raw if|a terminal|sound arrived|images and audio"
     r"|a folder|no such file|there is no track|expected 'start'|has disconnected"
     r"|it is larger|landmark file|header|landmarks a frame|sample rate is|times do|not pixels"
+    r"|a worker must name|may provide|host and port to connect to|registered with another key"
 )
 
 
@@ -54,15 +55,25 @@ def sent_texts(source: str) -> Iterator[str]:
             yield template(node.value)
 
 
+def control_texts(source: str) -> Iterator[str]:
+    """Yield the texts of errors in a module that sends them with an error code."""
+    for node in ast.walk(ast.parse((ROOT / source).read_text("utf-8"))):
+        if isinstance(node, ast.Call) and any("ErrorCode." in ast.unparse(a) for a in node.args):
+            yield from map(template, node.args)
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "text":
+            yield template(node.value)
+
+
 def test_the_page_translates_all_texts_of_the_gateway() -> None:
     texts, _ = PAGE_TEXTS.read_text("utf-8").split("const REASONS")
     keys = re.findall(r'^  "(.+?)":(?: "|$)', texts, re.MULTILINE)
     translated = {re.sub(r"\{\w+\}", "{}", key) for key in keys}
     sent = {text for source in SOURCES for text in sent_texts(source) if " " in text}
+    sent |= {text for source in CONTROL_SOURCES for text in control_texts(source) if " " in text}
     assert not {text for text in sent - translated if not OTHERS.search(text)}
     everything = "\n".join(
         template(node)
-        for source in (*SOURCES, *ERROR_SOURCES)
+        for source in (*SOURCES, *CONTROL_SOURCES)
         for node in ast.walk(ast.parse((ROOT / source).read_text("utf-8")))
         if isinstance(node, ast.Constant | ast.JoinedStr)
     )
@@ -70,6 +81,19 @@ def test_the_page_translates_all_texts_of_the_gateway() -> None:
         key for key in translated if any(part.strip() not in everything for part in key.split("{}"))
     }
     assert not unknown, "these texts no longer exist"
+
+
+def test_chinese_texts_contain_the_same_values_as_english_texts() -> None:
+    pairs = re.findall(r'^  "(.+?)":\s*"(.*?)",$', PAGE_TEXTS.read_text("utf-8"), re.MULTILINE)
+    texts = (PAGE / "texts.js").read_text("utf-8")
+    pairs += re.findall(r'en: "(.*?)",\s*zh: "(.*?)"', texts)
+    assert len(pairs) > 200
+    different = [
+        english
+        for english, chinese in pairs
+        if {*re.findall(r"\{\w+\}", english)} != {*re.findall(r"\{\w+\}", chinese)}
+    ]
+    assert not different
 
 
 def test_the_page_has_a_text_for_each_error_of_control() -> None:

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { pathOf, socketUrl } from "../../services/gateway/page/address.js";
+import { pathWithToken, socketUrl } from "../../services/gateway/page/address.js";
 
 test("the token is removed from the page's URL and added to every request", () => {
   globalThis.location = {
@@ -15,5 +15,5 @@ test("the token is removed from the page's URL and added to every request", () =
   assert.equal(socketUrl("/viewer", { session: "" }), "wss://phone:8080/viewer?token=a%2Bb");
   assert.equal(shownUrl, "/?view=bare");
   globalThis.location.hash = "";
-  assert.equal(pathOf("learn-mouth"), "learn-mouth?token=a%2Bb");
+  assert.equal(pathWithToken("learn-mouth"), "learn-mouth?token=a%2Bb");
 });

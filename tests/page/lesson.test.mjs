@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { curvePath, extent, figures, verdict } from "../../services/gateway/page/lip-curves.js";
+import { curvePath, extent, correlationRows, verdict } from "../../services/gateway/page/lip-curves.js";
 import { FaceRecording } from "../../services/gateway/page/face-recording.js";
 
 const RATE_HZ = 48000;
@@ -85,10 +85,10 @@ test("a curve is scaled to its box and has gaps at missing values", () => {
   assert.deepEqual(extent([3, null], [null, -1, 2]), { low: -1, high: 3 });
 });
 
-test("figures are summed up by a verdict", () => {
+test("a verdict summarizes the correlations", () => {
   const before = { opening: 0.5, width: 0.412, jaw: null };
   const withOpening = (opening) => ({ before, after: { ...before, opening } });
-  assert.deepEqual(figures(withOpening(0.6)), [
+  assert.deepEqual(correlationRows(withOpening(0.6)), [
     ["measure.opening", "0.50", "0.60"],
     ["measure.width", "0.41", "0.41"],
     ["measure.jaw", "–", "–"],

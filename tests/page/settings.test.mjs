@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import test from "node:test";
-import { languageFor, say, sayError, setLanguage } from "../../services/gateway/page/language.js";
+import { languageFor, translate, translateError, setLanguage } from "../../services/gateway/page/language.js";
 import { MouthProfileStore, Preferences } from "../../services/gateway/page/storage.js";
 import { TEXTS } from "../../services/gateway/page/texts.js";
 
@@ -36,11 +36,11 @@ test("the page uses the first language of the browser that it supports", () => {
   const page = { documentElement: {}, querySelectorAll: () => [] };
   setLanguage("zh", page);
   assert.equal(page.documentElement.lang, "zh");
-  assert.equal(say("soundDelay", { ms: 160 }), "声音延迟 160 ms");
+  assert.equal(translate("soundDelay", { ms: 160 }), "声音延迟 160 ms");
   setLanguage("en", page);
-  assert.equal(sayError({ code: "busy", text: "no" }), "no");
-  assert.match(sayError({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
-  assert.equal(say("head.new-head"), "new-head", "a name without a text is shown as it is");
+  assert.equal(translateError({ code: "busy", text: "no" }), "no");
+  assert.match(translateError({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
+  assert.equal(translate("head.new-head"), "new-head", "a name without a text is shown as it is");
 });
 
 test("every text that the page uses exists in both languages, and every text is used", () => {

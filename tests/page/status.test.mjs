@@ -7,7 +7,7 @@ import { errorToChinese, toChinese } from "../../services/gateway/page/gateway-t
 import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
 import {
   GatewayState,
-  LastingFault,
+  PersistentFault,
   delayText,
   drawingText,
   hintText,
@@ -101,7 +101,7 @@ test("the state is shown with the delay", () => {
   assert.match(playoutDelaysText(161, 94), /by 160 ms .* delay=90 /);
 });
 
-test("hints say what does not work and what to do", () => {
+test("a hint names the problem and the remedy", () => {
   const well = { isConnected: true, wasConnected: true, missing: [] };
   assert.equal(hintText(well), "");
   assert.match(hintText({ ...well, isConnected: false }), /gateway has stopped.*kouxing run/);
@@ -116,7 +116,7 @@ test("hints say what does not work and what to do", () => {
 });
 
 test("a fault is shown after a second, and its end only if it was shown", () => {
-  const fault = new LastingFault();
+  const fault = new PersistentFault();
   const nothing = { hint: "", isOver: false };
   assert.deepEqual(fault.update(0, "lost"), nothing);
   assert.deepEqual(fault.update(900, "lost"), nothing);

@@ -11,8 +11,8 @@ function takeToken() {
   return token;
 }
 
-/** Return a path with its query and the token; empty fields are left out. */
-export function pathOf(path, fields = {}) {
+/** Return a path with a query of the fields and the token. Empty fields are omitted. */
+export function pathWithToken(path, fields = {}) {
   const query = Object.entries({ ...fields, token: takeToken() }).filter(([, value]) => value !== "");
   return query.length === 0 ? path : `${path}?${new URLSearchParams(query)}`;
 }
@@ -20,7 +20,7 @@ export function pathOf(path, fields = {}) {
 /** Return the URL of a WebSocket. */
 export function socketUrl(path, fields) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
-  return `${scheme}://${location.host}${pathOf(path, fields)}`;
+  return `${scheme}://${location.host}${pathWithToken(path, fields)}`;
 }
 
 /** Return whether the page's URL shows that the gateway runs on this computer. */

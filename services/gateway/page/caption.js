@@ -9,7 +9,7 @@ const FADE = 16000; // samples in which it then fades
 const SILENCE = "sil";
 const SILENCE_SIGN = "·";
 
-/** The phones or syllables of a session, and which of them to show at a media time. */
+/** Stores the phones or syllables of a session, and returns those to show at a media time. */
 export class PhoneTrack {
   #phones = []; // { index, symbol, text, begin, end }, by index
 
@@ -39,14 +39,14 @@ export class PhoneTrack {
    * opacity: 0 to 1; at 0 nothing is current }.
    */
   at(mediaTime) {
-    const begun = this.#phones.filter(({ begin }) => begin <= mediaTime);
-    const last = begun.findLastIndex(({ symbol }) => symbol !== SILENCE);
-    const left = last === -1 ? 0 : begun[last].end + SHOWN_AFTER_END + FADE - mediaTime;
-    const past = left > 0 ? begun.slice(0, last) : begun;
+    const started = this.#phones.filter(({ begin }) => begin <= mediaTime);
+    const last = started.findLastIndex(({ symbol }) => symbol !== SILENCE);
+    const remaining = last === -1 ? 0 : started[last].end + SHOWN_AFTER_END + FADE - mediaTime;
+    const past = remaining > 0 ? started.slice(0, last) : started;
     return {
-      current: left > 0 ? begun[last].text : "",
+      current: remaining > 0 ? started[last].text : "",
       past: past.slice(-MAX_PAST).map(({ symbol, text }) => (symbol === SILENCE ? SILENCE_SIGN : text)),
-      opacity: Math.max(0, Math.min(1, left / FADE)),
+      opacity: Math.max(0, Math.min(1, remaining / FADE)),
     };
   }
 }
@@ -59,10 +59,10 @@ export class Caption {
   /** @param {Preferences} preferences stores whether captions and phones are shown */
   constructor(preferences) {
     this.#preferences = preferences;
-    const switched = element("captions");
-    switched.checked = preferences.get("captions") ?? true;
-    switched.oninput = () => {
-      preferences.set("captions", switched.checked);
+    const toggle = element("captions");
+    toggle.checked = preferences.get("captions") ?? true;
+    toggle.oninput = () => {
+      preferences.set("captions", toggle.checked);
       this.#showOrHide();
     };
     this.#showOrHide();

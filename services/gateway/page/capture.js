@@ -1,7 +1,7 @@
 // Captures the audio of a microphone or a file in chunks, with an audio worklet.
 
-import { pathOf } from "./address.js";
-import { UserError, say, sayReceived } from "./language.js";
+import { pathWithToken } from "./address.js";
+import { UserError, translate, translateReceived } from "./language.js";
 
 const MAX_RATE_HZ = 48000;
 const MAX_FILE_BYTES = 200 << 20;
@@ -43,21 +43,21 @@ export function capture(context, stream, onChunk) {
  * @throws {UserError} if the file is too large, too long or silent, or cannot be decoded
  */
 export async function openFileSpeech(context, file) {
-  if (file.size > MAX_FILE_BYTES) throw new UserError(say("fileTooLarge"));
+  if (file.size > MAX_FILE_BYTES) throw new UserError(translate("fileTooLarge"));
   let response;
   try {
-    response = await fetch(pathOf("sound", { name: file.name }), { method: "POST", body: file });
+    response = await fetch(pathWithToken("sound", { name: file.name }), { method: "POST", body: file });
   } catch {
-    throw new UserError(say("gatewaySilent"));
+    throw new UserError(translate("gatewaySilent"));
   }
   if (!response.ok) {
     const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
     const reason = isJson ? (await response.json()).error : await response.text();
-    throw new UserError(sayReceived(reason));
+    throw new UserError(translateReceived(reason));
   }
   const buffer = await context.decodeAudioData(await response.arrayBuffer());
   if (buffer.getChannelData(0).every((sample) => Math.abs(sample) < QUIET_PEAK)) {
-    throw new UserError(say("noSpeechSilent", { file: file.name }));
+    throw new UserError(translate("noSpeechSilent", { file: file.name }));
   }
   const source = new AudioBufferSourceNode(context, { buffer });
   const destination = new MediaStreamAudioDestinationNode(context, { channelCount: 1 });

@@ -6,7 +6,7 @@ import { SlidingWindow } from "./sliding-window.js";
 const STEP = 0.85; // factor of the pixel ratio; the number of pixels changes by its square
 const MIN_RATIO = 0.35;
 const MIN_IMAGES = 10; // before their mean time is used
-const FEW_IMAGES = 3; // the same if all of them take very long
+const FEW_IMAGES = 3; // if all of them are very slow
 const SMOOTHING = 0.2;
 const MAX_SHOWN_MS = 200; // an image that is shown for longer belongs to a face that does not move
 const WINDOW_MS = 2000; // over which delays are measured
@@ -15,7 +15,7 @@ const PERIOD_MS = 50; // 20 images per second
 const TICK_MS = 1000 / 60;
 const POLL_MS = 2; // interval of checking whether an image is done
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
-const MIN_REST_MS = 10;
+const MIN_PAUSE_MS = 10;
 const SLOW_MS = 36; // images that take longer get fewer pixels
 const VERY_SLOW_MS = 150;
 const FAST_MS = 16; // images that take less time get more pixels
@@ -24,32 +24,32 @@ const FAST_MS = 16; // images that take less time get more pixels
 export class DrawRate {
   imageMs = 0; // duration of drawing, mean since the ratio changed
   visibleDelayMs = 0; // from a face to the middle of the time for which it is visible, median
-  #rests;
+  #pauses;
   #maxRatio;
   #startMs = -Infinity; // start of the last image
-  #tookMs = 0;
+  #drawMs = 0;
   #numImages = 0;
-  #fastestMs = 0; // image since the ratio changed
+  #fastestMs = 0; // fastest image since the ratio changed
   #visibleMs = -Infinity; // when the last image became visible
-  #minPeriodMs = 0; // time between two images that the user has chosen
+  #minPeriodMs = 0; // minimum time between two images, chosen by the user
   #shownMs = 0; // for how long an image is visible
   #delays = new SlidingWindow(WINDOW_MS); // until images were visible, ms
 
   /**
    * @param ratio pixels drawn per pixel of the page, at first
    * @param maxRatio maximum ratio
-   * @param rests whether to pause after an image for as long as it took, but at most until the next
+   * @param pauses whether to pause after an image for as long as it took, but at most until the next
    *   of 20 per second. Use it when the processor draws: it also has to play sound.
    */
-  constructor(ratio, maxRatio, rests) {
-    this.#rests = rests;
+  constructor(ratio, maxRatio, pauses) {
+    this.#pauses = pauses;
     this.#maxRatio = maxRatio;
     this.ratio = ratio;
   }
 
   /** Whether it is time for the next image, if the last one is done. */
   isDue(nowMs) {
-    const periodMs = this.#rests ? restingPeriodMs(this.#tookMs) : 0;
+    const periodMs = this.#pauses ? periodWithPauseMs(this.#drawMs) : 0;
     return nowMs - this.#startMs >= Math.max(periodMs, this.#minPeriodMs) - TOLERANCE_MS;
   }
 
@@ -64,7 +64,7 @@ export class DrawRate {
 
   /** Halve the image rate. */
   halve() {
-    const periodMs = this.#rests ? restingPeriodMs(this.imageMs) : this.imageMs;
+    const periodMs = this.#pauses ? periodWithPauseMs(this.imageMs) : this.imageMs;
     this.#minPeriodMs = 2 * Math.max(periodMs, this.#minPeriodMs, TICK_MS);
   }
 
@@ -76,10 +76,10 @@ export class DrawRate {
   /** Record an image that was drawn. The ratio may change. */
   recordDrawn(startMs, doneMs) {
     this.#startMs = startMs;
-    this.#tookMs = doneMs - startMs;
+    this.#drawMs = doneMs - startMs;
     this.#numImages++;
-    this.imageMs += Math.max(SMOOTHING, 1 / this.#numImages) * (this.#tookMs - this.imageMs);
-    this.#fastestMs = this.#numImages === 1 ? this.#tookMs : Math.min(this.#fastestMs, this.#tookMs);
+    this.imageMs += Math.max(SMOOTHING, 1 / this.#numImages) * (this.#drawMs - this.imageMs);
+    this.#fastestMs = this.#numImages === 1 ? this.#drawMs : Math.min(this.#fastestMs, this.#drawMs);
     if (this.#numImages < (this.#fastestMs > VERY_SLOW_MS ? FEW_IMAGES : MIN_IMAGES)) return;
     const ratio = this.ratio;
     const step = Math.min(STEP, Math.sqrt(SLOW_MS / this.#fastestMs));
@@ -99,8 +99,8 @@ export class DrawRate {
 }
 
 /** Return the time between two images, ms: the drawing time and the pause after it. */
-function restingPeriodMs(tookMs) {
-  return tookMs + Math.min(tookMs, Math.max(PERIOD_MS - tookMs, MIN_REST_MS));
+function periodWithPauseMs(drawMs) {
+  return drawMs + Math.min(drawMs, Math.max(PERIOD_MS - drawMs, MIN_PAUSE_MS));
 }
 
 /** Return whether the processor draws instead of a graphics card. */
@@ -146,7 +146,7 @@ export class ImageQueue {
       this.#drawRate.recordDrawn(startMs, doneMs);
       requestAnimationFrame((tickMs) => {
         const visibleMs = Math.max(tickMs, doneMs); // a busy page gets a tick late
-        if (startMs <= this.#hiddenMs) return; // its delay says nothing
+        if (startMs <= this.#hiddenMs) return; // the delay would include the time that it was hidden
         this.#drawRate.recordVisible(nowMs, visibleMs);
         onVisible(visibleMs);
       });

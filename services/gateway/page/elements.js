@@ -1,6 +1,6 @@
 // Access to the page's elements.
 
-import { say } from "./language.js";
+import { translate } from "./language.js";
 
 export function element(id) {
   return document.getElementById(id);
@@ -14,5 +14,5 @@ export function setText(target, text) {
 /** Give an element another text of the table; it changes with the page's language. */
 export function setTextKey(target, key) {
   target.dataset.text = key;
-  setText(target, say(key));
+  setText(target, translate(key));
 }

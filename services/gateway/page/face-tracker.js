@@ -1,6 +1,6 @@
 // Finds the face in images. The work is done in a separate frame; see face-mesh.js.
 
-import { UserError, say } from "./language.js";
+import { UserError, translate } from "./language.js";
 
 const LOADING_TIMEOUT_MS = 60000;
 
@@ -44,6 +44,6 @@ export class FaceTracker {
   }
 
   #fail(reason) {
-    this.#pending?.reject(new UserError(say("trackerFailed", { reason })));
+    this.#pending?.reject(new UserError(translate("trackerFailed", { reason })));
   }
 }

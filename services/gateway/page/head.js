@@ -16,7 +16,7 @@ import { MorphedMesh } from "./morph.js";
 import { mouthLight } from "./mouth-light.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
-const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
+const MOUTH_PARTS = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
 const DRAWN_AFTER_HAIR = ["brows", "lashes"]; // the hair may be behind them
 const OVERLAY_FRACTION = 0.6; // fraction of the overlay that the head avoids
 const HEAD_HALF_WIDTH = 0.3; // relative to the window's height
@@ -30,7 +30,7 @@ export class Head {
   #controls;
   #model = null; // in the scene
   #meshes = []; // moved by FAPs
-  #inMouth = []; // materials
+  #mouthMaterials = []; // of teeth and tongue
   #joints = [];
   #faps = null; // for the next image
   #front = new THREE.Vector3(); // initial position of the camera
@@ -50,8 +50,8 @@ export class Head {
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: true });
     const gl = this.#renderer.getContext();
     this.#isSoftware = drawsInSoftware(gl);
-    const full = Math.min(2, Math.max(1.5, devicePixelRatio));
-    this.#drawRate = this.#isSoftware ? new DrawRate(0.5, 1, true) : new DrawRate(full, full, false);
+    const fullRatio = Math.min(2, Math.max(1.5, devicePixelRatio));
+    this.#drawRate = this.#isSoftware ? new DrawRate(0.5, 1, true) : new DrawRate(fullRatio, fullRatio, false);
     this.#images = new ImageQueue(gl, this.#drawRate);
     if (!this.#isSoftware) this.#addLights();
     this.#controls = new OrbitControls(this.#camera, canvas);
@@ -80,7 +80,7 @@ export class Head {
       if (material) release(material);
     });
     this.#meshes = [];
-    this.#inMouth = [];
+    this.#mouthMaterials = [];
     this.#add(gltf);
   }
 
@@ -95,7 +95,7 @@ export class Head {
       node.material = plain
         ? plainMaterial(node.name, node.material, gltf.scene.getObjectByName("head"), info.cel)
         : physicalMaterial(node.name, node.material);
-      if (IN_MOUTH.includes(node.name)) this.#inMouth.push(node.material);
+      if (MOUTH_PARTS.includes(node.name)) this.#mouthMaterials.push(node.material);
       if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, info.faps));
     });
     this.#joints = findJoints(gltf.scene, info.faps);
@@ -120,7 +120,7 @@ export class Head {
   #apply(faps) {
     for (const mesh of this.#meshes) mesh.pose(faps);
     const light = mouthLight(faps);
-    for (const material of this.#inMouth) setLight(material, light);
+    for (const material of this.#mouthMaterials) setLight(material, light);
     rotateJoints(this.#joints, faps);
   }
 
@@ -164,7 +164,7 @@ export class Head {
   }
 
   /**
-   * How it is drawn: { isCoarse, width, height, numImages, imageMs, isCurrent }.
+   * Return how the head is drawn: { isCoarse, width, height, numImages, imageMs, isCurrent }.
    *
    * isCoarse is true if the processor draws. The size is in pixels. numImages counts images since
    * the start, and imageMs is the duration of drawing. isCurrent is true if the newest face is drawn.
@@ -221,15 +221,15 @@ export class Head {
     const { controls, panel } = this.#overlays;
     const { left, height: panelHeight } = panel.getBoundingClientRect();
     const isBelow = left <= 0 && panelHeight > 0;
-    const beside = left > 0 ? width - left : 0; // the panel is at the right
-    const moved = Math.min(beside / 2, Math.max(0, beside + HEAD_HALF_WIDTH * height - width / 2));
-    const covered = isBelow ? panelHeight : controls.offsetHeight * OVERLAY_FRACTION;
-    const free = Math.max(0.5 * height, height - covered);
-    const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
-    const widened = half * Math.max(height / free, PORTRAIT_ASPECT * (height / width));
-    this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
+    const besideWidth = left > 0 ? width - left : 0; // the panel is at the right
+    const shiftX = Math.min(besideWidth / 2, Math.max(0, besideWidth + HEAD_HALF_WIDTH * height - width / 2));
+    const coveredHeight = isBelow ? panelHeight : controls.offsetHeight * OVERLAY_FRACTION;
+    const freeHeight = Math.max(0.5 * height, height - coveredHeight);
+    const tangent = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
+    const wideTangent = tangent * Math.max(height / freeHeight, PORTRAIT_ASPECT * (height / width));
+    this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(wideTangent));
     this.#camera.aspect = width / height;
-    this.#camera.setViewOffset(width, height, moved, (height - free) / 2, width, height);
+    this.#camera.setViewOffset(width, height, shiftX, (height - freeHeight) / 2, width, height);
     this.#needsDrawing = true;
     if (this.#isFilmed) return;
     this.#renderer.setPixelRatio(this.#drawRate.ratio);

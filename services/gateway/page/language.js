@@ -17,19 +17,19 @@ export function languageFor(preferred) {
 }
 
 /** Return a text of TEXTS with values. Without an entry, it is the part of the key after the last dot. */
-export function say(key, values = {}) {
+export function translate(key, values = {}) {
   const text = TEXTS[key]?.[language] ?? key.split(".").at(-1);
   return text.replace(/\{(\w+)\}/g, (_, name) => values[name]);
 }
 
 /** Return a text of the gateway in the page's language. */
-export function sayReceived(text) {
+export function translateReceived(text) {
   return language === "zh" ? toChinese(text) : text;
 }
 
 /** Return the text of an error message in the page's language. */
-export function sayError({ code, text }) {
-  if (code === "bad-mouth-profile") return say("oldMouthProfile");
+export function translateError({ code, text }) {
+  if (code === "bad-mouth-profile") return translate("oldMouthProfile");
   return language === "zh" ? errorToChinese(code, text) : text;
 }
 
@@ -38,11 +38,11 @@ export function setLanguage(name, page = document) {
   language = name;
   page.documentElement.lang = name;
   for (const element of page.querySelectorAll("[data-text]")) {
-    element.textContent = say(element.dataset.text);
+    element.textContent = translate(element.dataset.text);
   }
   for (const [key, attribute] of Object.entries(ATTRIBUTES)) {
     for (const element of page.querySelectorAll(`[data-${key}]`)) {
-      element.setAttribute(attribute, say(element.dataset[key]));
+      element.setAttribute(attribute, translate(element.dataset[key]));
     }
   }
 }

@@ -19,12 +19,12 @@ const IMAGES_MS = 3000; // window of the delays of images
  * 10 s, because clocks drift and a client may lose audio.
  */
 export class Lateness {
-  isBehind = false; // whether frames have been late for some time
+  isBehind = false; // true after frames have been late for some time
   #newest = -1; // media time, samples
   #differences = new SlidingWindow(WINDOW_MS); // arrival - media time, ms
   #recent = new SlidingWindow(RECENT_MS); // lateness, ms
   #imageDelays = new SlidingWindow(IMAGES_MS); // until images are visible, ms
-  #agreedMs = null; // when the frames last agreed with isBehind
+  #confirmedMs = null; // when isBehind was last correct
 
   /**
    * Record the arrival of a frame. Media time does not advance while the client sends no audio. Media time
@@ -36,7 +36,7 @@ export class Lateness {
     if (stepMs <= 0) return;
     if (this.#newest >= 0 && stepMs > MIN_SKIP_MS && stepMs < MAX_SKIP_MS) {
       this.isBehind = true;
-      this.#agreedMs = nowMs;
+      this.#confirmedMs = nowMs;
     }
     this.#newest = mediaTime;
     this.#differences.add(nowMs, nowMs - mediaTime / SAMPLES_PER_MS);
@@ -54,10 +54,10 @@ export class Lateness {
     const lateMs = isLive ? imageDelayMs + Math.max(0, differenceMs - this.#differences.min) : 0;
     this.#recent.add(nowMs, lateMs);
     const isLate = lateMs > LATE_MS;
-    if (isLate === this.isBehind) this.#agreedMs = nowMs;
-    this.#agreedMs ??= nowMs;
+    if (isLate === this.isBehind) this.#confirmedMs = nowMs;
+    this.#confirmedMs ??= nowMs;
     const waitMs = isLate ? SHOWN_AFTER_MS : OVER_AFTER_MS;
-    if (nowMs - this.#agreedMs >= waitMs) this.isBehind = isLate;
+    if (nowMs - this.#confirmedMs >= waitMs) this.isBehind = isLate;
   }
 
   /** The maximum lateness of the last second, ms. */

@@ -1,18 +1,18 @@
 // The dialog "Learn my mouth": it records lips and voice, sends the recording to the gateway, shows
 // the learned result, and stores it if the user keeps it.
 
-import { pathOf } from "./address.js";
+import { pathWithToken } from "./address.js";
 import { capture, openCaptureContext } from "./capture.js";
 import { element } from "./elements.js";
 import { FaceRecording } from "./face-recording.js";
 import { FaceTracker } from "./face-tracker.js";
-import { UserError, say, sayReceived } from "./language.js";
-import { curvePath, extent, figures, verdict } from "./lip-curves.js";
+import { UserError, translate, translateReceived } from "./language.js";
+import { curvePath, extent, correlationRows, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
 const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
 const SLOW_MS = 100; // a tracker that needs longer for an image runs only after the reading
-const MIN_SLOW = 2; // such images in a row; the first one takes long on any computer
+const MIN_SLOW = 2; // consecutive slow images; the first image is slow on any computer
 const SLOW_IMAGE = { everyMs: 110, widthPx: 320 }; // images that wait until the reading is over
 const SLOW_FACTOR = 1.5; // multiple of the usual time
 const MIN_READING = 0.5; // fraction of the time after which the user may finish
@@ -32,15 +32,15 @@ export class MouthLesson {
   #handlers;
   #abort = new AbortController(); // for the current step
   #finish = () => {}; // ends the reading
-  #numSlow = 0; // images in a row that the tracker needed long for
-  #recording = null; // landmark file that was not used yet
+  #numSlow = 0; // consecutive images that took the tracker long
+  #recording = null; // landmark file that is not yet learned from
   #learned = null; // profile that the user has neither kept nor discarded
 
   /** @param handlers { opened(), closed(), profileChanged() } */
   constructor(profiles, handlers) {
     this.#profiles = profiles;
     this.#handlers = handlers;
-    for (const [id, act] of Object.entries({
+    for (const [id, onClick] of Object.entries({
       "lesson-start": () => this.#record(),
       "lesson-finish": () => this.#finish(),
       "lesson-resend": () => this.#learn(),
@@ -48,7 +48,7 @@ export class MouthLesson {
       "lesson-keep": () => this.#keep(this.#learned),
       "lesson-forget": () => this.#keep(null),
     })) {
-      element(id).onclick = act;
+      element(id).onclick = onClick;
     }
     for (const button of dialog.querySelectorAll(".close")) button.onclick = () => dialog.close();
     dialog.onclose = () => {
@@ -69,15 +69,15 @@ export class MouthLesson {
     const { current } = this.#profiles;
     element("lesson-profile").hidden = current === null;
     if (current !== null) {
-      const [, before, after] = figures(current)[0];
+      const [, before, after] = correlationRows(current)[0];
       const day = new Date(current.learnedOn).toLocaleDateString(lang);
       element("lesson-profile").firstElementChild.textContent =
-        say("lessonLearned", { day, before, after });
+        translate("lessonLearned", { day, before, after });
     }
     const isSecure = navigator.mediaDevices !== undefined;
     element("lesson-start").disabled = !isSecure;
     element("lesson-insecure").hidden = isSecure;
-    element("lesson-insecure").textContent = say("cameraInsecure");
+    element("lesson-insecure").textContent = translate("cameraInsecure");
     this.#show("intro");
     dialog.showModal();
     this.#handlers.opened();
@@ -106,7 +106,7 @@ export class MouthLesson {
       this.#recording = recording.encode();
       this.#learn();
     } else {
-      this.#fail(say(problem));
+      this.#fail(translate(problem));
     }
   }
 
@@ -156,7 +156,7 @@ export class MouthLesson {
     element("lesson-finish").disabled = true;
     element("lesson-time").value = 0;
     element("lesson-count").textContent = "";
-    element("lesson-advice").textContent = say("lessonStarting");
+    element("lesson-advice").textContent = translate("lessonStarting");
     this.#show("reading");
   }
 
@@ -174,7 +174,7 @@ export class MouthLesson {
         resolve({});
       };
       signal.addEventListener("abort", this.#finish);
-      for (const track of stream.getTracks()) track.onended = () => reject(new UserError(say("cameraUnplugged")));
+      for (const track of stream.getTracks()) track.onended = () => reject(new UserError(translate("cameraUnplugged")));
     });
     const take = (previousMs) => nextImage(video, this.#isSlow ? { previousMs, ...SLOW_IMAGE } : {});
     let next = take();
@@ -203,7 +203,7 @@ export class MouthLesson {
         const sinceMs = performance.now() - startMs;
         const minImages = (FaceRecording.minRateHz * sinceMs) / 1000 / 2; // slower at first
         if (!isRateChecked && sinceMs > CLOSED_LIPS_MS && numImages < minImages) {
-          throw new UserError(say("tooSlow"));
+          throw new UserError(translate("tooSlow"));
         }
         isRateChecked ||= sinceMs > CLOSED_LIPS_MS;
       }
@@ -218,7 +218,7 @@ export class MouthLesson {
     for (const [index, { takenMs, image }] of images.entries()) {
       if (signal.aborted) return;
       const percent = Math.floor((100 * index) / images.length);
-      element("lesson-learning").textContent = say("lessonTracking", { percent });
+      element("lesson-learning").textContent = translate("lessonTracking", { percent });
       recording.addFace(takenMs, await tracker.find(image));
     }
   }
@@ -226,19 +226,19 @@ export class MouthLesson {
   #showTime(startMs, recording) {
     const nowMs = performance.now();
     if (startMs === null) {
-      element("lesson-advice").textContent = say("lessonShowFace");
+      element("lesson-advice").textContent = translate("lessonShowFace");
       return;
     }
     const readingMs = nowMs - startMs - CLOSED_LIPS_MS;
-    const wholeMs = 1000 * this.readingS * (this.#isSlow ? SLOW_FACTOR : 1);
-    const leftS = Math.ceil((readingMs < 0 ? -readingMs : wholeMs - readingMs) / 1000);
-    element("lesson-count").textContent = leftS;
-    element("lesson-time").value = Math.max(0, readingMs / wholeMs);
+    const totalMs = 1000 * this.readingS * (this.#isSlow ? SLOW_FACTOR : 1);
+    const remainingS = Math.ceil((readingMs < 0 ? -readingMs : totalMs - readingMs) / 1000);
+    element("lesson-count").textContent = remainingS;
+    element("lesson-time").value = Math.max(0, readingMs / totalMs);
     element("lesson-reading").classList.toggle("due", readingMs >= 0);
-    element("lesson-finish").disabled = readingMs < MIN_READING * wholeMs;
+    element("lesson-finish").disabled = readingMs < MIN_READING * totalMs;
     const advice = recording.advice(nowMs) ?? (readingMs < 0 ? "lessonLipsClosed" : "lessonRead");
-    element("lesson-advice").textContent = say(advice);
-    if (leftS <= 0) this.#finish();
+    element("lesson-advice").textContent = translate(advice);
+    if (remainingS <= 0) this.#finish();
   }
 
   // --- learning ----------------------------------------------------------------------------------
@@ -246,19 +246,19 @@ export class MouthLesson {
   async #learn() {
     this.#abort = new AbortController();
     const { signal } = this.#abort;
-    element("lesson-learning").textContent = say("lessonLearning");
+    element("lesson-learning").textContent = translate("lessonLearning");
     this.#show("learning");
     let answer;
     try {
-      const response = await fetch(pathOf("learn-mouth"), { method: "POST", body: this.#recording, signal });
+      const response = await fetch(pathWithToken("learn-mouth"), { method: "POST", body: this.#recording, signal });
       const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
       answer = isJson ? await response.json() : { error: await response.text() };
     } catch {
-      answer = { error: say("gatewaySilent") };
+      answer = { error: translate("gatewaySilent") };
     }
     if (signal.aborted) return;
     if (answer.error !== undefined) {
-      this.#fail(sayReceived(answer.error));
+      this.#fail(translateReceived(answer.error));
       return;
     }
     const { mouth_profile: profile, before, after } = answer;
@@ -268,13 +268,13 @@ export class MouthLesson {
   }
 
   #showResult({ before, after, curves }) {
-    element("lesson-verdict").textContent = say(verdict({ before, after }));
-    const rows = figures({ before, after }).map((cells) => {
+    element("lesson-verdict").textContent = translate(verdict({ before, after }));
+    const rows = correlationRows({ before, after }).map((cells) => {
       const row = document.createElement("tr");
-      row.append(...cells.map((text, index) => (index === 0 ? cell("th", say(text)) : cell("td", text))));
+      row.append(...cells.map((text, index) => (index === 0 ? cell("th", translate(text)) : cell("td", text))));
       return row;
     });
-    element("lesson-figures").replaceChildren(...rows);
+    element("lesson-correlationRows").replaceChildren(...rows);
     const box = { ...BOX, ...extent(...CURVES.map((name) => curves.opening[name])) };
     for (const name of CURVES) {
       const path = curvePath(curves.time_s, curves.opening[name], box);
@@ -304,7 +304,7 @@ async function nextImage(video, { previousMs = -Infinity, everyMs = 0, widthPx }
 }
 
 function errorText(error) {
-  return CAMERA_ERRORS[error.name] ? say(CAMERA_ERRORS[error.name]) : error.message;
+  return CAMERA_ERRORS[error.name] ? translate(CAMERA_ERRORS[error.name]) : error.message;
 }
 
 function drawLips(video, lips, landmarks) {

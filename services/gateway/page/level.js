@@ -4,7 +4,7 @@ const MAX_QUEUED = 500; // chunks
 const DECAY = 0.9; // factor of the level per image
 export const SILENT_DB = -60;
 
-/** Level of the sound that is audible now. It falls slowly, so that peaks are visible. */
+/** Measures the level of the audible sound. It decays slowly, so that peaks remain visible. */
 export class LevelMeter {
   #queue = []; // { mediaTime, level } of sound that is not audible yet
   #level = 0; // 0 to 1

@@ -22,22 +22,22 @@ export function curvePath(times, values, { width, height, low, high }) {
     .join("");
 }
 
-/** Return the least and the greatest value of curves; values may be null. */
+/** Return the minimum and the maximum of all curves. Values may be null. */
 export function extent(...curves) {
   const values = curves.flat().filter((value) => value !== null);
   return { low: Math.min(...values), high: Math.max(...values) };
 }
 
 /** Return rows [text key of the measure, before, after]; correlations of the lips with the speaker's. */
-export function figures({ before, after }) {
-  return MEASURES.map((name) => [`measure.${name}`, figure(before[name]), figure(after[name])]);
+export function correlationRows({ before, after }) {
+  return MEASURES.map((name) => [`measure.${name}`, correlationText(before[name]), correlationText(after[name])]);
 }
 
-function figure(correlation) {
+function correlationText(correlation) {
   return typeof correlation === "number" ? correlation.toFixed(2) : "–";
 }
 
-/** Return the key of the text that sums the figures up. */
+/** Return the key of the text that summarizes the result. */
 export function verdict({ before, after }) {
   const gain = mean(after) - mean(before);
   if (mean(after) < MIN_CORRELATION || gain < -MIN_GAIN) return "lessonWorse";

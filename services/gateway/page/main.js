@@ -3,12 +3,12 @@
 import { socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
-import { say, sayError } from "./language.js";
+import { translate, translateError } from "./language.js";
 import { MouthLesson } from "./learn-mouth.js";
 import { LevelMeter } from "./level.js";
 import { Player } from "./player.js";
 import { SendersPanel } from "./senders-panel.js";
-import { MOTIONS, Settings } from "./settings.js";
+import { FACE_SETTINGS, Settings } from "./settings.js";
 import { Sound } from "./sound.js";
 import { SpeechControls } from "./speech-controls.js";
 import { Stage } from "./stage.js";
@@ -28,27 +28,27 @@ const gateway = new GatewayState();
 const settings = new Settings(preferences, offers, {
   heads: (name) => stage.load(name),
   speechLanguage: () => speech.restart(),
-  lips: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLipModel(name)),
-  motion: sendMotions,
-  express: (strengths) => socket.send({ express: strengths }),
+  lipModel: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLipModel(name)),
+  faceSettings: sendFaceSettings,
+  expressions: (strengths) => socket.send({ express: strengths }),
 });
 const caption = new Caption(preferences);
 const sound = new Sound(() => speech.showSound());
 const speech = new SpeechControls(sound, {
   mouthProfile: () => mouthProfiles.current?.profile ?? "",
   language: () => element("speech-language").value,
-  lips: chosenLipModel,
+  lipModel: chosenLipModel,
   level: (value) => meter.raise(value),
   error: showError,
   fileEnded(file) {
     const isShown = gateway.session !== null && gateway.session === speech.session;
-    if (isShown && !caption.hasSpeech) showNews(say("noSpeech", { file }));
+    if (isShown && !caption.hasSpeech) showNews(translate("noSpeech", { file }));
   },
   news: showNews,
   session(name) {
     if (name !== null) {
       showLipModel();
-      if (name === gateway.session) sendMotions(); // the session was reported to the viewer first
+      if (name === gateway.session) sendFaceSettings(); // its "session" message arrived first
     }
     socket.follow(name ?? "");
   },
@@ -114,7 +114,7 @@ function handleMessage(message) {
 
 function showSession(message) {
   const { isOther, isRestart } = gateway.setSession(message);
-  if (isRestart) showNews(say("serviceRestarted"));
+  if (isRestart) showNews(translate("serviceRestarted"));
   if (isOther) statusBar.reset();
   if (gateway.session !== null) {
     // A session that has ended stays visible and audible to its end.
@@ -122,7 +122,7 @@ function showSession(message) {
     caption.reset();
     meter.reset();
   }
-  if (isOwnSession()) sendMotions();
+  if (isOwnSession()) sendFaceSettings();
   showLipModel();
   statusBar.show();
 }
@@ -132,7 +132,7 @@ function showNews(text) {
 }
 
 function showError(error) {
-  notice.showNews(sayError(error), "error");
+  notice.showNews(translateError(error), "error");
 }
 
 /** Whether the session that is shown is the microphone's, or the sample that this page asked for. */
@@ -156,8 +156,8 @@ function chooseAcousticModel(acoustic) {
   element("full-model").hidden = acoustic === "full";
 }
 
-function sendMotions() {
-  const chosen = MOTIONS.filter((id) => preferences.get(id) !== null);
+function sendFaceSettings() {
+  const chosen = FACE_SETTINGS.filter((id) => preferences.get(id) !== null);
   if (!chosen.length || gateway.session === null) return;
   socket.send(Object.fromEntries(chosen.map((id) => [id, preferences.get(id)])));
 }

@@ -6,7 +6,7 @@ import * as THREE from "three";
 const EYES = ["eye_left", "eye_right"];
 const HAIR = "hair";
 const HAIR_CUTOFF = 0.3; // texels with less alpha are not drawn, as in the driver
-const UNKNOWN = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // for files without these values
+const DEFAULT_SHADING = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // for files without these values
 const LIGHT = await (await fetch("light.glsl")).text(); // shared with the driver
 
 const PLAIN_VERTEX = `
@@ -26,11 +26,11 @@ void main() {
     turned = mix(position, (turn * vec4(position, 1.0)).xyz, skinWeight.y);
     n = mix(normal, mat3(turn) * normal, skinWeight.y);
   #endif
-  vec4 place = modelMatrix * vec4(turned, 1.0);
+  vec4 world = modelMatrix * vec4(turned, 1.0);
   vFacing = normalize(mat3(modelMatrix) * n);
-  light_vertex(vFacing, normalize(cameraPosition - place.xyz), color.rgb, vLight, vHigh);
+  light_vertex(vFacing, normalize(cameraPosition - world.xyz), color.rgb, vLight, vHigh);
   vUv = uv;
-  gl_Position = projectionMatrix * viewMatrix * place;
+  gl_Position = projectionMatrix * viewMatrix * world;
 }`;
 
 const PLAIN_FRAGMENT = `
@@ -56,7 +56,7 @@ void main() {
 
 /** The uniforms of light.glsl. */
 function lightUniforms(name, gltf, cel) {
-  const { wrap, gloss, shine } = gltf.userData.kouxing ?? UNKNOWN;
+  const { wrap, gloss, shine } = gltf.userData.kouxing ?? DEFAULT_SHADING;
   return {
     wrap: { value: new THREE.Vector3(...wrap) },
     gloss: { value: gloss },
@@ -83,7 +83,7 @@ export function plainMaterial(name, gltf, head, cel) {
     vertexShader: PLAIN_VERTEX,
     fragmentShader: PLAIN_FRAGMENT,
     vertexColors: true,
-    ...surface(name, gltf),
+    ...blending(name, gltf),
   });
 }
 
@@ -95,7 +95,7 @@ const SHEEN = `vec3 light;
   light_vertex(inverseTransformDirection(normal, viewMatrix),
     inverseTransformDirection(normalize(vViewPosition), viewMatrix), vColor.rgb, light, high);
   totalEmissiveRadiance += high * STRANDS * sampledDiffuseColor.g;`;
-const ADDED = { eye_left: WINDOW, eye_right: WINDOW, hair: SHEEN };
+const REFLECTIONS = { eye_left: WINDOW, eye_right: WINDOW, hair: SHEEN };
 
 /** Return a physical material for a part: subsurface scattering, wet eyes, glossy hair. */
 export function physicalMaterial(name, gltf) {
@@ -106,7 +106,7 @@ export function physicalMaterial(name, gltf) {
     metalness: 0,
     normalMap: gltf.normalMap,
     alphaTest: name === HAIR ? HAIR_CUTOFF : 0,
-    ...surface(name, gltf),
+    ...blending(name, gltf),
   });
   if (name === "skin") {
     Object.assign(material, { sheen: 0.25, sheenRoughness: 0.5, specularIntensity: 0.6 });
@@ -137,7 +137,7 @@ export function physicalMaterial(name, gltf) {
           `float open = min(1.0, 1.6 * vColor.g * diffuse.g);
           reflectedLight.directSpecular *= open;
           reflectedLight.indirectSpecular *= open;
-          ${ADDED[name] ?? ""}`,
+          ${REFLECTIONS[name] ?? ""}`,
         );
   };
   return material;
@@ -159,7 +159,7 @@ export function release(material) {
 /** Return the environment map of a studio: soft boxes in front of dim walls. */
 export function studioEnvironment(renderer) {
   const room = new THREE.Scene();
-  const box = (color, width, height, x, y, z) => {
+  const addSoftBox = (color, width, height, x, y, z) => {
     const light = new THREE.Mesh(
       new THREE.PlaneGeometry(width, height),
       new THREE.MeshBasicMaterial({ color: new THREE.Color(color, color, color) }),
@@ -169,10 +169,10 @@ export function studioEnvironment(renderer) {
     room.add(light);
   };
   room.background = new THREE.Color(0.32, 0.32, 0.34);
-  box(6, 2.2, 2.2, -2.2, 2.4, 3.4);
-  box(2.5, 1.6, 3, 4, 0.6, 2.2);
-  box(2, 5, 2, 0, 4.5, -1);
-  box(0.12, 10, 10, 0, -4, 0);
+  addSoftBox(6, 2.2, 2.2, -2.2, 2.4, 3.4);
+  addSoftBox(2.5, 1.6, 3, 4, 0.6, 2.2);
+  addSoftBox(2, 5, 2, 0, 4.5, -1);
+  addSoftBox(0.12, 10, 10, 0, -4, 0);
   const generator = new THREE.PMREMGenerator(renderer);
   const { texture } = generator.fromScene(room, 0.03);
   generator.dispose();
@@ -180,6 +180,6 @@ export function studioEnvironment(renderer) {
 }
 
 /** Hair has soft edges and hides parts behind it. Its triangles are stored in blending order. */
-function surface(name, { side, transparent, depthWrite }) {
+function blending(name, { side, transparent, depthWrite }) {
   return { side, transparent: transparent || name === HAIR, depthWrite };
 }

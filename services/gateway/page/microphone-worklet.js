@@ -1,6 +1,6 @@
 // Collects the microphone's sound in int16 chunks of 20 ms. Runs in the audio thread.
 
-class Capture extends AudioWorkletProcessor {
+class CaptureProcessor extends AudioWorkletProcessor {
   #chunk = new Int16Array(Math.round(sampleRate / 50));
   #numFilled = 0;
   #squares = 0;
@@ -22,4 +22,4 @@ class Capture extends AudioWorkletProcessor {
   }
 }
 
-registerProcessor("capture", Capture);
+registerProcessor("capture", CaptureProcessor);

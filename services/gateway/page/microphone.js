@@ -3,11 +3,11 @@
 import { socketUrl } from "./address.js";
 import { AudioUplink } from "./audio-uplink.js";
 import { capture, openCaptureContext, openFileSpeech } from "./capture.js";
-import { UserError, say } from "./language.js";
+import { UserError, translate } from "./language.js";
 
 const RETRY_MS = 500;
 const TAIL_MS = 1000; // silence after a file, for its last frames
-const GIVE_UP_MS = 30000; // a crashed service is restarted within this time
+const GIVE_UP_MS = 30000; // longer than the restart of a crashed service
 
 export class Microphone {
   #handlers;
@@ -21,7 +21,7 @@ export class Microphone {
   #giveUpMs = null; // when to stop reconnecting; null before it has streamed
 
   /**
-   * @param handlers { mouthProfile(): base64 or "", language(): of the speech, lips(): lip model to start with or null,
+   * @param handlers { mouthProfile(): base64 or "", language(): of the speech, lipModel(): initial lip model or null,
    *   state("off" | "starting" | "on" | "interrupted"), level(rms), session(name),
    *   fileEnded(name), error({ code, text }) }
    */
@@ -51,12 +51,12 @@ export class Microphone {
 
   start() {
     return this.#startFrom(async (source) => {
-      if (!navigator.mediaDevices) throw new UserError(say("microphoneInsecure"));
+      if (!navigator.mediaDevices) throw new UserError(translate("microphoneInsecure"));
       source.stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
       });
       for (const track of source.stream.getTracks()) {
-        track.onended = () => this.#fail(say("microphoneUnplugged"));
+        track.onended = () => this.#fail(translate("microphoneUnplugged"));
       }
       source.context = await openCaptureContext();
     });
@@ -139,7 +139,7 @@ export class Microphone {
     this.#handlers.session(session);
     this.#handlers.state("on");
     this.#fileSpeech?.play(() => setTimeout(() => this.#endFile(), TAIL_MS));
-    const lips = this.#handlers.lips();
+    const lips = this.#handlers.lipModel();
     if (lips !== null) this.chooseLipModel(lips);
   }
 
@@ -161,7 +161,7 @@ export class Microphone {
       this.#handlers.error(refusal);
       this.stop();
     } else {
-      this.#fail(say("microphoneStopped"));
+      this.#fail(translate("microphoneStopped"));
     }
   }
 
@@ -173,8 +173,8 @@ export class Microphone {
 
 function problemText(error) {
   if (error instanceof UserError) return error.message;
-  if (error.name === "NotAllowedError") return say("microphoneForbidden");
-  return say("microphoneFailed", { reason: error.message });
+  if (error.name === "NotAllowedError") return translate("microphoneForbidden");
+  return translate("microphoneFailed", { reason: error.message });
 }
 
 function release({ stream, context }) {

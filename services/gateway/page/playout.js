@@ -165,8 +165,8 @@ export class Playout {
   #isLate(nowMs, latenessMs, streak) {
     if (this.offsetMs === null) return false;
     const lateMs = latenessMs - this.offsetMs;
-    const forMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : JUMP_MS));
-    if (forMs > LATE_MS || lateMs < -MAX_BEHIND_MS) this.reset();
+    const lateForMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : JUMP_MS));
+    if (lateForMs > LATE_MS || lateMs < -MAX_BEHIND_MS) this.reset();
     return this.offsetMs !== null && streak.holds;
   }
 }

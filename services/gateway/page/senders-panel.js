@@ -1,9 +1,9 @@
 // The panel of senders: other programs that show the face. It lists them with buttons to start, stop
 // and delay them.
 
-import { pathOf } from "./address.js";
+import { pathWithToken } from "./address.js";
 import { element, setText } from "./elements.js";
-import { say, sayReceived } from "./language.js";
+import { translate, translateReceived } from "./language.js";
 import { roundToTens } from "./status.js";
 
 const PERIOD_MS = 1000; // while the panel is open
@@ -11,9 +11,9 @@ const TOLERANCE_MS = 15; // smaller differences of delays are ignored
 
 /** Return the text of a sender's state: { contents, rate_hz, delay_ms, problem } of the gateway. */
 export function senderText({ contents, rate_hz: rateHz, delay_ms: delay, problem }) {
-  if (problem !== "") return sayReceived(problem);
-  const values = { contents: sayReceived(contents), rate: Math.round(rateHz), delay };
-  return say(delay === 0 ? "senderState" : "senderStateDelayed", values);
+  if (problem !== "") return translateReceived(problem);
+  const values = { contents: translateReceived(contents), rate: Math.round(rateHz), delay };
+  return translate(delay === 0 ? "senderState" : "senderStateDelayed", values);
 }
 
 /** Return whether a sender's delay differs from this page's, ms; null: the page has no sound. */
@@ -59,7 +59,7 @@ export class SendersPanel {
   #offerDelay() {
     const button = element("send-delay");
     button.hidden = !isOutOfSync(this.#senders, this.#frameWaitMs);
-    if (!button.hidden) setText(button, say("delaySenders", { ms: this.#frameWaitMs }));
+    if (!button.hidden) setText(button, translate("delaySenders", { ms: this.#frameWaitMs }));
   }
 
   #show(answer) {
@@ -69,17 +69,17 @@ export class SendersPanel {
   }
 
   async #refresh() {
-    const response = await fetch(pathOf("senders")).catch(() => null);
+    const response = await fetch(pathWithToken("senders")).catch(() => null);
     if (response?.ok) this.#show(await response.json());
   }
 
   /** Send a command; return whether it succeeded. */
   async #post(command) {
     const options = { method: "POST", body: JSON.stringify(command) };
-    const response = await fetch(pathOf("senders"), options).catch(() => null);
+    const response = await fetch(pathWithToken("senders"), options).catch(() => null);
     if (response === null) return false; // the notice reports that the gateway has stopped
     const answer = await response.json();
-    setText(element("send-problem"), sayReceived(answer.error ?? ""));
+    setText(element("send-problem"), translateReceived(answer.error ?? ""));
     if (response.ok) this.#show(answer);
     return response.ok;
   }
@@ -97,7 +97,7 @@ function showRows({ senders, stopped }) {
     const [name, about, button] = item.children;
     setText(name, url);
     setText(about, state);
-    setText(button, say(action));
+    setText(button, translate(action));
     delete button.dataset[action === "stop" ? "start" : "stop"];
     button.dataset[action] = url;
   });

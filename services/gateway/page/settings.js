@@ -1,12 +1,12 @@
 // The settings panel: head, lips, size of movements, expressions and language.
 
 import { element } from "./elements.js";
-import { languageFor, say, setLanguage } from "./language.js";
+import { languageFor, translate, setLanguage } from "./language.js";
 import { TEXTS } from "./texts.js";
 
 const EXPRESSION_STRENGTH = 0.8;
-const AMOUNTS = ["expressiveness", "feeling"];
-export const MOTIONS = [...AMOUNTS, "still", "eye_contact"]; // names of face settings
+const SLIDERS = ["expressiveness", "feeling"];
+export const FACE_SETTINGS = [...SLIDERS, "still", "eye_contact"]; // also their names in messages
 const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];
 
 export class Settings {
@@ -17,7 +17,7 @@ export class Settings {
    * @param preferences Preferences
    * @param offers { heads: names, lips: { name: title by language }, languages: { code: title by
    *   language } } of the gateway
-   * @param handlers { heads(name), lips(name), speechLanguage(code), motion(), express(strengths by name) },
+   * @param handlers { heads(name), lipModel(name), speechLanguage(code), faceSettings(), expressions(strengths by name) },
    *   called when the user changes a setting
    */
   constructor(preferences, offers, handlers) {
@@ -29,16 +29,16 @@ export class Settings {
     for (const [code, title] of Object.entries(offers.languages)) TEXTS[`speech.${code}`] = title;
     this.#applyLanguage();
     this.#bind("heads", handlers.heads);
-    this.#bind("lips", handlers.lips);
+    this.#bind("lips", handlers.lipModel);
     this.#bind("speech-language", handlers.speechLanguage);
-    for (const id of MOTIONS) this.#bind(id, handlers.motion);
-    for (const id of AMOUNTS) {
+    for (const id of FACE_SETTINGS) this.#bind(id, handlers.faceSettings);
+    for (const id of SLIDERS) {
       element(id).addEventListener("input", () => showAmount(id));
       showAmount(id);
     }
     this.#bind("language", () => this.#applyLanguage());
     element("expressions").onclick = ({ target }) => {
-      if (target.value) handlers.express({ [target.value]: EXPRESSION_STRENGTH });
+      if (target.value) handlers.expressions({ [target.value]: EXPRESSION_STRENGTH });
     };
   }
 
@@ -79,7 +79,7 @@ function fill(id, tag, textPrefix, values) {
     const item = document.createElement(tag);
     if (tag === "button") item.type = "button";
     item.value = value;
-    item.textContent = say(`${textPrefix}.${value}`);
+    item.textContent = translate(`${textPrefix}.${value}`);
     return item;
   });
   element(id).replaceChildren(...items);
@@ -92,7 +92,7 @@ function showPictures(names) {
   const buttons = names.map((name) => {
     const button = document.createElement("button");
     button.type = "button";
-    const title = say(`head.${name}`);
+    const title = translate(`head.${name}`);
     button.title = title;
     button.append(Object.assign(new Image(48, 48), { src: `head-${name}.webp`, alt: title }));
     button.onclick = () => {

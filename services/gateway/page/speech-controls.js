@@ -5,7 +5,7 @@ import { Microphone } from "./microphone.js";
 
 export class SpeechControls {
   microphone;
-  // of the microphone
+  // state and session of the microphone
   state = "off";
   session = null;
   #sound;
@@ -14,7 +14,7 @@ export class SpeechControls {
 
   /**
    * @param {Sound} sound the session's sound
-   * @param handlers { mouthProfile(), language(), lips(), level(rms), fileEnded(name), error({ code, text }): as
+   * @param handlers { mouthProfile(), language(), lipModel(), level(rms), fileEnded(name), error({ code, text }): as
    *   of Microphone,
    *   news(text), session(name): the microphone's session, null when it ends }
    */

@@ -2,7 +2,7 @@
 
 import { element, setText } from "./elements.js";
 import { Head } from "./head.js";
-import { UserError, say } from "./language.js";
+import { UserError, translate } from "./language.js";
 import { drawingText, turnText } from "./status.js";
 
 const BACKGROUND = "#e9e8ea"; // the page's own background is not on the canvas
@@ -134,7 +134,7 @@ export class Stage {
       this.#handlers.loaded();
     } catch (error) {
       const isText = error instanceof UserError;
-      const text = isText ? error.message : say("headMissing", { file, reason: error.message });
+      const text = isText ? error.message : translate("headMissing", { file, reason: error.message });
       this.#handlers.failed(text);
       setText(element("no-head"), text); // stays after the notice has vanished
     }
@@ -150,7 +150,7 @@ export class Stage {
       this.#head.film(BACKGROUND);
       this.#recorder.start(element("head"), await this.#sound.tap(), (video) => {
         const file = save(video);
-        this.#handlers.news(say(file.endsWith(".mp4") ? "videoSaved" : "webmSaved", { file }));
+        this.#handlers.news(translate(file.endsWith(".mp4") ? "videoSaved" : "webmSaved", { file }));
       });
     }
     element("record").setAttribute("aria-pressed", this.#recorder.isRecording);
@@ -162,6 +162,6 @@ function makeHead() {
     const overlays = { controls: document.querySelector("footer"), panel: element("settings") };
     return new Head(element("head"), overlays);
   } catch {
-    throw new UserError(say("webGlMissing"));
+    throw new UserError(translate("webGlMissing"));
   }
 }

@@ -2,11 +2,11 @@
 
 import { isThisComputer } from "./address.js";
 import { element, setText } from "./elements.js";
-import { say } from "./language.js";
+import { translate } from "./language.js";
 import { SILENT_DB } from "./level.js";
 
 const NEWS_MS = 8000; // for which news is shown
-const SHORT_MS = 1000; // a fault that is over within this time is not shown
+const SHOWN_AFTER_MS = 1000; // shorter faults are not shown
 
 /** The state that the gateway reports: the connection, the session that is shown, missing services. */
 export class GatewayState {
@@ -34,7 +34,7 @@ export class GatewayState {
     if (!isConnected) this.session = null;
   }
 
-  /** Take a "session" message; return { isRestart, isOther }: whether the epoch or session changed. */
+  /** Process a "session" message; return { isRestart, isOther }: whether the epoch or session changed. */
   setSession({ session, epoch, sample, lips, acoustic }) {
     const isOther = session !== this.session;
     const isRestart = !isOther && session !== null && epoch > this.epoch;
@@ -63,19 +63,19 @@ export function stateKey({ isConnected, isStarting, isLive, isBehind, isInterrup
  */
 export function delayText(voiceMs, soundMs) {
   if (voiceMs !== null) return `${roundToTens(voiceMs)} ms`;
-  return soundMs === null ? "" : say("soundDelay", { ms: roundToTens(soundMs) });
+  return soundMs === null ? "" : translate("soundDelay", { ms: roundToTens(soundMs) });
 }
 
 /** Return the text of a delay in seconds, with tenths: more digits would change too often. */
 export function secondsText(ms) {
-  return say("seconds", { seconds: (ms / 1000).toFixed(1) });
+  return translate("seconds", { seconds: (ms / 1000).toFixed(1) });
 }
 
 /** Return the text of the delays of sound and of frames until their image; "" while unknown. */
 export function playoutDelaysText(soundMs, frameMs) {
   if (soundMs === null || frameMs === null) return "";
   const [sound, frame] = [soundMs, frameMs].map(roundToTens);
-  return say("playoutDelays", { soundMs: sound, frameMs: frame });
+  return translate("playoutDelays", { soundMs: sound, frameMs: frame });
 }
 
 /** Round to tens: a few milliseconds are invisible, and the text changes less often. */
@@ -85,13 +85,13 @@ export function roundToTens(ms) {
 
 /** Return the text about reduced quality (Head.drawing); "" if the quality is full. */
 export function drawingText({ isCoarse, width, height }) {
-  return isCoarse ? say("drawnInSoftware", { size: `${width} × ${height}` }) : "";
+  return isCoarse ? translate("drawnInSoftware", { size: `${width} × ${height}` }) : "";
 }
 
 /** Return the text of the head's rotation in the picture, degrees. */
 export function turnText(turned) {
   const [left, up] = [turned.left, turned.up].map(Math.round);
-  if (left === 0 && up === 0) return say("turnedFront");
+  if (left === 0 && up === 0) return translate("turnedFront");
   const directions = [
     [left, "turnedLeft"],
     [-left, "turnedRight"],
@@ -99,17 +99,17 @@ export function turnText(turned) {
     [-up, "turnedDown"],
   ]
     .filter(([degrees]) => degrees > 0)
-    .map(([degrees, key]) => say(key, { degrees }));
-  return say("turned", { directions: directions.join(", ") });
+    .map(([degrees, key]) => translate(key, { degrees }));
+  return translate("turned", { directions: directions.join(", ") });
 }
 
 /** Return what does not work and what to do; "" if all is well. */
 export function hintText({ isConnected, wasConnected, isRefused, missing }) {
-  if (!isConnected && wasConnected) return say("gatewayStopped");
-  if (isRefused) return say("connectionRefused");
-  if (isConnected && missing.includes("control")) return say("controlMissing");
+  if (!isConnected && wasConnected) return translate("gatewayStopped");
+  if (isRefused) return translate("connectionRefused");
+  if (isConnected && missing.includes("control")) return translate("controlMissing");
   if (isConnected && missing.length > 0) {
-    return say("servicesMissing", {
+    return translate("servicesMissing", {
       services: missing.join(", "),
       commands: missing.map((name) => `kouxing ${name}`).join("; "),
     });
@@ -117,8 +117,8 @@ export function hintText({ isConnected, wasConnected, isRefused, missing }) {
   return "";
 }
 
-/** A fault that lasts: its hint after some time, and the news that it is over. Time is injected. */
-export class LastingFault {
+/** Shows the hint of a fault only if the fault lasts, and reports its end. Time is injected. */
+export class PersistentFault {
   #sinceMs = null;
   #isShown = false;
 
@@ -131,7 +131,7 @@ export class LastingFault {
       return { hint, isOver };
     }
     this.#sinceMs ??= nowMs;
-    this.#isShown ||= nowMs - this.#sinceMs > SHORT_MS;
+    this.#isShown ||= nowMs - this.#sinceMs > SHOWN_AFTER_MS;
     return { hint: this.#isShown ? hint : "", isOver: false };
   }
 }
@@ -139,15 +139,15 @@ export class LastingFault {
 export class StatusBar {
   #parts;
   #wasLive = false; // in the session that is shown
-  #fault = new LastingFault();
-  #microphoneFault = new LastingFault();
+  #fault = new PersistentFault();
+  #microphoneFault = new PersistentFault();
 
-  /** @param parts { gateway, player, speech, sound, notice, senders }: where the state is */
+  /** @param parts { gateway, player, speech, sound, notice, senders }: sources of the state */
   constructor(parts) {
     this.#parts = parts;
   }
 
-  /** Another session is shown. */
+  /** Start again for another session. */
   reset() {
     this.#wasLive = false;
   }
@@ -165,8 +165,8 @@ export class StatusBar {
     const isBehind = isLive && player.lateness.isBehind;
     const state = stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted });
     element("status").dataset.state = state;
-    element("status").title = session === null ? "" : say("sessionName", { name: session });
-    setText(element("state"), say(isBehind && isThisComputer() ? "behindBusy" : state));
+    element("status").title = session === null ? "" : translate("sessionName", { name: session });
+    setText(element("state"), translate(isBehind && isThisComputer() ? "behindBusy" : state));
     element("behind").hidden = !isBehind;
     const isLight = gateway.acoustic === "light";
     for (const name of ["light", "acoustic"]) element(name).hidden = !isLight;
@@ -181,10 +181,10 @@ export class StatusBar {
     setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
     senders.frameWaitMs = frameMs;
     const fault = this.#fault.update(nowMs, hintText(gateway));
-    const pause = isMicrophoneInterrupted ? say("microphoneInterrupted") : "";
+    const pause = isMicrophoneInterrupted ? translate("microphoneInterrupted") : "";
     const microphone = this.#microphoneFault.update(nowMs, pause);
-    if (fault.isOver) notice.showNews(say("recovered"), "hint");
-    if (microphone.isOver && speech.state === "on") notice.showNews(say("microphoneResumed"), "hint");
+    if (fault.isOver) notice.showNews(translate("recovered"), "hint");
+    if (microphone.isOver && speech.state === "on") notice.showNews(translate("microphoneResumed"), "hint");
     notice.showHint(fault.hint || microphone.hint);
   }
 }

@@ -16,7 +16,7 @@ export const TEXTS = {
   recordHelp: { en: "Record the face and its sound as a video", zh: "把人脸和声音录成视频" },
   videoSaved: { en: "Saved {file}.", zh: "已保存 {file}。" },
   webmSaved: {
-    en: "Saved {file}. This browser records only WebM. QuickTime does not play it; VLC and browsers do. To convert it: ffmpeg -i {file} face.mp4",
+    en: "Saved {file}. This browser records only WebM, which VLC and browsers play but QuickTime does not. To convert it: ffmpeg -i {file} face.mp4",
     zh: "已保存 {file}。此浏览器只能录制 WebM，QuickTime 无法播放；可用 VLC 或浏览器播放，或转换：ffmpeg -i {file} face.mp4",
   },
   learn: { en: "Learn my mouth", zh: "学我的口型" },
@@ -47,7 +47,7 @@ export const TEXTS = {
     en: "Close other programs, and other windows that show this page.",
     zh: "请关闭其他程序，以及显示本页的其他窗口。",
   },
-  fewerPictures: { en: "Lower the frame rate", zh: "减少画面" },
+  fewerPictures: { en: "Lower the frame rate", zh: "降低帧率" },
   useLightModel: { en: "Use the light model", zh: "使用轻量模型" },
   gatewayStopped: {
     en: "The gateway has stopped. Start it with “kouxing run”; this page reconnects by itself.",
@@ -101,7 +101,7 @@ export const TEXTS = {
   noSpeechSilent: { en: "{file}: no speech was found; it is silent", zh: "{file}：没有找到语音，文件是静音的" },
   oldMouthProfile: {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
-    zh: "学到的口型不适用于当前版本：请重新“学我的口型”。",
+    zh: "保存的口型不适用于当前版本。请按“学我的口型”重新录制。",
   },
 
   // Settings
@@ -109,9 +109,9 @@ export const TEXTS = {
   head: { en: "Head", zh: "头像" },
   drawnInSoftware: {
     en: "No graphics card was found, so the head is drawn with fewer triangles and pixels: {size}",
-    zh: "没有显卡，画面已简化：{size} 像素",
+    zh: "没有找到显卡，因此用较少的三角形和像素绘制头像：{size}",
   },
-  allPictures: { en: "Restore the full frame rate", zh: "恢复全部画面" },
+  allPictures: { en: "Restore the full frame rate", zh: "恢复完整帧率" },
   lightModel: { en: "light model", zh: "轻量模型" },
   useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
@@ -136,7 +136,7 @@ export const TEXTS = {
     en: "{contents}, {rate} frames/s, delayed {delay} ms",
     zh: "{contents}，每秒 {rate} 帧，延迟 {delay} ms",
   },
-  delaySenders: { en: "Delay these programs by {ms} ms to match this page's sound", zh: "延迟 {ms} ms 以配合此声音" },
+  delaySenders: { en: "Delay these programs by {ms} ms to match this page's sound", zh: "把这些程序延迟 {ms} ms，以配合本页的声音" },
   playoutDelays: {
     en: "The sound is delayed by {soundMs} ms to match the picture. To match the face in another program to this sound, add delay={frameMs} to its address.",
     zh: "声音延迟 {soundMs} ms 以配合画面。要让其他程序的脸与此声音同步，请在地址中加 delay={frameMs}。",
@@ -162,15 +162,15 @@ export const TEXTS = {
   // Learn my mouth
   lessonIntro: {
     en: "Read a text aloud in front of your camera for 40 seconds. From then on, when you use the microphone, the head moves its lips as you do.",
-    zh: "对着摄像头朗读 40 秒，之后用麦克风时，头像就会学着你的口型说话。",
+    zh: "对着摄像头朗读一段文字 40 秒。之后你用麦克风时，头像就会像你一样动嘴唇。",
   },
   lessonPrivacy: {
     en: "No camera image leaves this browser. The gateway receives your voice and the positions of 43 points on your face, and deletes both after learning.",
-    zh: "图像不会离开浏览器。网关只收到你的声音和脸上 43 个点的位置，学完即删除。",
+    zh: "摄像头的图像不会离开浏览器。网关只收到你的声音和脸上 43 个点的位置，学完即删除。",
   },
   lessonLearned: {
     en: "Your mouth was learned on {day}. Similarity of the opening: {before} → {after}.",
-    zh: "{day} 学会了你的口型：张口 {before} → {after}。",
+    zh: "{day} 学会了你的口型。张口的相似度：{before} → {after}。",
   },
   lessonForget: { en: "Forget it", zh: "删除" },
   lessonText: { en: "Text", zh: "文本" },
@@ -179,7 +179,7 @@ export const TEXTS = {
   secondsLeft: { en: "seconds left", zh: "剩余秒数" },
   time: { en: "time", zh: "时间" },
   lessonFinish: { en: "I'm done reading", zh: "读完了" },
-  lessonLearning: { en: "Learning your mouth. This takes a few seconds …", zh: "正在学习，请稍候…" },
+  lessonLearning: { en: "Learning your mouth. This takes a few seconds …", zh: "正在学习你的口型，需要几秒钟…" },
   lessonTracking: {
     en: "You can stop reading. This computer is slow, so the lips in the images are found now: {percent} %.",
     zh: "可以停止朗读了。这台电脑较慢，正在查找画面中的嘴唇：{percent} %。",
@@ -192,7 +192,7 @@ export const TEXTS = {
   lessonSimilarity: { en: "How closely the head's lips follow yours (1 = exactly)", zh: "与你的相似度（1 为完全一致）" },
   lessonHeldOut: {
     en: "Measured on the last quarter of your reading, which was not used for learning.",
-    zh: "用未参与学习的最后四分之一测得。",
+    zh: "用朗读的最后四分之一测得，这部分没有用于学习。",
   },
   discard: { en: "Discard", zh: "放弃" },
   keep: { en: "Keep", zh: "保留" },
@@ -209,16 +209,16 @@ export const TEXTS = {
   "measure.width": { en: "Width", zh: "宽度" },
   "measure.jaw": { en: "Jaw", zh: "下颌" },
   lessonBetter: { en: "The head's lips now follow yours more closely.", zh: "现在头像的口型更像你了。" },
-  lessonSame: { en: "The head's lips follow yours about as well as before.", zh: "效果和以前差不多。" },
+  lessonSame: { en: "The head's lips follow yours about as well as before.", zh: "头像的口型和以前差不多一样像你。" },
   lessonWorse: {
     en: "The head's lips do not follow yours. Discard the result and try again, with light on your face and no other voices.",
-    zh: "效果不好。建议放弃，换个光线好、安静的地方再试。",
+    zh: "头像的口型不像你的。请放弃结果，在脸部有光、没有其他人说话的地方再试。",
   },
-  noFace: { en: "No face is visible. Sit in front of the camera, with light on your face.", zh: "看不到脸。请正对摄像头，脸部要有光。" },
+  noFace: { en: "No face is visible. Sit in front of the camera, with light on your face.", zh: "看不到脸。请坐在摄像头前，脸部要有光。" },
   tooQuiet: { en: "The sound is too quiet. Speak louder, or turn up the microphone.", zh: "声音太小。请大声一点，或调高麦克风音量。" },
   tooSlow: {
     en: "This computer is too slow to track your face. Close other programs and try again. Or film yourself and use kouxing track and kouxing adapt.",
-    zh: "这台电脑处理画面太慢。请关闭其他程序再试，或录一段视频，用 kouxing track 和 kouxing adapt 学习。",
+    zh: "这台电脑太慢，无法跟踪你的脸。请关闭其他程序再试，或录一段视频，用 kouxing track 和 kouxing adapt 学习。",
   },
   cameraInsecure: {
     en: "The camera needs https. Open this page at an https address or at http://localhost.",
@@ -226,9 +226,9 @@ export const TEXTS = {
   },
   cameraForbidden: {
     en: "The camera or the microphone is blocked. Allow both for this page and try again.",
-    zh: "未允许使用摄像头和麦克风。请允许后重试。",
+    zh: "未允许使用摄像头或麦克风。请允许本页使用两者，然后重试。",
   },
-  cameraMissing: { en: "No camera or microphone was found. Connect both and try again.", zh: "没有摄像头或麦克风。请接上后重试。" },
+  cameraMissing: { en: "No camera or microphone was found. Connect both and try again.", zh: "没有找到摄像头或麦克风。请接上两者后重试。" },
   cameraBusy: {
     en: "Another program uses the camera or the microphone. Close it and try again.",
     zh: "摄像头或麦克风被其他程序占用。请关闭后重试。",
