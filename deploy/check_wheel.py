@@ -33,7 +33,7 @@ ASSETS = (
 
 
 def main(wheel: Path) -> None:
-    """Check a wheel; an exception says what failed."""
+    """Check a wheel. Raises an exception at the first failed check."""
     size_mb = wheel.stat().st_size / 1e6
     print(f"{wheel.name}: {size_mb:.1f} MB")
     assert size_mb <= MAX_WHEEL_MB, f"the wheel is larger than {MAX_WHEEL_MB:g} MB"

@@ -15,7 +15,7 @@ export class Blinks {
   apply(values, names, nowS) {
     this.#startS ??= nowS + drawInterval();
     if (nowS > this.#startS + FALL_S + CLOSED_S + RISE_S) this.#startS = nowS + drawInterval();
-    const closed = amountAt(nowS - this.#startS);
+    const closed = closureAt(nowS - this.#startS);
     if (names.length === 0) LIDS.forEach((fap, i) => (values[fap] += closed * (CLOSED[i] - values[fap])));
     for (const name of ["eyeBlinkLeft", "eyeBlinkRight", "blink"]) {
       const i = names.indexOf(name);
@@ -25,7 +25,7 @@ export class Blinks {
 }
 
 /** Return how far the lids are closed, 0 to 1, at a time after the start of a blink. */
-function amountAt(sinceS) {
+function closureAt(sinceS) {
   return sinceS < FALL_S + CLOSED_S ? smoothStep(sinceS / FALL_S) : 1 - smoothStep((sinceS - FALL_S - CLOSED_S) / RISE_S);
 }
 

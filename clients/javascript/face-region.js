@@ -49,9 +49,9 @@ export class FaceRegion {
     const zAxis = xAxis.clone().cross(yAxis);
     if (this.#parts.some(({ shape, mesh }) => isMouth(shape) && mesh.matrixWorld.determinant() < 0)) zAxis.negate();
     turn.makeBasis(xAxis, yAxis, zAxis).invert();
-    const [found, wanted] = [side.applyMatrix4(turn).normalize(), new THREE.Vector3(1, 0, 0)];
-    if (found.angleTo(wanted) < MAX_TILT) return turn;
-    return turn.premultiply(new THREE.Matrix4().makeRotationFromQuaternion(new THREE.Quaternion().setFromUnitVectors(found, wanted)));
+    const [current, target] = [side.applyMatrix4(turn).normalize(), new THREE.Vector3(1, 0, 0)];
+    if (current.angleTo(target) < MAX_TILT) return turn;
+    return turn.premultiply(new THREE.Matrix4().makeRotationFromQuaternion(new THREE.Quaternion().setFromUnitVectors(current, target)));
   }
 
   /** The head: { center, height }. A mesh that also has a body counts only above the chin. */
@@ -72,8 +72,8 @@ export class FaceRegion {
     return { center, height: sizeOf(moved).y };
   }
 
-  #union(isWanted) {
-    return this.#parts.filter(isWanted).reduce((union, { box }) => union.union(box), new THREE.Box3());
+  #union(isIncluded) {
+    return this.#parts.filter(isIncluded).reduce((union, { box }) => union.union(box), new THREE.Box3());
   }
 }
 

@@ -58,7 +58,7 @@ export class KouxingFace extends HTMLElement {
     try {
       this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     } catch (error) {
-      this.#fail(error, NO_WEBGL);
+      this.#showError(error, NO_WEBGL);
       return;
     }
     const gl = this.#renderer.getContext();
@@ -174,7 +174,7 @@ export class KouxingFace extends HTMLElement {
       if (loadId !== this.#loadId) return; // another load has started
       this.#avatar = avatar;
     } catch (error) {
-      if (loadId === this.#loadId) this.#fail(error, error.message);
+      if (loadId === this.#loadId) this.#showError(error, error.message);
       return;
     }
     this.#note.textContent = "";
@@ -189,7 +189,7 @@ export class KouxingFace extends HTMLElement {
     this.#connect();
   }
 
-  #fail(error, message) {
+  #showError(error, message) {
     this.#note.textContent = message;
     this.dispatchEvent(new ErrorEvent("error", { error, message }));
   }
@@ -198,7 +198,7 @@ export class KouxingFace extends HTMLElement {
     this.#disconnect();
     if (this.#avatar === null || this.hasAttribute("recording") || this.hasAttribute("manual")) return;
     if (this.hasAttribute("local")) {
-      this.lips.catch((error) => this.#fail(error, error.message));
+      this.lips.catch((error) => this.#showError(error, error.message));
       return;
     }
     const [session, token] = ["session", "token"].map((name) => this.getAttribute(name) ?? "");
@@ -245,14 +245,14 @@ export class KouxingFace extends HTMLElement {
     if (this.#avatar === null || !this.#images.isDue(nowMs)) return;
     if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize();
     if (this.#recording) this.#poseRecording();
-    else if (this.hasAttribute("local")) this.#poseLocally(nowMs);
+    else if (this.hasAttribute("local")) this.#poseLocalFace(nowMs);
     else if (this.#viewer !== null && this.#values !== null) this.show(this.#player.faps, this.#names);
     this.#avatar.update(Math.min(MAX_STEP_S, (nowMs - this.#drawnMs) / 1000));
     this.#drawnMs = nowMs;
     this.#images.draw(nowMs, () => this.#renderer.render(this.#scene, this.#camera));
   }
 
-  #poseLocally(nowMs) {
+  #poseLocalFace(nowMs) {
     const face = this.#localFaces?.current;
     if (!face) return;
     const { set } = this;

@@ -85,7 +85,7 @@ function checkTextures({ textures = [] }) {
 function targetNames(mesh, { json, associations }) {
   const { meshes, primitives = 0 } = associations.get(mesh);
   const { targets, extras } = json.meshes[meshes].primitives[primitives];
-  const names = [extras, json.meshes[meshes].extras].map((found) => found?.targetNames).find(Array.isArray);
+  const names = [extras, json.meshes[meshes].extras].map((holder) => holder?.targetNames).find(Array.isArray);
   return targets.map(({ POSITION }, i) => (moves(mesh, i) ? String(names?.[i] ?? json.accessors[POSITION]?.name ?? i) : ""));
 }
 
@@ -95,7 +95,7 @@ function moves({ geometry }, index) {
 }
 
 function kouxingHead(scene, meshes, { faps, camera }) {
-  const moved = meshes.map(({ mesh }) => new MorphedMesh(mesh, faps));
+  const morphed = meshes.map(({ mesh }) => new MorphedMesh(mesh, faps));
   const joints = findJoints(scene, faps);
   const [position, target] = [camera.position, camera.target].map((at) => new THREE.Vector3(...at));
   const half = Math.tan(THREE.MathUtils.degToRad(camera.fovYDegrees / 2));
@@ -104,7 +104,7 @@ function kouxingHead(scene, meshes, { faps, camera }) {
     set: "faps",
     view: { target, height: 2 * half * position.distanceTo(target) },
     pose(values) {
-      for (const mesh of moved) mesh.pose(values);
+      for (const mesh of morphed) mesh.pose(values);
       rotateJoints(joints, values);
     },
     update() {},
@@ -121,7 +121,7 @@ function morphAvatar(scene, meshes) {
   const upright = new THREE.Group().add(scene);
   upright.applyMatrix4(region.upright);
   upright.updateMatrixWorld(true);
-  const turnJaw = findJaw(scene, targets);
+  const openJaw = createJawOpener(scene, targets);
   const { center, height } = new FaceRegion(targets).bounds;
   return {
     scene: upright,
@@ -133,7 +133,7 @@ function morphAvatar(scene, meshes) {
       for (const { mesh, index, shape } of targets) {
         mesh.morphTargetInfluences[index] = weightOf.get(shape) ?? 0;
       }
-      turnJaw(Object.entries(OPENINGS).reduce((sum, [shape, opening]) => sum + opening * (weightOf.get(shape) ?? 0), 0));
+      openJaw(Object.entries(OPENINGS).reduce((sum, [shape, opening]) => sum + opening * (weightOf.get(shape) ?? 0), 0));
     },
     update() {},
   };
@@ -143,13 +143,13 @@ function morphAvatar(scene, meshes) {
  * Return a function that opens the jaw bone. Its argument is the opening, 0 to 1. The bone moves
  * teeth and tongue; it stays at rest if it also moves a mesh with a shape that opens the mouth.
  */
-function findJaw(scene, targets) {
+function createJawOpener(scene, targets) {
   let jaw = null;
   scene.traverse((node) => {
     if (node.isBone && JAW_BONE.test(node.userData.name ?? node.name)) jaw ??= node;
   });
   const skins = targets.filter(({ shape }) => shape in OPENINGS).map(({ mesh }) => mesh);
-  if (jaw === null || skins.some((mesh) => isMovedBy(mesh, jaw))) return () => {};
+  if (jaw === null || skins.some((mesh) => isSkinnedBy(mesh, jaw))) return () => {};
   const rest = jaw.quaternion.clone();
   const axis = new THREE.Vector3(1, 0, 0).applyQuaternion(jaw.parent.getWorldQuaternion(new THREE.Quaternion()).invert());
   const turn = new THREE.Quaternion();
@@ -157,7 +157,7 @@ function findJaw(scene, targets) {
 }
 
 /** Return whether a bone, or one below it, moves a mesh. */
-function isMovedBy(mesh, bone) {
+function isSkinnedBy(mesh, bone) {
   const { skinIndex, skinWeight } = mesh.geometry.attributes;
   if (!mesh.isSkinnedMesh || !skinIndex) return false;
   const bones = new Set();

@@ -59,9 +59,9 @@ export function chooseSet(names) {
     const needed = SETS[set].filter(({ isNeeded }) => isNeeded).map(({ shape }) => shape);
     const missing = needed.filter((shape) => !found.has(shape));
     const penalty = missing.length / needed.length - found.size / 1000; // between equals, known shapes decide
-    return { set, missing, speaks: found.has(needed[0]), penalty };
+    return { set, missing, canSpeak: found.has(needed[0]), penalty };
   });
-  const speaking = options.filter(({ speaks }) => speaks);
+  const speaking = options.filter(({ canSpeak }) => canSpeak);
   const complete = speaking.find(({ missing }) => missing.length === 0);
   const nearest = (list) => list.reduce((best, other) => (other.penalty < best.penalty ? other : best));
   if (speaking.length > 0) return (complete ?? nearest(speaking.reverse())).set;
@@ -73,7 +73,7 @@ export function chooseSet(names) {
 }
 
 /** Remove a number at the end of a name, and write the side before it as a word. */
-function sided(name) {
+function spellOutSide(name) {
   return name
     .replace(/[._ ](div)?\d+$/, "") // Blender appends .001, Daz _div2
     .replace(/(?:[._\- ][Ll]|(?<=[a-z])L)$/, "Left")
@@ -84,9 +84,9 @@ function toKey(name) {
   return name.replaceAll(SEPARATOR, "").toLowerCase();
 }
 
-/** Return the keys of a name without none, one, two, ... words at its beginning. */
+/** Return the keys of a name: of all its words, and of those after each separator. */
 function candidates(name) {
-  const text = sided(name);
+  const text = spellOutSide(name);
   const keys = [toKey(text)];
   for (const { 0: separator, index } of text.matchAll(SEPARATOR)) {
     const key = toKey(text.slice(index + separator.length));
@@ -103,7 +103,7 @@ function readTable() {
     if (!line.startsWith(" ")) sets[(set = words.shift())] = [];
     for (const word of words) {
       const [shape, ...others] = word.replace("*", "").split("=");
-      const choices = [shape, ...others].map((choice) => choice.split("+").map((part) => toKey(sided(part))));
+      const choices = [shape, ...others].map((choice) => choice.split("+").map((part) => toKey(spellOutSide(part))));
       sets[set].push({ shape, choices, isNeeded: word.startsWith("*") });
     }
   }

@@ -29,11 +29,11 @@ export class FrameTrack {
   }
 }
 
-function mix(one, other, timeS) {
-  const fraction = (timeS - one.timeS) / (other.timeS - one.timeS);
-  const mixed = { ...one, timeS };
-  for (const name of Object.keys(one)) {
-    const [from, to] = [one[name], other[name]];
+function mix(before, after, timeS) {
+  const fraction = (timeS - before.timeS) / (after.timeS - before.timeS);
+  const mixed = { ...before, timeS };
+  for (const name of Object.keys(before)) {
+    const [from, to] = [before[name], after[name]];
     if (!(from instanceof Float32Array)) continue;
     const values = new Float32Array(from.length);
     for (let i = 0; i < values.length; i++) values[i] = from[i] + fraction * (to[i] - from[i]);

@@ -7,9 +7,9 @@ static const Mouth AT_REST = {{0}, {0}};
 
 static double clamp(double x, double lowest, double highest) { return fmin(fmax(x, lowest), highest); }
 
-static double smooth_step(double share) {
-  share = clamp(share, 0.0, 1.0);
-  return share * share * (3.0 - 2.0 * share);
+static double smooth_step(double x) {
+  x = clamp(x, 0.0, 1.0);
+  return x * x * (3.0 - 2.0 * x);
 }
 
 /* Return what remains of a difference on its way to zero, a cubic; u goes from 0 to 1. */
@@ -106,7 +106,7 @@ static double next_sound_s(const Rest *rest) {
   return INFINITY;
 }
 
-static double ajar_share(const Rest *rest) {
+static double ajar_amount(const Rest *rest) {
   const double u = fmin(rest->elapsed_s / rest->duration_s, 1.0);
   return rest->goal + remaining(rest->start, rest->velocity, u, rest->duration_s);
 }
@@ -114,9 +114,9 @@ static double ajar_share(const Rest *rest) {
 static void set_goal(Rest *rest, double goal, double duration_s) {
   if (goal == rest->goal) return;
   const double u = fmin(rest->elapsed_s / rest->duration_s, 1.0);
-  const double share = ajar_share(rest);
+  const double amount = ajar_amount(rest);
   rest->velocity = remaining_velocity(rest->start, rest->velocity, u, rest->duration_s);
-  rest->start = share - goal;
+  rest->start = amount - goal;
   rest->goal = goal;
   rest->duration_s = duration_s;
   rest->elapsed_s = 0.0;
@@ -146,7 +146,7 @@ static void follow_voice(Rest *rest, double time_s) {
 }
 
 /* Return the log odds that silence subtracts from a closure. */
-static double closure_doubt(Rest *rest, double time_s, double closure) {
+static double doubt_at(Rest *rest, double time_s, double closure) {
   const double next_s = next_sound_s(rest);
   const bool is_silent = rest->is_voice && rest->known_s > time_s + REST_LAST_SOUND_S && next_s > rest->known_s;
   const bool is_onset = REST_YIELD_S < next_s - time_s && next_s - time_s <= REST_ONSET_S;
@@ -170,17 +170,17 @@ static double ajar_amount_at(Rest *rest, double time_s) {
   else if (!rest->is_voice || fmin(next_s, rest->known_s) >= rest->sound_s + REST_MIN_PAUSE_S) set_goal(rest, 1.0, REST_PART_S);
   rest->elapsed_s += fmax(time_s - rest->time_s, 0.0);
   rest->time_s = time_s;
-  return ajar_share(rest);
+  return ajar_amount(rest);
 }
 
 /* ---- learned lips ---- */
 
 /* Move inner lips towards rest, and the outer lips by the same distance. */
-static void move_to_rest(double *faps, double share) {
+static void move_to_rest(double *faps, double amount) {
   for (int i = 0; i < CLOSURES_INNER_LENGTH; i++) {
-    const double moved = share * faps[CLOSURES_INNER[i]];
-    faps[CLOSURES_INNER[i]] -= moved;
-    faps[CLOSURES_OUTER[i]] -= moved;
+    const double shift = amount * faps[CLOSURES_INNER[i]];
+    faps[CLOSURES_INNER[i]] -= shift;
+    faps[CLOSURES_OUTER[i]] -= shift;
   }
 }
 
@@ -192,7 +192,7 @@ static void stabilize(Face *face, const LipFrame *frame, double *faps) {
       if (change != 0.0) face->stable[i] += change * change * change / (change * change + LEARNED_JITTER_SQUARED[i]);
     }
   } else {
-    face->shares[0] = face->shares[1] = 0.0;
+    face->closing[0] = face->closing[1] = 0.0;
     memcpy(face->stable, frame->faps, sizeof face->stable);
   }
   memcpy(faps, face->stable, sizeof face->stable);
@@ -206,13 +206,13 @@ static void stabilize(Face *face, const LipFrame *frame, double *faps) {
   double closure = RULE_SOUND + log(probability / (1.0 - probability));
   closure -= RULE_PARTED * (clamp(opening, CLOSURES_PARTED, CLOSURES_WIDE_APART) - CLOSURES_PARTED);
   closure -= RULE_ROUNDED * fmax(0.0, CLOSURES_ROUNDED - width);
-  closure -= closure_doubt(&face->rest, frame->time_s, frame->closure);
-  double share = smooth_step(0.5 + 0.5 * closure / RULE_DOUBT);
-  const double before = face->shares[0], newest = face->shares[1];
-  if (before < LEARNED_CLOSED_FRACTION && LEARNED_CLOSED_FRACTION <= newest) share = fmax(share, newest);
-  face->shares[0] = newest;
-  face->shares[1] = share;
-  move_to_rest(faps, share);
+  closure -= doubt_at(&face->rest, frame->time_s, frame->closure);
+  double amount = smooth_step(0.5 + 0.5 * closure / RULE_DOUBT);
+  const double before = face->closing[0], newest = face->closing[1];
+  if (before < LEARNED_CLOSED_FRACTION && LEARNED_CLOSED_FRACTION <= newest) amount = fmax(amount, newest);
+  face->closing[0] = newest;
+  face->closing[1] = amount;
+  move_to_rest(faps, amount);
 }
 
 static void extend_track(Face *face, double time_s) {

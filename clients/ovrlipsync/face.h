@@ -33,7 +33,7 @@ typedef struct {
   double time_s, level_db;
 } Level;
 
-/* Lips in pauses: the share of the mouth that is ajar. */
+/* Lips in pauses: how far the mouth is ajar. */
 typedef struct {
   Level levels[MAX_LEVELS]; /* of future frames */
   int num_levels;
@@ -48,7 +48,7 @@ typedef struct {
   LipFrame queue[MAX_QUEUE]; /* frames that are not due yet */
   int num_queued;
   double stable[NUM_MOUTH_FAPS]; /* the last lip frame, stabilized */
-  double shares[2];              /* closure shares of the last two lip frames */
+  double closing[2];             /* closure fractions of the last two lip frames */
   bool has_lip_frames, is_speaking;
   Track track;
   Mouth on_track, mouth; /* the track and the mouth at the last frame */

@@ -69,8 +69,8 @@ static bool resampler_init(Resampler *r, int rate_hz) {
     double sum = 0.0;
     for (int pass = 0; pass < 2; pass++) {
       for (int tap = 0; tap < 2 * r->half; tap++) {
-        const double time = (double)phase / r->up - (tap + 1 - r->half), share = time / r->half;
-        const double weight = sinc(lower * RESAMPLE_CUTOFF * time) * bessel(RESAMPLE_KAISER_BETA * sqrt(fmax(0.0, 1.0 - share * share)));
+        const double time = (double)phase / r->up - (tap + 1 - r->half), ratio = time / r->half;
+        const double weight = sinc(lower * RESAMPLE_CUTOFF * time) * bessel(RESAMPLE_KAISER_BETA * sqrt(fmax(0.0, 1.0 - ratio * ratio)));
         if (pass == 0) sum += weight;
         else row[tap] = (float)(weight / sum);
       }
@@ -86,12 +86,12 @@ static void resampler_reset(Resampler *r) {
   r->num_out = 0;
 }
 
-static void take_sample(Lips *lips, float sample);
+static void process_sample(Lips *lips, float sample);
 
 static void resample(Lips *lips, const float *samples, int num_samples) {
   Resampler *r = &lips->resampler;
   if (r->up == r->down) {
-    for (int i = 0; i < num_samples; i++) take_sample(lips, samples[i]);
+    for (int i = 0; i < num_samples; i++) process_sample(lips, samples[i]);
     return;
   }
   memcpy(r->known + r->num_known, samples, num_samples * sizeof(float));
@@ -102,7 +102,7 @@ static void resample(Lips *lips, const float *samples, int num_samples) {
     const float *known = r->known + (position / r->up - r->half + 1 - r->first);
     double total = 0.0;
     for (int tap = 0; tap < 2 * r->half; tap++) total += (double)filter[tap] * known[tap];
-    take_sample(lips, (float)total);
+    process_sample(lips, (float)total);
   }
   int64_t drop = (r->num_out * r->down) / r->up - r->half + 1 - r->first;
   if (drop > r->num_known) drop = r->num_known;
@@ -180,8 +180,8 @@ static void analyze_slice(Lips *lips) {
 
 static double media_time_s(const Lips *lips) { return (double)lips->num_samples / MEDIA_RATE_HZ; }
 
-/* Take a sample at 16 kHz. After 20 ms, make the faces that are due. */
-static void take_sample(Lips *lips, float sample) {
+/* Process a sample at 16 kHz. After 20 ms, compute the faces that are due. */
+static void process_sample(Lips *lips, float sample) {
   lips->slice[lips->num_in_slice++] = sample;
   if (lips->num_in_slice < SLICE) return;
   double power = 0.0;

@@ -83,7 +83,7 @@ TITLES = {"arkit": "ARKit", "oculus": "Oculus", "vrm": "VRM"}
 SEPARATOR = re.compile(r"[._:|/\- ]|eCTRL|(?<=[a-z])(?=[A-Z])")
 
 
-def sided(name):
+def spell_out_side(name):
     """Remove a number at the end of a name, and write the side before it as a word."""
     name = re.sub(r"[._ ](div)?\d+$", "", name)  # Blender appends .001, Daz _div2
     name = re.sub(r"([._\- ][Ll]|(?<=[a-z])L)$", "Left", name)
@@ -96,11 +96,11 @@ def to_key(name):
 
 
 def candidates(name):
-    """Return the keys of a name without none, one, two, ... words at its beginning."""
-    name = sided(name)
-    rests = [(found[0], to_key(name[found.end() :])) for found in SEPARATOR.finditer(name)]
-    least = {"": 7, **dict.fromkeys(".:|/", 0)}  # letters of a name after this separator
-    return [to_key(name), *(key for mark, key in rests if len(key) >= least.get(mark, 2))]
+    """Return the keys of a name: of all its words, and of those after each separator."""
+    name = spell_out_side(name)
+    endings = [(match[0], to_key(name[match.end() :])) for match in SEPARATOR.finditer(name)]
+    min_letters = {"": 7, **dict.fromkeys(".:|/", 0)}  # letters of a name after this separator
+    return [to_key(name), *(key for mark, key in endings if len(key) >= min_letters.get(mark, 2))]
 
 
 def read_table():
@@ -112,7 +112,7 @@ def read_table():
             entries = sets[words.pop(0)] = []
         for word in words:
             choices = [choice.split("+") for choice in word.lstrip("*").split("=")]
-            keys = [[to_key(sided(part)) for part in parts] for parts in choices]
+            keys = [[to_key(spell_out_side(part)) for part in parts] for parts in choices]
             entries.append((choices[0][0], keys, word.startswith("*")))
     return sets
 
@@ -143,7 +143,7 @@ def shape_keys(set_name):
     return keys
 
 
-def problem(set_name):
+def find_problem(set_name):
     """Return why weights of a set cannot move the scene, or an empty text."""
     missing, penalty, speaking = {}, {}, []
     for name, entries in SETS.items():
@@ -243,7 +243,7 @@ class KOUXING_OT_follow(bpy.types.Operator):
         if RECEIVER.socket is not None:
             RECEIVER.close()
             return {"FINISHED"}
-        if text := problem("arkit"):
+        if text := find_problem("arkit"):
             self.report({"ERROR"}, text)
             return {"CANCELLED"}
         try:
@@ -272,7 +272,7 @@ class KOUXING_OT_insert(bpy.types.Operator, ImportHelper):
         except (OSError, KeyError, ValueError, IndexError, StopIteration) as error:
             self.report({"ERROR"}, f"{self.filepath} is not a file of weights: {error}")
             return {"CANCELLED"}
-        if text := problem(set_name):
+        if text := find_problem(set_name):
             self.report({"ERROR"}, text)
             return {"CANCELLED"}
         keys = shape_keys(set_name)

@@ -24,8 +24,8 @@ const { vrm, renderer } = await start().catch((error) => {
   throw error;
 });
 const expressions = vrm.expressionManager;
-const moving = (expressions?.expressions ?? []).filter(({ binds }) => binds.length > 0); // some exporters write empty ones
-const nameOf = new Map(moving.map(({ expressionName }) => [plain(expressionName), expressionName]));
+const activeExpressions = (expressions?.expressions ?? []).filter(({ binds }) => binds.length > 0); // some exporters write empty ones
+const nameOf = new Map(activeExpressions.map(({ expressionName }) => [normalizeName(expressionName), expressionName]));
 const head = vrm.humanoid.getNormalizedBoneNode("head");
 const forward = vrm.meta.metaVersion === "0" ? -1 : 1; // the bones of version 0 look along -z
 const scene = new THREE.Scene();
@@ -56,13 +56,13 @@ async function start() {
 }
 
 /** Return one name for JawOpen and jawOpen, mouthSmile_L and mouthSmileLeft. */
-function plain(name) {
+function normalizeName(name) {
   return name.replace(/_L$/i, "Left").replace(/_R$/i, "Right").toLowerCase();
 }
 
 /** Return the names of a set that no expression has. */
-function missing(names) {
-  return names.filter((name) => !nameOf.has(plain(name)));
+function missingNames(names) {
+  return names.filter((name) => !nameOf.has(normalizeName(name)));
 }
 
 /** Follow the session; reconnect while the page is open. */
@@ -71,10 +71,10 @@ function connect() {
   url.searchParams.set("session", query.get("session") ?? "");
   url.searchParams.set("token", query.get("token") ?? "");
   // Avatars with "Perfect Sync" have ARKit's 52 shapes, others have only VRM's shapes.
-  const isPerfect = missing(ARKIT_NEEDED).length === 0;
-  const unknown = missing(VRM_NEEDED);
-  if (!isPerfect && unknown[0] === "aa") {
-    note.textContent = `the avatar cannot speak: it has no shape ${unknown.join(", ")} of VRM; use an avatar with the shapes of ARKit, Oculus or VRM`;
+  const isPerfect = missingNames(ARKIT_NEEDED).length === 0;
+  const missingShapes = missingNames(VRM_NEEDED);
+  if (!isPerfect && missingShapes[0] === "aa") {
+    note.textContent = `the avatar cannot speak: it has no shape ${missingShapes.join(", ")} of VRM; use an avatar with the shapes of ARKit, Oculus or VRM`;
     return;
   }
   url.searchParams.set("shapes", isPerfect ? "arkit" : "vrm");
@@ -100,7 +100,7 @@ function connect() {
 }
 
 function show(names, weights) {
-  names.forEach((name, index) => expressions.setValue(nameOf.get(plain(name)), weights[index]));
+  names.forEach((name, index) => expressions.setValue(nameOf.get(normalizeName(name)), weights[index]));
 }
 
 function rotateHead(faps) {

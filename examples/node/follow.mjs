@@ -11,18 +11,18 @@ import { setTimeout as sleep } from "node:timers/promises";
 import { ask, connectControl, read, subscribe } from "./kouxing.mjs";
 
 const JAW_OPEN = 24; // index in ARKit's names
-const [wanted = "", controlAddress] = process.argv.slice(2);
+const [sessionName = "", controlAddress] = process.argv.slice(2);
 
 /** Return whether a frame is newer than another. After a move some frames arrive twice. */
-function isAfter(one, other) {
-  return one.media_time > other.media_time
-    || (one.media_time === other.media_time && one.sequence > other.sequence);
+function isNewer(frame, other) {
+  return frame.media_time > other.media_time
+    || (frame.media_time === other.media_time && frame.sequence > other.sequence);
 }
 
-/** Wait for the wanted session, or for any session; return it or the newest. */
+/** Wait for the named session, or for any session; return it, or the newest. */
 async function findSession(control) {
   for (;;) {
-    const [, { sessions = [] }] = await ask(control, "status-request", wanted); // an error has no sessions
+    const [, { sessions = [] }] = await ask(control, "status-request", sessionName); // an error has no sessions
     const open = sessions.filter(({ endpoints }) => "faps" in endpoints);
     if (open.length > 0) return open.reduce((a, b) => (a.age_s < b.age_s ? a : b));
     await sleep(500);
@@ -39,7 +39,7 @@ async function follow(endpoint) {
       await ask(control, "set-face", session, { face: { shapes: ["arkit"] } });
       console.log("following", session);
       face.unsubscribe(`joined/${session}/`); // it arrives for every subscriber that joins
-    } else if (body.shapes?.arkit && isAfter(body, newest)) {
+    } else if (body.shapes?.arkit && isNewer(body, newest)) {
       newest = body;
       const weights = new Float32Array(new Uint8Array(body.shapes.arkit).buffer); // 52
       console.log((body.media_time / 16000).toFixed(3), weights[JAW_OPEN].toFixed(2));

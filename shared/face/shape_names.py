@@ -81,7 +81,7 @@ def _key(name: str) -> str:
     return _SEPARATOR.sub("", name).lower()
 
 
-def _sided(name: str) -> str:
+def _spell_out_side(name: str) -> str:
     """Remove a number at the end, and write the side before it as a word."""
     name = re.sub(r"[._ ](div)?\d+$", "", name)  # Blender appends .001, Daz _div2
     return re.sub(
@@ -94,7 +94,7 @@ def _sided(name: str) -> str:
 @lru_cache(maxsize=1024)
 def _candidates(name: str) -> list[str]:
     """Return the keys of a name without none, one, two, ... words at its beginning."""
-    name = _sided(name)
+    name = _spell_out_side(name)
     keys = [_key(name)]
     for separator in _SEPARATOR.finditer(name):
         key = _key(name[separator.end() :])
@@ -117,7 +117,7 @@ def _read_table() -> tuple[dict[str, dict[str, list[list[str]]]], dict[str, list
         for word in words:
             choices = word.lstrip("*").split("=")
             table[set_name][choices[0]] = [
-                [_key(_sided(part)) for part in choice.split("+")] for choice in choices
+                [_key(_spell_out_side(part)) for part in choice.split("+")] for choice in choices
             ]
             if word.startswith("*"):
                 needed[set_name].append(choices[0])

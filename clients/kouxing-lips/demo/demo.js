@@ -8,7 +8,7 @@ const AVATAR = /\.(vrm|glb)$/i;
 const byId = (id) => document.getElementById(id);
 const [face, note, voice] = [byId("face"), byId("note"), byId("phones")];
 let comparison = null; // the newest one: { rivals: [{ face, lips: input and FAPs }], empty while they load }
-let followed = null; // audio node that the rivals follow
+let comparedNode = null; // audio node whose sound the rivals receive
 
 for (const head of HEADS) {
   const button = document.createElement("button");
@@ -24,7 +24,7 @@ face.addEventListener("notice", ({ detail }) => (note.textContent = detail));
 face.addEventListener("error", ({ message }) => (note.textContent = message));
 
 byId("microphone").onclick = () =>
-  act(async (lips) => {
+  runAction(async (lips) => {
     if (byId("microphone").ariaPressed === "true") {
       lips.stop();
       setMicrophone(false);
@@ -33,11 +33,11 @@ byId("microphone").onclick = () =>
     await lips.listenToMicrophone();
     setMicrophone(true);
   });
-byId("final").onclick = () => act(setFinalPhones);
-byId("compare").onclick = () => act(comparison ? stopComparing : startComparing);
-byId("sample").onclick = () => act((lips) => play(lips, "sample.wav"));
+byId("final").onclick = () => runAction(setFinalPhones);
+byId("compare").onclick = () => runAction(comparison ? stopComparing : startComparing);
+byId("sample").onclick = () => runAction((lips) => play(lips, "sample.wav"));
 byId("file").onchange = ({ target }) => {
-  take(target.files[0]);
+  openFile(target.files[0]);
   target.value = "";
 };
 
@@ -49,7 +49,7 @@ document.body.ondragleave = () => document.body.classList.remove("dropping");
 document.body.ondrop = (event) => {
   event.preventDefault();
   document.body.classList.remove("dropping");
-  take(event.dataTransfer.files[0]);
+  openFile(event.dataTransfer.files[0]);
 };
 
 prepare();
@@ -128,9 +128,9 @@ async function startComparing(lips) {
 function stopComparing() {
   for (const { face: rival, lips: { node } } of comparison.rivals) {
     rival.remove();
-    followed?.disconnect(node);
+    comparedNode?.disconnect(node);
   }
-  followed = null;
+  comparedNode = null;
   setComparison(null);
 }
 
@@ -151,18 +151,18 @@ function setRivalHeads() {
 function showRivals(lips, shown) {
   if (comparison !== shown) return;
   requestAnimationFrame(() => showRivals(lips, shown));
-  if (lips.node !== followed) {
+  if (lips.node !== comparedNode) {
     for (const { lips: { node } } of shown.rivals) {
-      followed?.disconnect(node);
+      comparedNode?.disconnect(node);
       lips.node?.connect(node);
     }
-    followed = lips.node;
+    comparedNode = lips.node;
   }
   for (const { face: rival, lips: rivalLips } of shown.rivals) rival.show(rivalLips.faps());
 }
 
 /** Run an action on the lip sync; show its error message. */
-async function act(action) {
+async function runAction(action) {
   note.textContent = "";
   try {
     await action(await face.lips);
@@ -183,23 +183,24 @@ async function play(lips, url) {
   await lips.listenTo(buffer);
 }
 
-/** Show an avatar file, or play a sound file. */
-function take(file) {
+/** Show an avatar, or play a sound. */
+function openFile(file) {
   if (!file) return;
   const url = URL.createObjectURL(file);
   if (AVATAR.test(file.name)) {
-    choose("");
+    markHead("");
     face.setAttribute("src", url);
-  } else act((lips) => play(lips, url));
+  } else runAction((lips) => play(lips, url));
 }
 
 function showHead(head) {
-  choose(head);
+  markHead(head);
   face.setAttribute("src", `heads/${head}.glb`);
   setRivalHeads();
 }
 
-function choose(head) {
+/** Mark the button of a head; no button for "". */
+function markHead(head) {
   note.textContent = "";
   for (const button of byId("heads").children) button.ariaChecked = String(button.dataset.head === head);
 }

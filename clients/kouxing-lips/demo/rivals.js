@@ -12,7 +12,7 @@ export async function headAudio(context) {
   const node = new HeadAudio(context);
   await node.loadModel(file("model-en-mixed.bin"));
   const weights = {};
-  node.onvalue = (name, weight) => (weights[shapeOf(name)] = weight);
+  node.onvalue = (name, weight) => (weights[visemeOf(name)] = weight);
   const mix = await mixer();
   let lastMs = performance.now();
   return {
@@ -51,13 +51,13 @@ export async function wawa(context) {
     node,
     faps() {
       lips.processAudio();
-      return mix({ [shapeOf(lips.viseme)]: 1 });
+      return mix({ [visemeOf(lips.viseme)]: 1 });
     },
   };
 }
 
-/** Return the shape of a name such as viseme_I. */
-function shapeOf(name) {
+/** Return the Oculus viseme of a name such as viseme_I. */
+function visemeOf(name) {
   const viseme = name.replace("viseme_", "");
   return VOWELS[viseme] ?? viseme;
 }

@@ -3,27 +3,27 @@
 // The network holds the state of one session at a time.
 
 export class BlockScorer {
-  /** Scores of the frames after the settled ones; a change is a new array. */
+  /** Scores of the frames after the settled ones; each change creates a new array. */
   #provisional = [];
-  #c; // constants
+  #constants;
   #network;
   #logPrior;
   #scale;
   #sizes; // block, length, past: positions
   #rings; // keys and values of each layer
-  #table; // of positions
+  #table; // encodings of the positions
   #frames; // from the next block's first on
   #numFrames; // number of frames of the speech
   #numSettled;
-  #settled; // not yet returned
-  #loudest; // band of the speech
+  #settled; // scores not yet returned
+  #highestBand; // of the speech, for the floor
   #hasEnded;
   #row; // row of the table for the next block
-  #numDue; // positions that the next run needs
+  #numNeeded; // positions that the next run needs
   #numCached;
 
   constructor({ blocks, phoneArrays, phones, constants }) {
-    this.#c = { ...constants.blocks, ...constants.network, floorBands: constants.mel.FLOOR_BANDS };
+    this.#constants = { ...constants.blocks, ...constants.network, floorBands: constants.mel.FLOOR_BANDS };
     this.#network = blocks;
     this.#logPrior = phoneArrays.block_log_prior.values;
     this.#scale = Math.fround(phones.acousticScale);
@@ -41,29 +41,29 @@ export class BlockScorer {
     this.#provisional = [];
     this.#settled = [];
     this.#numFrames = this.#numSettled = 0;
-    this.#loudest = -Infinity;
-    this.#frames = Array.from({ length: this.#c.PADDING }, () => new Float32Array(this.#numMels));
+    this.#highestBand = -Infinity;
+    this.#frames = Array.from({ length: this.#constants.PADDING }, () => new Float32Array(this.#numMels));
     this.#hasEnded = false;
     this.#startTable();
   }
 
-  /** Take the last frames of some positions; return the new settled scores and the provisional scores. */
+  /** Process the last frames of some positions; return the new settled scores and the provisional scores. */
   accept(positions, numFrames) {
     const size = this.#numMels;
     const frames = positions.flatMap(({ features }) => [features.slice(0, size), features.slice(size, 2 * size)]);
     for (const frame of frames.slice(-numFrames)) {
       this.#numFrames++;
-      this.#loudest = frame.reduce((most, band) => Math.max(most, band), this.#loudest);
-      const floor = Math.fround(this.#loudest - this.#c.floorBands);
+      this.#highestBand = frame.reduce((highest, band) => Math.max(highest, band), this.#highestBand);
+      const floor = Math.fround(this.#highestBand - this.#constants.floorBands);
       this.#frames.push(frame.map((band) => Math.max(band, floor)));
     }
-    while (this.#numPositions >= this.#numDue) this.#run();
+    while (this.#numPositions >= this.#numNeeded) this.#run();
     return { settled: this.#takeSettled(), provisional: this.#provisional };
   }
 
   /** End the speech; return the scores of the remaining frames. */
   finish() {
-    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#c;
+    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#constants;
     const numMore = this.#numFrames ? SEEN_AFTER - ((this.#numFrames - 1) % FRAMES_PER_POSITION) : 0;
     this.#frames.push(...Array(numMore).fill(this.#frames.at(-1)));
     this.#hasEnded = true;
@@ -78,14 +78,14 @@ export class BlockScorer {
 
   /** Number of complete positions, from the next block's first on. */
   get #numPositions() {
-    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#c;
+    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#constants;
     return Math.max(0, Math.floor((this.#frames.length - 1 - SEEN_AFTER) / FRAMES_PER_POSITION));
   }
 
   #startTable() {
     const { length, block } = this.#sizes;
     this.#row = this.#numCached = 0;
-    this.#numDue = length % block || block;
+    this.#numNeeded = length % block || block;
     this.#network.values("state").fill(0);
     for (const ring of this.#rings) ring.fill(0);
   }
@@ -99,14 +99,14 @@ export class BlockScorer {
 
   /** Compute the next block and its right context. */
   #run() {
-    const { FRAMES_PER_POSITION, PADDING, MAX_POSITIONS } = this.#c;
+    const { FRAMES_PER_POSITION, PADDING, MAX_POSITIONS } = this.#constants;
     const { block, length } = this.#sizes;
     const numComplete = this.#numPositions;
-    let numPositions = Math.min(numComplete, this.#numDue);
-    const most = Math.min(length, MAX_POSITIONS - this.#row);
-    if (numPositions < most) {
+    let numPositions = Math.min(numComplete, this.#numNeeded);
+    const maxPositions = Math.min(length, MAX_POSITIONS - this.#row);
+    if (numPositions < maxPositions) {
       // one run replaces several runs that settle nothing
-      const numMore = Math.min(numComplete, most) - numPositions;
+      const numMore = Math.min(numComplete, maxPositions) - numPositions;
       numPositions += Math.floor(numMore / block) * block;
     }
     const isLast = this.#row + numPositions === MAX_POSITIONS || (this.#hasEnded && numPositions === numComplete);
@@ -120,8 +120,8 @@ export class BlockScorer {
       this.#startTable();
       return;
     }
-    if (numKept) this.#keep(numKept);
-    this.#numDue = Math.min(numPositions - numKept + block, MAX_POSITIONS - this.#row);
+    if (numKept) this.#storeContext(numKept);
+    this.#numNeeded = Math.min(numPositions - numKept + block, MAX_POSITIONS - this.#row);
   }
 
   /** Run the network; return the scores of the states, a row for each frame. */
@@ -137,15 +137,15 @@ export class BlockScorer {
     network.run();
     const logPosteriors = network.values("log_posteriors");
     const numStates = this.#logPrior.length;
-    return Array.from({ length: this.#c.FRAMES_PER_POSITION * numPositions }, (_, row) => {
+    return Array.from({ length: this.#constants.FRAMES_PER_POSITION * numPositions }, (_, row) => {
       const scores = logPosteriors.slice(row * numStates, (row + 1) * numStates);
       for (let i = 0; i < numStates; i++) scores[i] = this.#scale * Math.fround(scores[i] - this.#logPrior[i]);
       return scores;
     });
   }
 
-  /** Keep the state, and the keys and values, after the first positions of the block. */
-  #keep(numKept) {
+  /** Store the state, and the keys and values, after the first positions of the block. */
+  #storeContext(numKept) {
     const { past } = this.#sizes;
     const [, , numHeads, numNew, size] = this.#network.shape("new");
     const values = this.#network.values("new");

@@ -2,13 +2,13 @@
 
 /** The recognized phones of one kind of closure: "b" (b p m) or "f". */
 export class ClosingPhones {
-  #c; // constants
+  #constants;
   #rule;
   #symbols;
   #phones = new Map(); // by index: { phone, knownS }
 
   constructor({ constants, closureRule, phones }, viseme) {
-    this.#c = constants.closures;
+    this.#constants = constants.closures;
     this.#rule = closureRule;
     this.#symbols = new Set(phones.closing[viseme]);
   }
@@ -29,16 +29,16 @@ export class ClosingPhones {
 
   /** Return the log odds of a closure that the phones add at a time. */
   logOddsAt(timeS) {
-    return [...this.#phones.values()].reduce((most, known) => Math.max(most, this.#logOddsOf(known, timeS)), 0);
+    return [...this.#phones.values()].reduce((highest, known) => Math.max(highest, this.#logOddsOf(known, timeS)), 0);
   }
 
   #logOddsOf({ phone, knownS }, timeS) {
-    const { HOLD_S, MAX_LATE_S, LATE_HOLD_S, EDGE_S } = this.#c;
-    const most = Math.min(logOddsOf(Math.max(phone.confidence, 0.5), this.#c), this.#rule.phone);
+    const { HOLD_S, MAX_LATE_S, LATE_HOLD_S, EDGE_S } = this.#constants;
+    const highest = Math.min(logOddsOf(Math.max(phone.confidence, 0.5), this.#constants), this.#rule.phone);
     let endS = phone.onsetS + Math.min(phone.durationS, HOLD_S);
     if (knownS < phone.onsetS + MAX_LATE_S) endS = Math.max(endS, knownS + LATE_HOLD_S);
     const outsideS = Math.max(phone.onsetS - timeS, timeS - endS, 0);
-    return most * Math.max(0, 1 - outsideS / EDGE_S);
+    return highest * Math.max(0, 1 - outsideS / EDGE_S);
   }
 }
 

@@ -4,11 +4,11 @@ const NO_RECORD = -1;
 const NO_TOKEN = -1;
 
 export class Decoder {
-  #c; // constants
+  #constants;
   #lm;
   #hmms; // firstState, logStay, logLeave, lmScale, penalty, rateWeight, silence
-  #rate; // rate of change of the scores
-  #roots; // square roots of the phones' probabilities at the last frame
+  #changeRate; // how fast the probabilities of the phones change
+  #rootProbabilities; // square roots of the phones' probabilities at the last frame
   #maxStates;
   #context;
   #top;
@@ -21,10 +21,10 @@ export class Decoder {
   #numPhones;
 
   constructor(lm, hmms, { constants }) {
-    this.#c = constants.decoder;
+    this.#constants = constants.decoder;
     this.#lm = lm;
     this.#hmms = hmms;
-    const maxTokens = this.#c.MAX_TOKENS;
+    const maxTokens = this.#constants.MAX_TOKENS;
     const numPhones = hmms.firstState.length - 1;
     this.#maxStates = Math.max(...Array.from({ length: numPhones }, (_, phone) => this.#numStates(phone)));
     this.#context = new Int32Array(maxTokens);
@@ -34,23 +34,23 @@ export class Decoder {
     this.#tokenOf = new Int16Array(lm.phone.length).fill(NO_TOKEN);
     this.#entry = new Float32Array(maxTokens);
     this.#entryLink = new Int32Array(maxTokens);
-    this.#roots = new Float32Array(numPhones);
+    this.#rootProbabilities = new Float32Array(numPhones);
     this.#probabilities = new Float32Array(hmms.firstState[numPhones]);
     this.#numPhones = numPhones;
     this.reset();
   }
 
-  /** Start a new stretch of speech at frame 0. */
+  /** Restart at frame 0 of a new stretch of speech. */
   reset() {
     for (let token = 0; token < (this.numTokens ?? 0); token++) this.#tokenOf[this.#context[token]] = NO_TOKEN;
     this.numFrames = 0;
     this.numTokens = 0;
-    this.records = []; // { end, phone, before: number of another }
+    this.records = []; // { end, phone, before: index of the record of the phone before }
     this.shared = []; // segments that no later frame can change
     this.lastShared = NO_RECORD;
     this.best = [0, 0]; // token, and state of its phone
     this.confidence = 0;
-    this.#rate = this.#c.SLOW_RATE;
+    this.#changeRate = this.#constants.SLOW_RATE;
   }
 
   /** Continue from the state of another search. */
@@ -58,8 +58,8 @@ export class Decoder {
     for (let token = 0; token < this.numTokens; token++) this.#tokenOf[this.#context[token]] = NO_TOKEN;
     const { numFrames, numTokens, lastShared, best, confidence } = other;
     Object.assign(this, { numFrames, numTokens, lastShared, best, confidence, records: other.records.slice(), shared: other.shared.slice() });
-    this.#rate = other.#rate;
-    this.#roots.set(other.#roots);
+    this.#changeRate = other.#changeRate;
+    this.#rootProbabilities.set(other.#rootProbabilities);
     const numStates = numTokens * this.#maxStates;
     this.#context.set(other.#context.subarray(0, numTokens));
     this.#top.set(other.#top.subarray(0, numTokens));
@@ -94,7 +94,7 @@ export class Decoder {
     return this.#end(this.lastShared);
   }
 
-  /** Forget the phones before a frame. */
+  /** Drop the shared segments that start before a frame. */
   forgetBefore(frame) {
     this.shared = this.shared.filter(({ start }) => start >= frame);
   }
@@ -103,12 +103,12 @@ export class Decoder {
   finalPath() {
     if (this.numFrames === 0) return [];
     let [best, state] = this.best;
-    let highest = this.#c.IMPOSSIBLE;
+    let highest = this.#constants.IMPOSSIBLE;
     for (let token = 0; token < this.numTokens; token++) {
       const phone = this.#phoneOf(token);
       const last = this.#numStates(phone) - 1;
-      const ends = Math.fround(this.#score[token * this.#maxStates + last] + this.#hmms.logLeave[this.#hmms.firstState[phone + 1] - 1]);
-      if (ends > highest) [highest, best, state] = [ends, token, last];
+      const finalScore = Math.fround(this.#score[token * this.#maxStates + last] + this.#hmms.logLeave[this.#hmms.firstState[phone + 1] - 1]);
+      if (finalScore > highest) [highest, best, state] = [finalScore, token, last];
     }
     const link = this.#linkAt(best, state);
     const last = { phone: this.#phoneOf(best), start: this.#end(link), end: this.numFrames };
@@ -118,14 +118,14 @@ export class Decoder {
   /** Store the phones that all paths share, and drop records that no path needs. */
   dropRecords() {
     const [records, link, score] = [this.records, this.#link, this.#score];
-    const { IMPOSSIBLE } = this.#c;
-    const numPlaces = this.numTokens * this.#maxStates;
+    const { IMPOSSIBLE } = this.#constants;
+    const numStates = this.numTokens * this.#maxStates;
     const paths = new Int32Array(records.length);
     let numPaths = 0;
-    for (let place = 0; place < numPlaces; place++) {
-      if (score[place] <= IMPOSSIBLE) continue;
+    for (let index = 0; index < numStates; index++) {
+      if (score[index] <= IMPOSSIBLE) continue;
       numPaths++;
-      if (link[place] !== NO_RECORD) paths[link[place]]++;
+      if (link[index] !== NO_RECORD) paths[link[index]]++;
     }
     for (let number = paths.length - 1; number >= 0; number--) {
       const { before } = records[number];
@@ -142,8 +142,8 @@ export class Decoder {
       records[numKept++] = { end, phone, before: before === NO_RECORD ? NO_RECORD : numberOf[before] };
     }
     records.length = numKept;
-    for (let place = 0; place < numPlaces; place++) {
-      if (score[place] > IMPOSSIBLE && link[place] !== NO_RECORD) link[place] = numberOf[link[place]];
+    for (let index = 0; index < numStates; index++) {
+      if (score[index] > IMPOSSIBLE && link[index] !== NO_RECORD) link[index] = numberOf[link[index]];
     }
     this.lastShared = shared === NO_RECORD ? NO_RECORD : numberOf[shared];
   }
@@ -163,7 +163,7 @@ export class Decoder {
   /** Drop the tokens outside the beam. */
   #prune() {
     for (let token = 0; token < this.numTokens; ) {
-      if (this.#top[token] >= -this.#c.BEAM) {
+      if (this.#top[token] >= -this.#constants.BEAM) {
         token++;
         continue;
       }
@@ -182,11 +182,11 @@ export class Decoder {
     }
   }
 
-  /** Update the rate of change by a frame's scores; return the penalty of phones that start. */
+  /** Update the rate of change with the scores of a frame; return the penalty of phones that start. */
   #phonePenalty(scores) {
-    const { SLOW_RATE, RATE_FRAMES, MAX_PENALTY_CHANGE } = this.#c;
+    const { SLOW_RATE, RATE_FRAMES, MAX_PENALTY_CHANGE } = this.#constants;
     const { firstState, penalty, rateWeight } = this.#hmms;
-    const [probabilities, roots] = [this.#probabilities, this.#roots];
+    const [probabilities, roots] = [this.#probabilities, this.#rootProbabilities];
     let highest = -Infinity;
     for (let state = 0; state < scores.length; state++) if (scores[state] > highest) highest = scores[state];
     let total = 0;
@@ -202,40 +202,40 @@ export class Decoder {
       overlap += root * roots[phone];
       roots[phone] = root;
     }
-    if (this.numFrames) this.#rate += (1 - overlap - this.#rate) / RATE_FRAMES;
-    const change = rateWeight * (this.#rate - SLOW_RATE);
+    if (this.numFrames) this.#changeRate += (1 - overlap - this.#changeRate) / RATE_FRAMES;
+    const change = rateWeight * (this.#changeRate - SLOW_RATE);
     return Math.fround(penalty + Math.min(Math.max(change, -MAX_PENALTY_CHANGE), MAX_PENALTY_CHANGE));
   }
 
   /** Record the phones that may end before the frame, and start the phones that may follow. */
   #startPhones(penalty) {
-    const { BEAM, IMPOSSIBLE } = this.#c;
+    const { BEAM, IMPOSSIBLE } = this.#constants;
     this.#entry.fill(IMPOSSIBLE);
     if (this.numFrames === 0) {
-      this.#continueFrom(this.#hmms.silence + 1, 0, NO_RECORD, penalty); // speech starts after a pause
+      this.#enterPhones(this.#hmms.silence + 1, 0, NO_RECORD, penalty); // speech starts after a pause
       return;
     }
     const numTokens = this.numTokens;
     for (let token = 0; token < numTokens; token++) {
       const phone = this.#phoneOf(token);
       const last = this.#numStates(phone) - 1;
-      const leaving = Math.fround(this.#score[token * this.#maxStates + last] + this.#hmms.logLeave[this.#hmms.firstState[phone + 1] - 1]);
-      if (leaving < -BEAM) continue;
+      const exitScore = Math.fround(this.#score[token * this.#maxStates + last] + this.#hmms.logLeave[this.#hmms.firstState[phone + 1] - 1]);
+      if (exitScore < -BEAM) continue;
       this.records.push({ end: this.numFrames, phone, before: this.#linkAt(token, last) });
-      this.#continueFrom(this.#context[token], leaving, this.records.length - 1, penalty);
+      this.#enterPhones(this.#context[token], exitScore, this.records.length - 1, penalty);
     }
   }
 
   /** Enter all phones that may follow a context. */
-  #continueFrom(context, leaving, record, penalty) {
-    const { BEAM, IMPOSSIBLE, MAX_TOKENS } = this.#c;
+  #enterPhones(context, exitScore, record, penalty) {
+    const { BEAM, IMPOSSIBLE, MAX_TOKENS } = this.#constants;
     const { lmScale, silence } = this.#hmms;
     const [lm, tokenOf, entry] = [this.#lm, this.#tokenOf, this.#entry];
     const { logProbs, nextContexts } = lm;
     const row = lm.rowOf(context);
     for (let phone = 0; phone < this.#numPhones; phone++) {
       const logProb = this.numFrames === 0 && phone === silence ? 0 : logProbs[row + phone];
-      const candidate = Math.fround(Math.fround(leaving + Math.fround(lmScale * logProb)) + penalty);
+      const candidate = Math.fround(Math.fround(exitScore + Math.fround(lmScale * logProb)) + penalty);
       if (candidate < -BEAM) continue;
       const next = nextContexts[row + phone];
       if (tokenOf[next] === NO_TOKEN) {
@@ -247,17 +247,17 @@ export class Decoder {
         this.#score.fill(IMPOSSIBLE, begin, begin + this.#maxStates);
         this.#link.fill(NO_RECORD, begin, begin + this.#maxStates);
       }
-      const following = tokenOf[next];
-      if (candidate > entry[following]) {
-        entry[following] = candidate;
-        this.#entryLink[following] = record;
+      const nextToken = tokenOf[next];
+      if (candidate > entry[nextToken]) {
+        entry[nextToken] = candidate;
+        this.#entryLink[nextToken] = record;
       }
     }
   }
 
   /** Advance the paths within the phones by one frame; return the best token and its state. */
   #advanceStates(scores) {
-    const { IMPOSSIBLE } = this.#c;
+    const { IMPOSSIBLE } = this.#constants;
     const { firstState, logStay, logLeave } = this.#hmms;
     const [scoreOf, linkOf, top, maxStates] = [this.#score, this.#link, this.#top, this.#maxStates];
     let highest = IMPOSSIBLE;
@@ -267,21 +267,21 @@ export class Decoder {
       const phone = this.#phoneOf(token);
       const first = firstState[phone];
       const begin = token * maxStates;
-      let highestOfToken = IMPOSSIBLE;
+      let tokenScore = IMPOSSIBLE;
       for (let state = firstState[phone + 1] - first - 1; state >= 0; state--) {
         let value = Math.fround(scoreOf[begin + state] + logStay[first + state]);
         let link = linkOf[begin + state];
-        const moved = state ? Math.fround(scoreOf[begin + state - 1] + logLeave[first + state - 1]) : this.#entry[token];
-        if (moved > value) {
-          value = moved;
+        const entered = state ? Math.fround(scoreOf[begin + state - 1] + logLeave[first + state - 1]) : this.#entry[token];
+        if (entered > value) {
+          value = entered;
           link = state ? linkOf[begin + state - 1] : this.#entryLink[token];
         }
         const sum = Math.fround(value + scores[first + state]);
         const score = sum > IMPOSSIBLE ? sum : IMPOSSIBLE;
         scoreOf[begin + state] = score;
         linkOf[begin + state] = link;
-        if (score > highestOfToken) {
-          highestOfToken = score;
+        if (score > tokenScore) {
+          tokenScore = score;
           if (score > highest) {
             highest = score;
             bestToken = token;
@@ -289,14 +289,14 @@ export class Decoder {
           }
         }
       }
-      top[token] = highestOfToken;
+      top[token] = tokenScore;
     }
     return [bestToken, bestState];
   }
 
   /** Subtract the best score, so that numbers stay small; return the last phone's confidence. */
   #normalize() {
-    const { BEAM, IMPOSSIBLE } = this.#c;
+    const { BEAM, IMPOSSIBLE } = this.#constants;
     const [scoreOf, top, maxStates] = [this.#score, this.#top, this.#maxStates];
     const [bestToken, bestState] = this.best;
     const best = scoreOf[bestToken * maxStates + bestState];
@@ -305,10 +305,10 @@ export class Decoder {
     for (let token = 0; token < this.numTokens; token++) {
       let before = NO_RECORD;
       const end = (token + 1) * maxStates;
-      for (let place = token * maxStates; place < end; place++) {
-        const score = scoreOf[place];
-        if (score === top[token]) before = this.#link[place];
-        if (score > IMPOSSIBLE) scoreOf[place] = score - best;
+      for (let index = token * maxStates; index < end; index++) {
+        const score = scoreOf[index];
+        if (score === top[token]) before = this.#link[index];
+        if (score > IMPOSSIBLE) scoreOf[index] = score - best;
       }
       top[token] -= best;
       if (top[token] <= -BEAM) continue;

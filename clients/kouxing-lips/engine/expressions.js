@@ -5,7 +5,7 @@ import { clamp, smoothingGain } from "./math.js";
 
 /** The current expressions of the face. */
 export class Expressions {
-  #c; // constants
+  #constants;
   #easeS; // time constant of each filter pole
   #faps; // FAPs of each expression at full strength
   #numFaps;
@@ -17,7 +17,7 @@ export class Expressions {
   #free = 1;
 
   constructor({ arrays, constants, expressionNames, numFaps }, easeS = constants.expression.EASE_S) {
-    this.#c = constants.expression;
+    this.#constants = constants.expression;
     this.#easeS = easeS;
     this.#numFaps = numFaps;
     this.#faps = Object.fromEntries(expressionNames.map((name) => [name, arrays[`expressions.${name}`].values]));
@@ -42,7 +42,7 @@ export class Expressions {
 
   /** Add the expressions to a frame, in place. */
   apply(faps, stepS, isSpeaking) {
-    const { FADE_S, FREE_S, BIND_S } = this.#c;
+    const { FADE_S, FREE_S, BIND_S } = this.#constants;
     const isHeld = this.#remainingS > 0;
     this.#remainingS -= stepS;
     if (isSpeaking) this.#free = Math.max(this.#free - stepS / BIND_S, 0);
@@ -52,11 +52,11 @@ export class Expressions {
     this.#halfway = this.#halfway.map((x, i) => x + gain * ((isHeld ? this.#goal[i] : 0) - x));
     this.#shown = this.#shown.map((x, i) => x + gain * (this.#halfway[i] - x));
     this.#mix(faps);
-    this.#isShown = this.#shown.some((x) => Math.abs(x) > this.#c.VISIBLE);
+    this.#isShown = this.#shown.some((x) => Math.abs(x) > this.#constants.VISIBLE);
   }
 
   #mix(faps) {
-    const { UPPER, LOWER, CLOSED, OPEN, WIDEST, WIDEST_JAW, JAW } = this.#c;
+    const { UPPER, LOWER, CLOSED, OPEN, WIDEST, WIDEST_JAW, JAW } = this.#constants;
     const added = this.#shown.slice();
     const gaps = UPPER.map((upper, i) => -(faps[upper] + faps[LOWER[i]]));
     const rooms = gaps.map((gap, i) => Math.min(gap, -faps[LOWER[i]], OPEN) - CLOSED);

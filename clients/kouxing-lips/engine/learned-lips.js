@@ -4,7 +4,7 @@
 import { ClosingPhones, logOddsOf } from "./closing-phones.js";
 import { clamp, smoothStep } from "./math.js";
 import { RestingLips } from "./resting-lips.js";
-import { LipTrack, Transition, add, still } from "./trajectory.js";
+import { LipTrack, Transition, add, stateAtRest } from "./trajectory.js";
 
 export class LearnedLips {
   #model;
@@ -33,8 +33,8 @@ export class LearnedLips {
     this.#neutral = model.mouthFaps.map(() => 0);
     this.#stable = this.#neutral;
     this.#track = new LipTrack(this.#neutral, model.constants.track);
-    this.#onTrack = this.#mouth = still(this.#neutral);
-    this.#transition = new Transition(still(this.#neutral), 1);
+    this.#onTrack = this.#mouth = stateAtRest(this.#neutral);
+    this.#transition = new Transition(stateAtRest(this.#neutral), 1);
     this.#resting = new RestingLips(model);
   }
 
@@ -104,13 +104,13 @@ export class LearnedLips {
     }
     const faps = this.#stable.slice();
     separateLips(faps, closures);
-    const amountOf = (logOdds) => smoothStep(0.5 + (0.5 * logOdds) / rule.doubt);
+    const fractionOf = (logOdds) => smoothStep(0.5 + (0.5 * logOdds) / rule.doubt);
     const teeth = this.#labiodentals.logOddsAt(frame.timeS) - TEETH_LOG_ODDS;
     const phones = this.#bilabials.logOddsAt(frame.timeS);
     let closure = closureLogOdds(faps, logOddsOf(frame.closure, closures), phones, rule, closures);
     closure -= this.#resting.doubtAt(frame.timeS, frame.closure, phones);
-    moveToRest(faps, amountOf(teeth), closures.LOWER, closures.LOWER_OUTER);
-    let closing = amountOf(closure);
+    moveToRest(faps, fractionOf(teeth), closures.LOWER, closures.LOWER_OUTER);
+    let closing = fractionOf(closure);
     const [before, newest] = this.#closing;
     if (before < CLOSED_FRACTION && CLOSED_FRACTION <= newest) closing = Math.max(closing, newest);
     this.#closing = [newest, closing];
@@ -139,13 +139,13 @@ function separateLips(faps, { UPPER, LOWER, BOTH }) {
 /** Move inner lips towards rest, and the outer lips by the same distance, in place. */
 function moveToRest(faps, amount, inner, outer) {
   inner.forEach((column, i) => {
-    const moved = amount * faps[column];
-    faps[column] -= moved;
-    faps[outer[i]] -= moved;
+    const shift = amount * faps[column];
+    faps[column] -= shift;
+    faps[outer[i]] -= shift;
   });
 }
 
-function isDifferent(one, other, epsilon) {
+function isDifferent(state, other, epsilon) {
   const differs = (x, y) => x.some((value, i) => Math.abs(value - y[i]) > epsilon);
-  return differs(one.value, other.value) || differs(one.velocity, other.velocity);
+  return differs(state.value, other.value) || differs(state.velocity, other.velocity);
 }

@@ -22,8 +22,8 @@ export class LipPredictor {
     this.#constants = constants.lips;
     this.#numMouthFaps = mouthFaps.length;
     const delaysS = Array.from(this.#weights.delays.values, (value) => Math.round(1e6 * value) / 1e6);
-    const inTime = delaysS.filter((delay) => delay + constants.lipFrames.POSITION_LAG_S <= delayS + 1e-6);
-    this.#delayS = inTime.at(-1) ?? delaysS[0];
+    const possibleDelaysS = delaysS.filter((delay) => delay + constants.lipFrames.POSITION_LAG_S <= delayS + 1e-6);
+    this.#delayS = possibleDelaysS.at(-1) ?? delaysS[0];
     const { projection, entry_weights, input_weights, state_weights, output_bias } = this.#weights;
     const entry = product(projection, entry_weights); // no activation separates these two layers
     const [numFeatures, width] = entry.shape;
@@ -46,7 +46,7 @@ export class LipPredictor {
     this.#arrays = {
       ...buffers,
       lastState: buffers.inputs.subarray(stateAt, stateAt + width),
-      entered: buffers.inputs.subarray(stateAt + width),
+      entryOutput: buffers.inputs.subarray(stateAt + width),
       weights: Object.fromEntries(Object.entries(matrices).map(([name, values]) => [name, stored(values)])),
       outputWeights: stored(outputs),
       outputBias: output_bias.values.subarray(delaysS.indexOf(this.#delayS) * numOutputs),
@@ -77,13 +77,13 @@ export class LipPredictor {
   /** Return the outputs at the delay, from features that stay unchanged. */
   #step(features) {
     const w = this.#weights;
-    const { centered, inputs, lastState, entered, fromInput, fromState, outputs, weights, outputWeights, outputBias } = this.#arrays;
+    const { centered, inputs, lastState, entryOutput, fromInput, fromState, outputs, weights, outputWeights, outputBias } = this.#arrays;
     const size = lastState.length;
     inputs.set(features);
     for (let i = 0; i < centered.length; i++) centered[i] = features[i] - w.feature_mean.values[i];
-    this.#multiply(centered, weights.entry, entered);
-    for (let i = 0; i < size; i++) entered[i] = Math.max(entered[i] + w.entry_bias.values[i], 0);
-    this.#multiply(entered, weights.input, fromInput);
+    this.#multiply(centered, weights.entry, entryOutput);
+    for (let i = 0; i < size; i++) entryOutput[i] = Math.max(entryOutput[i] + w.entry_bias.values[i], 0);
+    this.#multiply(entryOutput, weights.input, fromInput);
     this.#multiply(lastState, weights.state, fromState);
     for (let i = 0; i < fromInput.length; i++) {
       fromInput[i] += w.input_bias.values[i];
@@ -131,15 +131,15 @@ export class LipPredictor {
 }
 
 /** Return the product of two matrices. */
-export function product(one, other) {
-  const [rows, size, columns] = [...one.shape, other.shape[1]];
+export function product(left, right) {
+  const [rows, size, columns] = [...left.shape, right.shape[1]];
   const values = new Float32Array(rows * columns);
   const row = new Float64Array(columns);
   for (let i = 0; i < rows; i++) {
     row.fill(0);
     for (let k = 0, at = 0; k < size; k++) {
-      const factor = one.values[i * size + k];
-      for (let column = 0; column < columns; column++, at++) row[column] += factor * other.values[at];
+      const factor = left.values[i * size + k];
+      for (let column = 0; column < columns; column++, at++) row[column] += factor * right.values[at];
     }
     values.set(row, i * columns);
   }

@@ -9,8 +9,8 @@ export class LogMel {
   #bands; // weights of the bins from the first edge of each band
   #edges;
   #root; // square root of the size
-  #columns; // { cosines, sines } of 2 pi k n / root, (root, root)
-  #rotations; // { cosines, sines } of 2 pi k n / size, (root, root)
+  #columnWaves; // { cosines, sines } of 2 pi k n / root, (root, root)
+  #twiddles; // { cosines, sines } of 2 pi k n / size, (root, root)
   #windowed; // samples, (root, root)
   #real; // transforms of the columns, (root / 2 + 1, root)
   #imaginary;
@@ -32,7 +32,7 @@ export class LogMel {
       Float64Array.from({ length: root * root }, (_, i) => compute((2 * Math.PI * Math.floor(i / root) * (i % root)) / size));
     const waves = (size) => ({ cosines: wave(Math.cos, size), sines: wave(Math.sin, size) });
     this.#root = root;
-    [this.#columns, this.#rotations] = [waves(root), waves(this.#size)];
+    [this.#columnWaves, this.#twiddles] = [waves(root), waves(this.#size)];
     [this.#real, this.#imaginary] = [0, 0].map(() => new Float64Array((root / 2 + 1) * root));
     this.#windowed = new Float64Array(this.#size);
     this.#power = new Float64Array(this.#size / 2 + 1);
@@ -46,7 +46,7 @@ export class LogMel {
     const frames = [];
     let begin = 0;
     for (; begin + this.#size <= known.length; begin += this.#hop) {
-      frames.push(this.#bandsOf(this.#powers(known.subarray(begin, begin + this.#size))));
+      frames.push(this.#bandsOf(this.#powerSpectrum(known.subarray(begin, begin + this.#size))));
     }
     this.#samples = known.slice(begin);
     return frames;
@@ -67,11 +67,11 @@ export class LogMel {
    * Return the power spectrum. The samples are the rows of a square, whose columns and then rows are
    * transformed (Cooley & Tukey 1965). The columns are real, so half of their transform is enough.
    */
-  #powers(samples) {
+  #powerSpectrum(samples) {
     const [size, root, windowed, window] = [this.#size, this.#root, this.#windowed, this.#window];
     const [real, imaginary, power] = [this.#real, this.#imaginary, this.#power];
-    const { cosines, sines } = this.#columns;
-    const { cosines: rotationCosines, sines: rotationSines } = this.#rotations;
+    const { cosines, sines } = this.#columnWaves;
+    const { cosines: rotationCosines, sines: rotationSines } = this.#twiddles;
     const half = root / 2;
     for (let i = 0; i < size; i++) windowed[i] = window[i] * samples[i];
     for (let column = 0; column < root; column++) {
@@ -82,9 +82,9 @@ export class LogMel {
           re += windowed[at] * cosines[wave];
           im -= windowed[at] * sines[wave];
         }
-        const place = k * root + column;
-        real[place] = re * rotationCosines[place] + im * rotationSines[place];
-        imaginary[place] = im * rotationCosines[place] - re * rotationSines[place];
+        const index = k * root + column;
+        real[index] = re * rotationCosines[index] + im * rotationSines[index];
+        imaginary[index] = im * rotationCosines[index] - re * rotationSines[index];
       }
     }
     for (let k = 0; k <= half; k++) {

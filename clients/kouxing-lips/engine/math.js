@@ -48,7 +48,7 @@ export function frameTimeS(frame, model) {
   return wholeSamples(frame * HOP_S + (WINDOW_S - HOP_S) / 2, model);
 }
 
-/** Convert the bits of a 16-bit floating-point number to a number. */
+/** Convert the bits of a 16-bit floating-point number. */
 export function halfToFloat(half) {
   const sign = half & 0x8000 ? -1 : 1;
   const exponent = (half >> 10) & 31;

@@ -46,9 +46,9 @@ export async function loadModel(base, { phones = false } = {}) {
 }
 
 /** Return { shape, values } by name. */
-function unpack(blob, places) {
+function unpack(blob, entries) {
   return Object.fromEntries(
-    Object.entries(places).map(([name, { type, shape, begin }]) => {
+    Object.entries(entries).map(([name, { type, shape, begin }]) => {
       const size = shape.reduce((a, b) => a * b, 1);
       const stored = new ARRAYS[type](blob.buffer, blob.byteOffset + begin, size);
       return [name, { shape, values: type === "float16" ? floats(stored, halfToFloat) : stored }];

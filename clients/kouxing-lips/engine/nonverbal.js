@@ -4,7 +4,7 @@
 import { Expressions } from "./expressions.js";
 
 export class NonverbalSounds {
-  #c; // constants
+  #constants;
   #laughter;
   #breath;
   #levels = []; // progress events that have not acted yet
@@ -12,8 +12,8 @@ export class NonverbalSounds {
   #loudness = 0;
 
   constructor(model) {
-    this.#c = model.constants.nonverbal;
-    this.#laughter = new Expressions(model, this.#c.LAUGH_EASE_S);
+    this.#constants = model.constants.nonverbal;
+    this.#laughter = new Expressions(model, this.#constants.LAUGH_EASE_S);
     this.#breath = new Expressions(model);
   }
 
@@ -24,7 +24,7 @@ export class NonverbalSounds {
    *   voice: traits or undefined, levels: new progress events }
    */
   apply(faps, { timeS, knownS, stepS, isSpeaking, voice, levels }) {
-    const { HOLD_S, LEAD_S, LOUDNESS_DB, FORGET_DB_S, BREATH, SMILING, LOUD_NOTE } = this.#c;
+    const { HOLD_S, LEAD_S, LOUDNESS_DB, FORGET_DB_S, BREATH, SMILING, LOUD_NOTE } = this.#constants;
     this.#levels.push(...levels);
     this.#loudestDb -= FORGET_DB_S * stepS;
     while (this.#levels[0]?.timeS <= Math.min(knownS, timeS + LEAD_S)) {

@@ -22,7 +22,7 @@ export function readGraph(bytes) {
 
 /** Return [name, shape] of a ValueInfoProto. An axis without a size counts the sessions. */
 function readInput(bytes) {
-  const inner = (value, ...path) => path.reduce((found, field) => fields(found)[field][0], value);
+  const inner = (value, ...path) => path.reduce((values, field) => fields(values)[field][0], value);
   const { 1: dimensions } = fields(inner(bytes, 2, 1, 2)); // type, tensor, shape
   return [text(fields(bytes)[1]), dimensions.map((dimension) => fields(dimension)[1]?.[0] ?? 1)];
 }
@@ -39,14 +39,14 @@ function readNode(bytes) {
 
 function readAttribute(bytes) {
   const { 1: name, 2: float, 3: integer, 5: tensor, 8: integers } = fields(bytes);
-  return [text(name), tensor ? readTensor(tensor[0]).values : (integers && integersIn(integers)) ?? (float ?? integer)?.[0]];
+  return [text(name), tensor ? readTensor(tensor[0]).values : (integers && readIntegers(integers)) ?? (float ?? integer)?.[0]];
 }
 
 /** Return { shape, length, values }. */
 function readTensor(bytes) {
   const { 1: dimensions = [], 2: [type], 9: [raw] = [] } = fields(bytes);
   const copy = raw?.slice().buffer;
-  const shape = integersIn(dimensions);
+  const shape = readIntegers(dimensions);
   const tensor = (values) => ({ shape, length: values.length, values });
   if (type === FLOAT && copy) return tensor(new Float32Array(copy));
   if (type === HALF && copy) return tensor(Float32Array.from(new Uint16Array(copy), halfToFloat));
@@ -59,28 +59,28 @@ function readTensor(bytes) {
 /** Return the values of a message by field number: integers, or bytes. */
 function fields(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  const found = {};
+  const values = {};
   let at = 0;
   while (at < bytes.length) {
     let key;
-    [key, at] = varint(bytes, at);
+    [key, at] = readVarint(bytes, at);
     const kind = key % 8;
     let value;
-    if (kind === 0) [value, at] = varint(bytes, at);
+    if (kind === 0) [value, at] = readVarint(bytes, at);
     else if (kind === 1) [value, at] = [view.getFloat64(at, true), at + 8];
     else if (kind === 5) [value, at] = [view.getFloat32(at, true), at + 4];
     else if (kind === 2) {
       let length;
-      [length, at] = varint(bytes, at);
+      [length, at] = readVarint(bytes, at);
       value = bytes.subarray(at, at + length);
       at += length;
     } else throw new Error("this is not an ONNX file");
-    (found[Math.floor(key / 8)] ??= []).push(value);
+    (values[Math.floor(key / 8)] ??= []).push(value);
   }
-  return found;
+  return values;
 }
 
-function varint(bytes, at) {
+function readVarint(bytes, at) {
   let value = 0n;
   for (let shift = 0n; ; shift += 7n) {
     const byte = bytes[at++];
@@ -90,15 +90,15 @@ function varint(bytes, at) {
 }
 
 /** Return the integers of a repeated field, packed or not. */
-function integersIn(field) {
-  return field.flatMap((value) => (value instanceof Uint8Array ? integersOf(value) : [value]));
+function readIntegers(field) {
+  return field.flatMap((value) => (value instanceof Uint8Array ? unpackIntegers(value) : [value]));
 }
 
-function integersOf(bytes) {
+function unpackIntegers(bytes) {
   const integers = [];
   for (let at = 0; at < bytes.length; ) {
     let value;
-    [value, at] = varint(bytes, at);
+    [value, at] = readVarint(bytes, at);
     integers.push(value);
   }
   return integers;

@@ -2,7 +2,7 @@
 //
 // Each takes a node and its inputs. It returns { outputs, start, constants }: tensors, a function that
 // returns the computation once all tensors have their place in a ProductMemory, and more tensors to store.
-// A tensor is { shape, length, values }. One that is a part of another is { shape, length, of, offset }.
+// A tensor is { shape, length, values }. A view of another tensor is { shape, length, of, offset }.
 
 const LANES = 16; // values that products of 8-bit integers process together
 const MAX_BYTE = 255;
@@ -42,9 +42,9 @@ const BINARY = {
   },
   Max(out, at, count, x, xAt, xStep, y, yAt, yStep) {
     for (let i = 0; i < count; i++) {
-      const one = x[xAt + i * xStep];
-      const other = y[yAt + i * yStep];
-      out[at + i] = one > other ? one : other;
+      const left = x[xAt + i * xStep];
+      const right = y[yAt + i * yStep];
+      out[at + i] = left > right ? left : right;
     }
   },
   Less(out, at, count, x, xAt, xStep, y, yAt, yStep) {
@@ -62,7 +62,7 @@ function unary({ type }, [x]) {
 function activation(factor, offset) {
   return (_node, [x]) => {
     const out = tensorOf(x.shape);
-    const start = (memory) => () => memory.activate(placeOf(x), placeOf(out), out.length, factor, offset);
+    const start = (memory) => () => memory.activate(byteOffsetOf(x), byteOffsetOf(out), out.length, factor, offset);
     return { outputs: [out], start };
   };
 }
@@ -98,22 +98,22 @@ export const OPERATORS = {
   Sigmoid: activation(0.5, 0.5),
   Tanh: activation(1, 0),
   Softmax: rowwise((out, x, at, end) => {
-    const most = largest(x, at, end);
+    const max = maximum(x, at, end);
     let sum = 0;
-    for (let i = at; i < end; i++) sum += out[i] = Math.exp(x[i] - most);
+    for (let i = at; i < end; i++) sum += out[i] = Math.exp(x[i] - max);
     for (let i = at; i < end; i++) out[i] /= sum;
   }),
   LogSoftmax: rowwise((out, x, at, end) => {
-    const most = largest(x, at, end);
+    const max = maximum(x, at, end);
     let sum = 0;
-    for (let i = at; i < end; i++) sum += Math.exp(x[i] - most);
-    for (let i = at; i < end; i++) out[i] = x[i] - most - Math.log(sum);
+    for (let i = at; i < end; i++) sum += Math.exp(x[i] - max);
+    for (let i = at; i < end; i++) out[i] = x[i] - max - Math.log(sum);
   }),
   ReduceMax(_node, [x]) {
     const count = x.shape.at(-1);
     const out = tensorOf(x.shape.slice(0, -1));
     const start = () => () => {
-      for (let row = 0; row < out.length; row++) out.values[row] = largest(x.values, row * count, (row + 1) * count);
+      for (let row = 0; row < out.length; row++) out.values[row] = maximum(x.values, row * count, (row + 1) * count);
     };
     return { outputs: [out], start };
   },
@@ -145,15 +145,15 @@ export const OPERATORS = {
   Unsqueeze: (_node, [x, { values: axes }]) => {
     const shape = [...x.shape];
     for (const axis of axes) shape.splice(axis < 0 ? shape.length + 1 + axis : axis, 0, 1);
-    return { outputs: [partOf(x, shape)] };
+    return { outputs: [viewOf(x, shape)] };
   },
   Reshape: (_node, [x, { values: sizes }]) => {
     const known = sizes.reduce((product, size) => (size < 0 ? product : product * size), 1);
-    return { outputs: [partOf(x, sizes.map((size) => (size < 0 ? x.length / known : size)))] };
+    return { outputs: [viewOf(x, sizes.map((size) => (size < 0 ? x.length / known : size)))] };
   },
   // values are stored as 32-bit numbers, rounded to the type
   Cast({ attributes: { to } }, [x]) {
-    if (to !== HALF) return { outputs: [partOf(x, x.shape)] };
+    if (to !== HALF) return { outputs: [viewOf(x, x.shape)] };
     const out = tensorOf(x.shape);
     return { outputs: [out], start: () => () => roundToHalf(out.values, x.values) };
   },
@@ -181,34 +181,34 @@ export const OPERATORS = {
   Split({ attributes: { axis }, outputs }, [x, lengths]) {
     const at = axis === undefined ? 0 : axis < 0 ? x.shape.length + axis : axis;
     let begin = 0;
-    return joined(
+    return joinOperations(
       outputs.map((_name, i) => {
         const length = lengths?.values[i] ?? x.shape[at] / outputs.length;
         begin += length;
-        return picked(x, at, begin - length, begin, 1);
+        return sliceAxis(x, at, begin - length, begin, 1);
       }),
     );
   },
   Slice(_node, [x, begin, end, axis, step]) {
     const size = x.shape[axis.values[0]];
     const inside = (value) => Math.min(value < 0 ? value + size : value, size);
-    return picked(x, axis.values[0], inside(begin.values[0]), inside(end.values[0]), step?.values[0] ?? 1);
+    return sliceAxis(x, axis.values[0], inside(begin.values[0]), inside(end.values[0]), step?.values[0] ?? 1);
   },
   Gather({ attributes: { axis } }, [x, { values: [place] }]) {
-    const { outputs: [row], start } = picked(x, axis, place, place + 1, 1);
-    return { outputs: [partOf(row, row.shape.toSpliced(axis, 1)), row], start };
+    const { outputs: [row], start } = sliceAxis(x, axis, place, place + 1, 1);
+    return { outputs: [viewOf(row, row.shape.toSpliced(axis, 1)), row], start };
   },
   Transpose({ attributes: { perm } }, [x]) {
     const shape = perm.map((axis) => x.shape[axis]);
     const strides = stridesOf(x.shape);
-    return gathered(x, shape, perm.map((axis) => strides[axis]), 0);
+    return gather(x, shape, perm.map((axis) => strides[axis]), 0);
   },
   QuantizeLinear(_node, [x, scale, zero]) {
     const [rows, size] = [scale.length, x.length / scale.length];
     if (size % LANES) throw new Error(`the network has rows of ${size} values, which is not a multiple of ${LANES}`);
     const out = { shape: x.shape, rows, size, length: x.length, Type: Int16Array }; // without the zero point
     const start = (memory) => {
-      const places = [x, scale, out].map(placeOf);
+      const places = [x, scale, out].map(byteOffsetOf);
       return () => memory.quantize(...places, rows, size, -zero.values[0], MAX_BYTE - zero.values[0]);
     };
     return { outputs: [out], start };
@@ -224,7 +224,7 @@ export const OPERATORS = {
       }
       weights.values = null; // frees the copy from the file
       for (let column = 0; column < columns; column++) scales.values[column] = xScale.values[0] * columnScales.values[column];
-      const places = [x, matrix, scales, out].map(placeOf);
+      const places = [x, matrix, scales, out].map(byteOffsetOf);
       return () => memory.multiplyBytes(...places, x.rows, size, columns);
     };
     return { outputs: [out], constants: [matrix, scales], start };
@@ -244,13 +244,13 @@ function multiplyEach(x, y, columns, multiply) {
   const out = tensorOf([...x.shape.slice(0, -1), columns]);
   const start = (memory) => {
     const bytes = Float32Array.BYTES_PER_ELEMENT;
-    const each = Array.from({ length: x.length / rows / size }, (_, i) => [
-      placeOf(x) + i * rows * size * bytes,
-      placeOf(y) + i * size * columns * bytes,
-      placeOf(out) + i * rows * columns * bytes,
+    const matrixOffsets = Array.from({ length: x.length / rows / size }, (_, i) => [
+      byteOffsetOf(x) + i * rows * size * bytes,
+      byteOffsetOf(y) + i * size * columns * bytes,
+      byteOffsetOf(out) + i * rows * columns * bytes,
     ]);
     return () => {
-      for (const places of each) multiply(memory, places, rows, size, columns);
+      for (const places of matrixOffsets) multiply(memory, places, rows, size, columns);
     };
   };
   return { outputs: [out], start };
@@ -276,12 +276,12 @@ function GRU({ attributes: { hidden_size: width } }, [x, inputWeights, stateWeig
         for (let i = 0; i < size; i++) input.values[step * size + i] = x.values[step * numSessions * size + i];
       }
       for (let direction = 0; direction < 2; direction++) {
-        const [places, statePlaces] = [size, width].map((length, i) => placeOf(weights[i]) + direction * 3 * width * length * bytes);
-        memory.multiplyTransposed(placeOf(input), places, placeOf(fromInput), numPositions, size, 3 * width, 1);
+        const [places, statePlaces] = [size, width].map((length, i) => byteOffsetOf(weights[i]) + direction * 3 * width * length * bytes);
+        memory.multiplyTransposed(byteOffsetOf(input), places, byteOffsetOf(fromInput), numPositions, size, 3 * width, 1);
         for (let i = 0; i < width; i++) state.values[i] = first.values[direction * numSessions * width + i];
         for (let number = 0; number < numPositions; number++) {
           const step = direction ? numPositions - 1 - number : number;
-          memory.multiplyTransposed(placeOf(state), statePlaces, placeOf(fromState), 1, width, 3 * width, 1);
+          memory.multiplyTransposed(byteOffsetOf(state), statePlaces, byteOffsetOf(fromState), 1, width, 3 * width, 1);
           advance(state.values, fromInput.values, step * 3 * width, fromState.values, biases.values, direction * 6 * width);
           const to = (step * 2 + direction) * numSessions * width;
           for (let i = 0; i < width; i++) out.values[to + i] = state.values[i];
@@ -299,10 +299,10 @@ function advance(state, input, at, hidden, bias, biasAt) {
   for (let i = 0; i < width; i++) {
     const update = gate(i);
     const reset = gate(width + i);
-    const fresh = Math.tanh(
+    const candidate = Math.tanh(
       input[at + 2 * width + i] + bias[biasAt + 2 * width + i] + reset * (hidden[2 * width + i] + bias[biasAt + 5 * width + i]),
     );
-    state[i] = (1 - update) * fresh + update * state[i];
+    state[i] = (1 - update) * candidate + update * state[i];
   }
 }
 
@@ -322,10 +322,10 @@ function roundHalfEven(x) {
   return x + ROUNDER - ROUNDER;
 }
 
-function largest(values, at, end) {
-  let most = -Infinity;
-  for (let i = at; i < end; i++) if (values[i] > most) most = values[i];
-  return most;
+function maximum(values, at, end) {
+  let max = -Infinity;
+  for (let i = at; i < end; i++) if (values[i] > max) max = values[i];
+  return max;
 }
 
 const GELU_TABLE = Float32Array.from({ length: 2 * GELU_END * GELU_STEPS + 1 }, (_, i) => {
@@ -358,12 +358,12 @@ function constant(shape, values) {
   return { shape, length: values.length, values };
 }
 
-function partOf(of, shape, offset = 0) {
+function viewOf(of, shape, offset = 0) {
   const length = shape.reduce((a, b) => a * b, 1);
   return { shape, length, of, offset, values: of.values?.slice(offset, offset + length) ?? null };
 }
 
-function placeOf({ values }) {
+function byteOffsetOf({ values }) {
   return values.byteOffset;
 }
 
@@ -373,9 +373,9 @@ function stridesOf(shape) {
   return strides;
 }
 
-function broadcastShape(one, other) {
-  const length = Math.max(one.length, other.length);
-  const [a, b] = [one, other].map((shape) => [...new Array(length - shape.length).fill(1), ...shape]);
+function broadcastShape(left, right) {
+  const length = Math.max(left.length, right.length);
+  const [a, b] = [left, right].map((shape) => [...new Array(length - shape.length).fill(1), ...shape]);
   return a.map((size, axis) => Math.max(size, b[axis]));
 }
 
@@ -386,7 +386,7 @@ function rowsOf(shape, outShape) {
   return { starts: offsets(outShape.slice(0, -1), strides.slice(0, -1), 0), step: strides.at(-1) ?? 0 };
 }
 
-/** Return the places of a tensor's values, given the stride of each axis. */
+/** Return the index of each value of a tensor, given the stride of each axis. */
 function offsets(shape, strides, first) {
   let places = [first];
   shape.forEach((size, axis) => {
@@ -395,17 +395,17 @@ function offsets(shape, strides, first) {
   return Int32Array.from(places);
 }
 
-/** Return a range of an axis: a part of the tensor if it is contiguous, otherwise a copy. */
-function picked(x, axis, begin, end, step) {
+/** Return a range of an axis: a view of the tensor if it is contiguous, otherwise a copy. */
+function sliceAxis(x, axis, begin, end, step) {
   const strides = stridesOf(x.shape);
   const shape = x.shape.with(axis, Math.ceil((end - begin) / step));
-  return gathered(x, shape, strides.with(axis, strides[axis] * step), begin * strides[axis]);
+  return gather(x, shape, strides.with(axis, strides[axis] * step), begin * strides[axis]);
 }
 
-/** Return the values at some strides. */
-function gathered(x, shape, strides, first) {
+/** Return the values that the strides select: a view if they are contiguous, otherwise a copy. */
+function gather(x, shape, strides, first) {
   const places = offsets(shape, strides, first);
-  if (places.every((place, i) => place === first + i)) return { outputs: [partOf(x, shape, first)] };
+  if (places.every((place, i) => place === first + i)) return { outputs: [viewOf(x, shape, first)] };
   const out = tensorOf(shape);
   const start = () => () => {
     const { values } = x;
@@ -414,7 +414,8 @@ function gathered(x, shape, strides, first) {
   return { outputs: [out], start };
 }
 
-function joined(operations) {
+/** Return one operation with the outputs of several. */
+function joinOperations(operations) {
   const starts = operations.flatMap(({ start }) => start ?? []);
   return { outputs: operations.map(({ outputs: [output] }) => output), start: (memory) => starts.map((start) => start(memory)) };
 }

@@ -3,17 +3,17 @@
 
 import { floats } from "./math.js";
 
-const NUM_ROWS = 512; // of contexts that were looked up last
+const NUM_ROWS = 512; // cached rows
 const NO_CONTEXT = -1;
 
 export class PhoneLm {
-  /** Node whose n-grams continue a node's. */
+  /** Context of each node: its longest suffix with n-grams. */
   contextOf;
-  /** Context to which a node backs off. */
+  /** Context to which each node backs off. */
   backoff;
-  /** Log weight of that. */
+  /** Log weight of this step. */
   logBackoff;
-  /** Last phone of a node. */
+  /** Last phone of each node. */
   phone;
   /** Rows of log-probabilities of the phones after a context. */
   logProbs;
@@ -36,29 +36,29 @@ export class PhoneLm {
     this.#firstChild[0] = 1;
     for (let node = 0; node < children.length; node++) this.#firstChild[node + 1] = this.#firstChild[node] + children[node];
     this.contextOf = new Int32Array(children.length);
-    const shorter = new Int32Array(children.length); // node of the longest known ending
+    const suffixOf = new Int32Array(children.length); // node of the longest known suffix
     for (let node = 0; node < children.length; node++) {
       const isContext = children[node] > 0 || node <= children[0];
-      this.contextOf[node] = isContext ? node : this.contextOf[shorter[node]];
+      this.contextOf[node] = isContext ? node : this.contextOf[suffixOf[node]];
       if (node === 0) continue;
       for (let child = this.#firstChild[node]; child < this.#firstChild[node + 1]; child++) {
-        shorter[child] = this.#ending(shorter[node], phone[child], shorter);
+        suffixOf[child] = this.#longestSuffix(suffixOf[node], phone[child], suffixOf);
       }
     }
-    this.backoff = shorter.map((node) => this.contextOf[node]);
+    this.backoff = suffixOf.map((node) => this.contextOf[node]);
     this.#numPhones = phoneArrays.first_state.values.length - 1;
     this.logProbs = new Float32Array(NUM_ROWS * this.#numPhones);
     this.nextContexts = new Int32Array(this.logProbs.length);
   }
 
-  /** Return the node of a phone after a context, or after the longest ending of it that has one. */
-  #ending(context, phone, shorter) {
+  /** Return the node of a phone after a context, or after the longest suffix of it that has one. */
+  #longestSuffix(context, phone, suffixOf) {
     for (;;) {
       let child = this.#firstChild[context];
       const end = this.#firstChild[context + 1];
       while (child < end && this.phone[child] < phone) child++;
       if (child < end && this.phone[child] === phone) return child;
-      context = shorter[context];
+      context = suffixOf[context];
     }
   }
 
@@ -71,8 +71,8 @@ export class PhoneLm {
     if (this.#contexts[row] === context) return at;
     const end = at + this.#numPhones;
     if (context !== 0) {
-      const before = this.rowOf(this.backoff[context]);
-      for (let i = at, from = before; i < end; i++, from++) {
+      const backoffRow = this.rowOf(this.backoff[context]);
+      for (let i = at, from = backoffRow; i < end; i++, from++) {
         this.logProbs[i] = this.logProbs[from] + this.logBackoff[context];
         this.nextContexts[i] = this.nextContexts[from];
       }

@@ -14,17 +14,17 @@ export class PhoneRecognizer {
   #silence;
   #durationsS;
   #settled; // search over settled scores
-  #ahead; // continues the settled search over provisional scores
-  #decoder; // the search in use: settled or ahead
+  #lookahead; // continues this search over provisional scores
+  #decoder; // the search in use: one of these two
   #provisional; // the scores last searched
-  #numChecked; // frames that the output rule has had
+  #numRuleFrames; // frames that the output rule has seen
   #rule; // lastEmitted, candidate, numAgreeing
   #startFrame = 0;
-  #done = 0; // frame of the speech up to which phones are final
-  #confidence = []; // confidence of the settled frames from `done` on
+  #finalFrame = 0; // up to this frame of the speech, phones are final
+  #confidence = []; // confidence of the settled frames from #finalFrame on
   #numFinal = 0;
   #lastFinal;
-  #open = []; // emitted, not yet final
+  #openPhones = []; // emitted, but not final yet
 
   /** @param rule parameters of the output rule */
   constructor(model, scorer, rule) {
@@ -46,24 +46,24 @@ export class PhoneRecognizer {
       rateWeight: phones.rateWeight,
     };
     this.#settled = new Decoder(phoneLm, hmms, model);
-    this.#ahead = new Decoder(phoneLm, hmms, model);
+    this.#lookahead = new Decoder(phoneLm, hmms, model);
   }
 
   /** Start a stretch of speech at a feature frame. */
   start(frame) {
     this.#scorer.start();
     this.#startFrame = frame;
-    this.#done = this.#numChecked = 0;
+    this.#finalFrame = this.#numRuleFrames = 0;
     this.#confidence = [];
     this.#provisional = [];
     this.#lastFinal = this.#silence;
-    this.#open = [];
+    this.#openPhones = [];
     this.#settled.reset();
     this.#decoder = this.#settled;
     this.#rule = { lastEmitted: this.#silence, candidate: this.#silence, numAgreeing: 0 };
   }
 
-  /** Take the last frames of some positions; return new and changed phones. */
+  /** Process the last frames of some positions; return new and changed phones. */
   accept(positions, numFrames) {
     const { settled, provisional } = this.#scorer.accept(positions, numFrames);
     return this.#decode(settled, provisional);
@@ -72,8 +72,8 @@ export class PhoneRecognizer {
   /** End the speech; return the last phones. */
   finish() {
     const phones = this.#decode(this.#scorer.finish(), []);
-    const rest = this.#settled.finalPath().filter(({ start }) => start >= this.#done);
-    if (this.#open.length && rest.length > 1 && rest.at(-1).phone === this.#silence) rest.pop();
+    const rest = this.#settled.finalPath().filter(({ start }) => start >= this.#finalFrame);
+    if (this.#openPhones.length && rest.length > 1 && rest.at(-1).phone === this.#silence) rest.pop();
     phones.push(...this.#revise(rest, 0));
     return phones;
   }
@@ -81,54 +81,54 @@ export class PhoneRecognizer {
   #decode(settled, provisional) {
     if (settled.length === 0 && provisional === this.#provisional) return [];
     const known = this.#provisional;
-    const continues = settled.length === 0 && known.every((row, i) => isEqual(row, provisional[i]));
+    const continues = settled.length === 0 && known.every((row, i) => areEqualRows(row, provisional[i]));
     const numKnown = continues ? known.length : 0; // otherwise the search over provisional scores restarts
     this.#provisional = provisional;
     this.#decoder = this.#settled;
     const phones = this.#search(settled);
     if (settled.length) {
-      this.#settled.forgetBefore(this.#done);
+      this.#settled.forgetBefore(this.#finalFrame);
       this.#settled.dropRecords();
     }
     if (provisional.length) {
-      this.#decoder = this.#ahead;
-      if (numKnown === 0) this.#ahead.copyState(this.#settled);
+      this.#decoder = this.#lookahead;
+      if (numKnown === 0) this.#lookahead.copyState(this.#settled);
       phones.push(...this.#search(provisional.slice(numKnown)));
     }
     return phones;
   }
 
-  /** Continue the search; the output rule gets the frames that it has not had. */
+  /** Continue the search; the output rule sees each frame once. */
   #search(rows) {
-    const numChecked = Math.max(0, this.#numChecked - this.#decoder.numFrames);
+    const numRuleFrames = Math.max(0, this.#numRuleFrames - this.#decoder.numFrames);
     return rows.flatMap((scores, i) => {
       const confidence = this.#decoder.advance(scores);
       if (this.#decoder === this.#settled) this.#confidence.push(confidence);
-      return i < numChecked ? [] : this.#emit();
+      return i < numRuleFrames ? [] : this.#emit();
     });
   }
 
   /** Return the last phone and corrections, if the output rule emits it at this frame. */
   #emit() {
-    this.#numChecked = this.#decoder.numFrames;
+    this.#numRuleFrames = this.#decoder.numFrames;
     const { phone, start, confidence } = this.#decoder.lastPhone;
-    if (!this.#isDue(phone, confidence)) return [];
-    const revised = this.#revise(this.#decoder.pathSince(this.#done), 1);
-    const before = this.#open.length ? this.#symbols.indexOf(this.#open.at(-1).symbol) : this.#lastFinal;
+    if (!this.#isEmitted(phone, confidence)) return [];
+    const revised = this.#revise(this.#decoder.pathSince(this.#finalFrame), 1);
+    const before = this.#openPhones.length ? this.#symbols.indexOf(this.#openPhones.at(-1).symbol) : this.#lastFinal;
     const position = before === this.#silence ? FIRST : INSIDE;
     const emitted = {
-      index: this.#numFinal + this.#open.length,
+      index: this.#numFinal + this.#openPhones.length,
       symbol: this.#symbols[phone],
-      onsetS: this.#timeS(Math.max(start, this.#done)),
+      onsetS: this.#timeS(Math.max(start, this.#finalFrame)),
       durationS: wholeSamples(this.#durationsS.values[position * this.#durationsS.shape[1] + phone], this.#model),
       confidence,
       isFinal: false,
     };
-    this.#open.push(emitted);
+    this.#openPhones.push(emitted);
     return [...revised, emitted];
   }
 
-  #isDue(phone, confidence) {
+  #isEmitted(phone, confidence) {
     const { numStableFrames, minConfidence } = this.#ruleConfig;
     const rule = this.#rule;
     if (confidence < minConfidence) rule.numAgreeing = 0;
@@ -141,31 +141,31 @@ export class PhoneRecognizer {
 
   /** Replace the open phones by the best string; return those that are new or changed. */
   #revise(segments, numFollowing) {
-    let numBefore = this.#open.length - numFollowing;
-    if (this.#done === 0 && segments.length > Math.max(0, numBefore) && segments[0].phone === this.#silence) segments = segments.slice(1);
+    let numBefore = this.#openPhones.length - numFollowing;
+    if (this.#finalFrame === 0 && segments.length > Math.max(0, numBefore) && segments[0].phone === this.#silence) segments = segments.slice(1);
     const emitted = [];
     for (; segments.length < numBefore; numBefore--) {
-      // an extra phone was emitted and is withdrawn
-      emitted.push({ ...this.#open.shift(), symbol: this.#symbols[this.#silence], durationS: 0, isFinal: true });
+      // a phone was emitted that the best string lacks: withdraw it
+      emitted.push({ ...this.#openPhones.shift(), symbol: this.#symbols[this.#silence], durationS: 0, isFinal: true });
       this.#numFinal++;
     }
     const finalUntil = numFollowing ? this.#settled.sharedEnd : this.#settled.numFrames;
-    const known = this.#open;
-    const [firstIndex, firstFrame] = [this.#numFinal, this.#done];
-    this.#open = [];
+    const known = this.#openPhones;
+    const [firstIndex, firstFrame] = [this.#numFinal, this.#finalFrame];
+    this.#openPhones = [];
     segments.forEach((segment, number) => {
       const phone = this.#phoneOf(segment, known[number], firstFrame, finalUntil);
       phone.index = firstIndex + number;
       if (!isSame(phone, known[number])) emitted.push(phone);
       if (!phone.isFinal) {
-        this.#open.push(phone);
+        this.#openPhones.push(phone);
         return;
       }
       this.#numFinal++;
       this.#lastFinal = segment.phone;
-      this.#done = segment.end;
+      this.#finalFrame = segment.end;
     });
-    this.#confidence.splice(0, this.#done - firstFrame);
+    this.#confidence.splice(0, this.#finalFrame - firstFrame);
     return emitted;
   }
 
@@ -182,10 +182,10 @@ export class PhoneRecognizer {
   }
 }
 
-function isSame(one, other) {
-  return other !== undefined && Object.keys(one).every((key) => one[key] === other[key]);
+function isSame(phone, other) {
+  return other !== undefined && Object.keys(phone).every((key) => phone[key] === other[key]);
 }
 
-function isEqual(one, other) {
-  return other !== undefined && one.every((value, i) => value === other[i]);
+function areEqualRows(row, other) {
+  return other !== undefined && row.every((value, i) => value === other[i]);
 }

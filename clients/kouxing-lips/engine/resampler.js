@@ -77,12 +77,12 @@ export class Resampler {
     this.#numKnown += samples.length;
     const end = this.#first + this.#numKnown;
     const numReady = Math.max(0, Math.ceil(((end - this.#half) * up) / down) - this.#numOut);
-    const begin = this.#neededFrom(this.#numOut);
+    const begin = this.#firstNeeded(this.#numOut);
     const input = known.byteOffset + begin * known.BYTES_PER_ELEMENT;
     const phase = (this.#numOut * down) % up;
     this.#memory.resample(input, this.#table.byteOffset, out.byteOffset, numReady, this.#numTaps, up, down, phase);
     this.#numOut += numReady;
-    const numOld = Math.max(0, this.#neededFrom(this.#numOut));
+    const numOld = Math.max(0, this.#firstNeeded(this.#numOut));
     known.copyWithin(0, numOld, this.#numKnown);
     this.#numKnown -= numOld;
     this.#first += numOld;
@@ -90,7 +90,7 @@ export class Resampler {
   }
 
   /** Return the index, among the known samples, of the first one that an output sample depends on. */
-  #neededFrom(number) {
+  #firstNeeded(number) {
     return Math.floor((number * this.#down) / this.#up) - this.#half + 1 - this.#first;
   }
 }

@@ -4,7 +4,7 @@ import { Transition } from "./trajectory.js";
 
 /** Tracks how far the mouth is ajar in one session. */
 export class RestingLips {
-  #c; // constants
+  #constants;
   #levels = []; // levels of future frames: [time s, dB]
   #changes = []; // changes in future frames
   #isVoice = false;
@@ -13,20 +13,20 @@ export class RestingLips {
   #knownS = -Infinity;
   #soundS = -Infinity;
   #staysShut = true;
-  #isPhone = false; // a phone closes the lips
+  #isClosedByPhone = false;
   #timeS = Infinity;
   #goal = 0;
   #transition = transitionTo(0, 0, 0, 1);
   #elapsedS = 0;
 
   constructor({ constants }) {
-    this.#c = constants.rest;
+    this.#constants = constants.rest;
   }
 
   addEvent(event) {
     if (event.type === "progress") {
       this.#levels.push([event.timeS, event.levelDb]);
-      this.#loudestDb = Math.max(event.levelDb, this.#loudestDb - this.#c.FADE_DB);
+      this.#loudestDb = Math.max(event.levelDb, this.#loudestDb - this.#constants.FADE_DB);
       this.#knownS = event.timeS;
     } else if (event.type === "speech") this.#changes.push(event);
     else if (event.type === "end") this.#hasEnded = true;
@@ -47,9 +47,9 @@ export class RestingLips {
 
   /** Return the log odds that silence subtracts from a closure, given those that phones add. */
   doubtAt(timeS, closure, phones) {
-    const c = this.#c;
-    this.#isPhone = phones > 0;
-    if (this.#isPhone) return 0;
+    const c = this.#constants;
+    this.#isClosedByPhone = phones > 0;
+    if (this.#isClosedByPhone) return 0;
     const nextS = this.#nextSoundS();
     const isSilent = this.#isVoice && this.#knownS > timeS + c.LAST_SOUND_S && nextS > this.#knownS;
     const isOnset = c.YIELD_S < nextS - timeS && nextS - timeS <= c.ONSET_S;
@@ -63,11 +63,11 @@ export class RestingLips {
 
   /** Return the amount at the time of a frame. */
   amountAt(timeS) {
-    const c = this.#c;
+    const c = this.#constants;
     const nextS = this.#nextSoundS();
     if (this.#hasEnded) this.#setGoal(0, c.END_S);
     else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#setGoal(1, c.PART_S);
-    else if (this.#isPhone || this.#staysShut || nextS <= timeS + c.YIELD_S) this.#setGoal(0, c.YIELD_S);
+    else if (this.#isClosedByPhone || this.#staysShut || nextS <= timeS + c.YIELD_S) this.#setGoal(0, c.YIELD_S);
     else if (timeS > this.#soundS + c.HOLD_S) this.#setGoal(0, c.CLOSE_S);
     else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#setGoal(1, c.PART_S);
     this.#elapsedS += Math.max(timeS - this.#timeS, 0);
@@ -76,7 +76,7 @@ export class RestingLips {
   }
 
   #isSound(levelDb) {
-    return this.#isVoice && levelDb >= this.#loudestDb - this.#c.RANGE_DB;
+    return this.#isVoice && levelDb >= this.#loudestDb - this.#constants.RANGE_DB;
   }
 
   #nextSoundS() {

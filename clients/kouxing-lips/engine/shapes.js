@@ -7,7 +7,7 @@ const FINISH = {
   oculus(weights) {
     weights[0] = Math.max(0, 1 - weights.reduce((a, b) => a + b));
   },
-  // "blink" has what both eyes have in common
+  // "blink" is the part that both eyes share
   vrm(weights, names) {
     const [both, left, right] = ["blink", "blinkLeft", "blinkRight"].map((name) => names.indexOf(name));
     weights[both] = Math.min(weights[left], weights[right]);
@@ -29,13 +29,13 @@ export class ShapeSet {
   #free; // weights between 0 and 1 in the last solution
   #isWrong; // weights that the next solution frees or fixes
   #finish;
-  #c; // constants
+  #constants;
 
   /** Throws an error if the set is unknown. */
   constructor(set, { arrays, shapeNames, constants }) {
     if (!(set in shapeNames)) throw new Error(`unknown shapes ${set}; use ${Object.keys(shapeNames).join(", ")}`);
     this.names = shapeNames[set];
-    this.#c = constants.shapes;
+    this.#constants = constants.shapes;
     this.#gram = rowsOf(arrays[`shapes.${set}.gram`]);
     this.#right = rowsOf(arrays[`shapes.${set}.right`]);
     this.#matrix = new Float64Array(this.names.length ** 2);
@@ -55,7 +55,7 @@ export class ShapeSet {
   }
 
   #solve(right) {
-    const { ROUNDING, PATIENCE } = this.#c;
+    const { ROUNDING, PATIENCE } = this.#constants;
     const [atOne, free, isWrong] = [this.#atOne, this.#free, this.#isWrong];
     const size = right.length;
     let [fewest, patience] = [size + 1, PATIENCE];
@@ -108,9 +108,9 @@ function rowsOf({ values, shape: [rows, columns] }) {
   return Array.from({ length: rows }, (_, row) => values.subarray(row * columns, (row + 1) * columns));
 }
 
-function dot(one, other) {
+function dot(left, right) {
   let sum = 0;
-  for (let i = 0; i < one.length; i++) sum += one[i] * other[i];
+  for (let i = 0; i < left.length; i++) sum += left[i] * right[i];
   return sum;
 }
 

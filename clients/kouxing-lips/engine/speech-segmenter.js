@@ -8,22 +8,22 @@ import { VoiceTraits } from "./voice-traits.js";
 
 class VoiceActivityDetector {
   isSpeech = false;
-  #c; // constants
+  #constants;
   #evidence = 0;
-  #numImprobable = 0;
+  #numUnlikely = 0;
 
   constructor({ constants }) {
-    this.#c = constants.vad;
+    this.#constants = constants.vad;
   }
 
   update(probability) {
-    this.#numImprobable = probability >= this.#c.IMPROBABLE ? 0 : this.#numImprobable + 1;
+    this.#numUnlikely = probability >= this.#constants.IMPROBABLE ? 0 : this.#numUnlikely + 1;
     if (this.isSpeech) {
-      this.isSpeech = this.#numImprobable < this.#c.STOP_POSITIONS;
+      this.isSpeech = this.#numUnlikely < this.#constants.STOP_POSITIONS;
       return;
     }
-    this.#evidence = Math.max(0, this.#evidence + probability - this.#c.NO_EVIDENCE);
-    this.isSpeech = this.#evidence >= this.#c.ENOUGH;
+    this.#evidence = Math.max(0, this.#evidence + probability - this.#constants.NO_EVIDENCE);
+    this.isSpeech = this.#evidence >= this.#constants.ENOUGH;
     if (this.isSpeech) this.#evidence = 0;
   }
 }

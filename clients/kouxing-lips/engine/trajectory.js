@@ -2,13 +2,13 @@
 // services/synthesizer/lips has the formulas in trajectory.py and learned/track.py.
 
 /** Return a state { value, velocity } at rest. */
-export function still(value) {
+export function stateAtRest(value) {
   return { value, velocity: value.map(() => 0) };
 }
 
 /** Return a state plus a factor times another. */
-export function add(one, other, factor = 1) {
-  const [value, velocity] = [one.value.slice(), one.velocity.slice()];
+export function add(state, other, factor = 1) {
+  const [value, velocity] = [state.value.slice(), state.velocity.slice()];
   for (let i = 0; i < value.length; i++) {
     value[i] += factor * other.value[i];
     velocity[i] += factor * other.velocity[i];
@@ -16,7 +16,7 @@ export function add(one, other, factor = 1) {
   return { value, velocity };
 }
 
-/** Leads a difference, a state, to zero along a cubic. */
+/** Blends a difference, a state, to zero along a cubic. */
 export class Transition {
   #difference;
   #durationS;
@@ -46,7 +46,7 @@ export class LipTrack {
   #knots = []; // { timeS, state }
 
   constructor(neutral, constants) {
-    this.#rest = still(neutral);
+    this.#rest = stateAtRest(neutral);
     this.#constants = constants;
   }
 
@@ -82,7 +82,7 @@ export class LipTrack {
   #returnToRest() {
     const rest = { timeS: this.endS + this.holdS + this.#constants.CLOSE_S, state: this.#rest };
     if (this.holdS === 0) return [rest];
-    return [{ timeS: this.endS + this.holdS, state: still(this.#knots.at(-1).state.value) }, rest];
+    return [{ timeS: this.endS + this.holdS, state: stateAtRest(this.#knots.at(-1).state.value) }, rest];
   }
 }
 

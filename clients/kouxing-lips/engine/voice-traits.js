@@ -5,7 +5,7 @@ import { clamp } from "./math.js";
 export class VoiceTraits {
   /** Traits of the voice at the newest position. */
   newest = { arousal: 0, valence: 0, isLaughter: false, isBreath: false };
-  #c; // constants
+  #constants;
   #voices;
   #weights;
   #bias;
@@ -13,12 +13,12 @@ export class VoiceTraits {
   #mean;
   #numVoiced = 0;
   #evidence = [0, 0]; // evidence of laughter and of breath
-  #sinceLaugh; // positions
+  #positionsSinceLaugh;
 
   constructor({ arrays, constants, voices }) {
-    this.#c = constants.traits;
+    this.#constants = constants.traits;
     this.#voices = voices;
-    this.#sinceLaugh = this.#c.LAUGH_POSITIONS;
+    this.#positionsSinceLaugh = this.#constants.LAUGH_POSITIONS;
     this.#weights = arrays["traits.weights"];
     this.#bias = arrays["traits.bias"].values;
     this.#feeling = this.#mean = [...arrays["traits.mean"].values];
@@ -26,35 +26,35 @@ export class VoiceTraits {
 
   /** Process the next position's state and probabilities of the kinds of voice. */
   accept(state, voice) {
-    const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_FRACTION } = this.#c;
+    const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_FRACTION } = this.#constants;
     const { values, shape: [, numOutputs] } = this.#weights;
     const outputs = new Float64Array(this.#bias);
     for (let i = 0, at = 0; i < state.length; i++) {
       const value = state[i];
       for (let output = 0; output < numOutputs; output++, at++) outputs[output] += value * values[at];
     }
-    const towards = (values_, gain) => values_.map((value, i) => value + gain * (outputs[i] - value));
+    const smooth = (current, gain) => current.map((value, i) => value + gain * (outputs[i] - value));
     if (voice[this.#voices.SPEECH] + voice[this.#voices.SUNG] > MIN_VOICE) {
       this.#numVoiced++;
-      this.#mean = towards(this.#mean, 1 / Math.min(this.#numVoiced + PRIOR_POSITIONS, MAX_POSITIONS));
-      this.#feeling = towards(this.#feeling, 1 / Math.min(this.#numVoiced + PRIOR_FEELING, MEAN_POSITIONS));
+      this.#mean = smooth(this.#mean, 1 / Math.min(this.#numVoiced + PRIOR_POSITIONS, MAX_POSITIONS));
+      this.#feeling = smooth(this.#feeling, 1 / Math.min(this.#numVoiced + PRIOR_FEELING, MEAN_POSITIONS));
     }
     this.#evidence = this.#evidence.map((value, i) => value + EVIDENCE_FRACTION * (outputs[2 + i] - value));
     const [arousal, valence] = this.#feeling.map((value, i) => this.#rounded(clamp(value - this.#mean[i], -1, 1)));
-    const isLaugh = voice[this.#voices.LAUGHTER] > this.#c.MIN_LAUGHTER;
-    this.#sinceLaugh = isLaugh ? 0 : this.#sinceLaugh + 1;
-    const isOn = (evidence, wasOn) => evidence > (wasOn ? this.#c.STOP : this.#c.START);
+    const isLaugh = voice[this.#voices.LAUGHTER] > this.#constants.MIN_LAUGHTER;
+    this.#positionsSinceLaugh = isLaugh ? 0 : this.#positionsSinceLaugh + 1;
+    const isDetected = (evidence, wasDetected) => evidence > (wasDetected ? this.#constants.STOP : this.#constants.START);
     this.newest = {
       arousal,
       valence,
       isLaughter:
-        isOn(this.#evidence[0], this.newest.isLaughter) && this.#sinceLaugh < this.#c.LAUGH_POSITIONS,
-      isBreath: isOn(this.#evidence[1], this.newest.isBreath),
+        isDetected(this.#evidence[0], this.newest.isLaughter) && this.#positionsSinceLaugh < this.#constants.LAUGH_POSITIONS,
+      isBreath: isDetected(this.#evidence[1], this.newest.isBreath),
     };
   }
 
   #rounded(value) {
-    const scale = 10 ** this.#c.DIGITS;
+    const scale = 10 ** this.#constants.DIGITS;
     return Math.round(scale * value) / scale;
   }
 }

@@ -121,7 +121,7 @@ class AsyncSession(BaseSession):
 
     def events(self) -> AsyncResults[Event]:
         """Subscribe to control's events about the session, as ``Session.events``."""
-        return AsyncResults(*self._read_events())
+        return AsyncResults(*self._subscribe_events())
 
     async def _join(
         self, classes: tuple[type[Result], ...], shape_set: str = "", keep_all: bool = False
@@ -130,8 +130,8 @@ class AsyncSession(BaseSession):
         try:
             await asyncio.wait_for(asyncio.wrap_future(joined), self._thread.timeout_s)
         except TimeoutError:
-            raise self._not_joined() from None
-        if added := self._add_shapes(shape_set):
+            raise self._join_error() from None
+        if added := self._request_shapes(shape_set):
             await asyncio.wrap_future(added)
         return AsyncResults(inbox, close)
 
@@ -143,7 +143,7 @@ class AsyncResults(BaseResults, Generic[T]):
         return self
 
     async def __anext__(self) -> T:
-        await self._signal.wait_async(self._has_news)
+        await self._signal.wait_async(self._has_results)
         result = self._take()
         if result is None:
             raise StopAsyncIteration

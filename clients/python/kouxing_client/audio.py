@@ -98,7 +98,7 @@ class AudioStream:
 
     @property
     def num_unacknowledged(self) -> int:
-        """Number of messages that the recognizer must still acknowledge; any thread may ask."""
+        """Number of messages that the recognizer must still acknowledge; any thread may read it."""
         return min(self.sequence - self.acknowledged, len(self._kept))
 
     def connect_ms(self, default: int) -> int:

@@ -20,7 +20,7 @@ CHUNK_BYTES = 32_000  # largest chunk in one message
 MAX_LIVE = 100  # unread results of a live session
 MAX_EVENTS = 1000  # unread events of a session
 MAX_UNACKNOWLEDGED = 500  # messages; then the sender waits
-LAST_ANSWER_S = 2.0  # for the recognizer to receive the end of the audio before a session closes
+LAST_ANSWER_S = 2.0  # limit for delivering the end of the audio before a session closes
 
 
 class FaceSettings(TypedDict, total=False):
@@ -128,7 +128,7 @@ class BaseSession:
         self._signal = core.signal
         self._options = options
         self._num_added = 0  # audio messages
-        self._incomplete = b""  # part of a sample
+        self._partial_sample = b""  # the first bytes of the next sample
         self._has_finished = False
 
     @property
@@ -208,10 +208,10 @@ class BaseSession:
 
     def _chunks(self, audio: Any) -> Iterator[tuple[bytes, int]]:
         """Yield messages of PCM and their number of samples per channel."""
-        pcm = self._incomplete + to_pcm(audio, (self._options or {}).get("encoding", "s16le"))
+        pcm = self._partial_sample + to_pcm(audio, (self._options or {}).get("encoding", "s16le"))
         end = len(pcm) // self._frame_bytes * self._frame_bytes
         self._check()
-        pcm, self._incomplete = pcm[:end], pcm[end:]
+        pcm, self._partial_sample = pcm[:end], pcm[end:]
         for chunk in split(pcm, CHUNK_BYTES):
             yield chunk, self._num_frames(chunk)
 
@@ -233,7 +233,7 @@ class BaseSession:
 
     def _flush(self) -> Future[Fields]:
         self._check_sender()
-        self._incomplete = b""
+        self._partial_sample = b""
 
         def flush(core: ClientCore) -> Future[Fields]:
             if self._core.stream is not None:
@@ -252,7 +252,10 @@ class BaseSession:
         keep_all: bool,
         on_result: Callable[[Any], None] | None = None,
     ) -> tuple[Inbox, Callable[[], None], Future[None]]:
-        """Start a subscription; return its inbox, how to close it, and when it is in effect."""
+        """Start a subscription.
+
+        Return its inbox, a function that ends it, and a future that is done when it is in effect.
+        """
         thread, core = self._thread, self._core
         inbox = Inbox(MAX_LIVE if core.is_live and not keep_all else None)
         subscription = Subscription(core, classes, shape_set, inbox, on_result)
@@ -260,8 +263,8 @@ class BaseSession:
         close = partial(thread.call, lambda: core.unsubscribe(subscription))
         return inbox, close, subscription.joined
 
-    def _not_joined(self) -> KouxingError:
-        """Return the error of a subscription that is not confirmed."""
+    def _join_error(self) -> KouxingError:
+        """Return the error for a subscription that is not confirmed."""
         endpoints = [self._core.endpoints.get(name, "") for name in ("phones", "faps")]
         addresses = sorted({endpoint.partition(" ")[0] for endpoint in endpoints if endpoint})
         return KouxingError(
@@ -269,13 +272,13 @@ class BaseSession:
             " this machine to find out why"
         )
 
-    def _add_shapes(self, name: str) -> Future[Fields] | None:
+    def _request_shapes(self, name: str) -> Future[Fields] | None:
         """Request a set of blendshapes, unless the session has it already."""
         if not name or name in (self._options or {}).get("face", {}).get("shapes", ()):
             return None
         return self._request("set-face", {"face": {"shapes": [name]}})
 
-    def _read_events(self) -> tuple[Inbox, Callable[[], None]]:
+    def _subscribe_events(self) -> tuple[Inbox, Callable[[], None]]:
         """Return an inbox, and the function that closes it."""
         thread, core = self._thread, self._thread.core
         inbox = Inbox(MAX_EVENTS)
@@ -326,11 +329,11 @@ class BaseResults:
         """Minimum number of frames and phones that were published but did not arrive."""
         return self._inbox.num_missed
 
-    def _has_news(self) -> bool:
+    def _has_results(self) -> bool:
         return self._inbox.is_over or bool(self._inbox.messages)
 
     def _take(self) -> Any:
-        """Return the next result; None if no result is left."""
+        """Return the next result, or None if none is left."""
         if self._inbox.messages:
             return self._inbox.messages.popleft()
         if self._inbox.failure is not None:

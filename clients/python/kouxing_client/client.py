@@ -169,7 +169,7 @@ class Session(BaseSession):
 
     def events(self) -> Results[Event]:
         """Subscribe to control's events about the session, including those after it has closed."""
-        return Results(*self._read_events())
+        return Results(*self._subscribe_events())
 
     def _join(
         self,
@@ -182,8 +182,8 @@ class Session(BaseSession):
         try:
             joined.result(self._thread.timeout_s)
         except FutureTimeout:
-            raise self._not_joined() from None
-        if added := self._add_shapes(shape_set):
+            raise self._join_error() from None
+        if added := self._request_shapes(shape_set):
             added.result()
         return Results(inbox, close)
 
@@ -208,7 +208,7 @@ class Results(BaseResults, Generic[T]):
         KouxingError
             If the session failed before its last frame.
         """
-        self._signal.wait(self._has_news, timeout_s)
+        self._signal.wait(self._has_results, timeout_s)
         return cast("T | None", self._take())
 
     def available(self, timeout_s: float = 0.0) -> Iterator[T]:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
 
 RETRY_S = 1.0  # interval between attempts of an unanswered request
-WATCHED = ("event", "session-moved")  # topics that control publishes about a session
+WATCHED_TOPICS = ("event", "session-moved")  # topics that control publishes about a session
 EVENTS = Decoders(Event)
 T = TypeVar("T")
 U = TypeVar("U")
@@ -59,9 +59,9 @@ class ClientCore:
         self._timeout_s = timeout_s
         self._requests: dict[str, _Request] = {}
         self._refused_s = math.inf  # when control started to reject this key
-        self._is_explaining = False  # finding out why control does not answer
+        self._is_diagnosing = False  # searching for the reason why control does not answer
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
-        self._asked_s: dict[str, float] = {}  # when control was asked about a silent session
+        self._located_s: dict[str, float] = {}  # when a silent session was last located
         self._events: Connection | None = None
         self._commands = self._connect()
 
@@ -98,7 +98,7 @@ class ClientCore:
     def open_session(self, options: Fields) -> Future[SessionCore]:
         """Open a session; the options are the fields of ``open-session``."""
         is_live = bool(options.get("paced", True))
-        return then(
+        return map_future(
             self.request("open-session", **options),
             lambda opened: self._add(opened, options, is_live=is_live),
         )
@@ -109,7 +109,7 @@ class ClientCore:
         def add(status: Status) -> SessionCore:
             return self._add(newest_session(status, name), None, is_live=is_live)
 
-        return then(self.status(""), add)  # with the endpoint of control's events
+        return map_future(self.status(""), add)  # with the endpoint of control's events
 
     def add_inbox(self, session: str, inbox: Inbox) -> None:
         """Pass a session's events to an inbox, even after the session has ended."""
@@ -131,15 +131,15 @@ class ClientCore:
                 has_failed = True
             elif now_s >= request.retry_s:
                 self._send(request)
-        if has_failed and not self._is_explaining:
-            self._is_explaining = True
-            self._sockets.explain(self._control, self._give_up)
+        if has_failed and not self._is_diagnosing:
+            self._is_diagnosing = True
+            self._sockets.explain(self._control, self._fail_requests)
         for session in list(self.sessions):
             session.tick()
             if session.is_over:
                 self._remove(session)
             elif session.is_silent():
-                self._find(session)
+                self._locate(session)
 
     def close(self, failure: KouxingError) -> None:
         """End all sessions, and answer all requests with a failure."""
@@ -170,9 +170,9 @@ class ClientCore:
         """Return whether control has rejected this key for longer than a temporary penalty."""
         return self._sockets.now_s > self._refused_s + self._timeout_s
 
-    def _give_up(self, reason: str) -> None:
+    def _fail_requests(self, reason: str) -> None:
         """End requests without an answer, and all sessions if control rejects this key."""
-        self._is_explaining = False
+        self._is_diagnosing = False
         failure = KouxingError(self._failure(reason))
         for name, request in list(self._requests.items()):
             if self._sockets.now_s > request.end_s:
@@ -207,20 +207,20 @@ class ClientCore:
 
     def _remove(self, session: SessionCore) -> None:
         self.sessions.remove(session)
-        self._asked_s.pop(session.name, None)
+        self._located_s.pop(session.name, None)
         self._watch(session.name, on=False)
 
     def _watch(self, session: str, *, on: bool) -> None:
         if self._events is not None:
-            topics = [topic(kind, session) for kind in WATCHED]
+            topics = [topic(kind, session) for kind in WATCHED_TOPICS]
             self._sockets.set_topics(self._events, topics, on=on)
 
-    def _find(self, session: SessionCore) -> None:
+    def _locate(self, session: SessionCore) -> None:
         """Ask control where a silent session is: its ``session-moved`` may be lost."""
         now_s = self._sockets.now_s
-        if now_s < self._asked_s.get(session.name, 0.0) + SILENT_S:
+        if now_s < self._located_s.get(session.name, 0.0) + SILENT_S:
             return
-        self._asked_s[session.name] = now_s
+        self._located_s[session.name] = now_s
 
         def on_status(answer: Future[Status]) -> None:
             try:
@@ -245,11 +245,11 @@ class ClientCore:
             for request in self._requests.values():
                 request.answer.set_exception(refused(fields))
             self._requests.clear()
-        elif asked := self._requests.pop(str(fields.get("request")), None):
+        elif pending := self._requests.pop(str(fields.get("request")), None):
             if kind == "error":
-                asked.answer.set_exception(refused(fields))
+                pending.answer.set_exception(refused(fields))
             else:
-                asked.answer.set_result(fields)
+                pending.answer.set_result(fields)
 
     def _on_event(self, parts: list[bytes]) -> None:
         if kind_of(parts) == "session-moved" and (message := decode(parts)) is not None:
@@ -302,20 +302,22 @@ def newest_session(status: Status, name: str) -> Fields:
 
 @contextlib.contextmanager
 def forward_errors(future: Future[Any]) -> Iterator[None]:
-    """Pass errors to a future."""
+    """Pass exceptions of the block to a future."""
     try:
         yield
     except Exception as error:
         future.set_exception(error)
 
 
-def then(asked: Future[T], make: Callable[[T], U], made: Future[U] | None = None) -> Future[U]:
-    """Return a future of ``make(answer)``. Without ``made``, this is a new future."""
-    made = new_future() if made is None else made
+def map_future(
+    source: Future[T], convert: Callable[[T], U], target: Future[U] | None = None
+) -> Future[U]:
+    """Return ``target``, or a new future, that gets ``convert(result)`` of another future."""
+    target = new_future() if target is None else target
 
     def on_answer(answer: Future[T]) -> None:
-        with forward_errors(made):
-            made.set_result(make(answer.result()))
+        with forward_errors(target):
+            target.set_result(convert(answer.result()))
 
-    asked.add_done_callback(on_answer)
-    return made
+    source.add_done_callback(on_answer)
+    return target

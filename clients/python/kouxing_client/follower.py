@@ -14,7 +14,7 @@ MAX_HELD_FRAMES = 8  # number of these live frames that are kept
 END = "end-of-faps"
 _PUBLISHER_OF = {"fap-frame": "faps", END: "faps"}  # endpoint; other kinds are at "phones"
 _Number = tuple[int, int]  # epoch and sequence, or media time and sequence
-_NONE = (-1, -1)
+_NO_NUMBER = (-1, -1)
 
 
 class Transport(Protocol):
@@ -87,7 +87,7 @@ class Follower:
         self.is_complete = False  # every publisher has confirmed
         self.has_ended = False  # the last FAP frame has arrived; needs EndOfFaps in the classes
         self.num_missed = 0  # FAP frames, by gaps in their sequence numbers
-        self.num_outdated = 0  # messages that were dropped because their epoch is over
+        self.num_outdated = 0  # messages that were dropped because their epoch has ended
         self.received_at_s = transport.now_s  # time of the last message or confirmation
         self._transport = transport
         self._classes = classes
@@ -108,7 +108,7 @@ class Follower:
         self._newest: dict[str, _Number] = {}  # numbers of the newest message, by kind
         self._newest_before: dict[str, _Number] = {}  # newest at the new subscription
         self._seen: set[tuple[str, _Number]] = set()  # messages since the new subscription
-        self._last_frame = _NONE  # media time and sequence
+        self._last_frame = _NO_NUMBER  # media time and sequence
         self._last_sequence: int | None = None
         self._held_frames: deque[Any] = deque(maxlen=MAX_HELD_FRAMES)
 
@@ -174,7 +174,7 @@ class Follower:
         return self._connection
 
     def close(self) -> None:
-        """Unsubscribe; no message is passed on any more."""
+        """Unsubscribe; from then on, no message is passed on."""
         for connection in (self._connection, self._old_connection):
             if connection is not None:
                 self._transport.close_connection(connection)
@@ -195,7 +195,7 @@ class Follower:
         )
 
     def _close_old_connection(self) -> None:
-        """Take what the old connection has received, and close it."""
+        """Process what the old connection has received, and close it."""
         self._close_old_due_s = math.inf
         if (connection := self._old_connection) is None:
             return
@@ -259,7 +259,7 @@ class Follower:
         has_two = self._old_connection is not None
         known = self._newest_before if has_two else self._newest
         is_numbered = message.sequence > 0
-        if is_numbered and (number <= known.get(kind, _NONE) or (kind, number) in self._seen):
+        if is_numbered and (number <= known.get(kind, _NO_NUMBER) or (kind, number) in self._seen):
             return True
         if has_two:
             self._seen.add((kind, number))

@@ -1,4 +1,4 @@
-"""Joins the phones of successive recognizers into one sequence; does no I/O."""
+"""Joins the phones of successive recognizers into one sequence, without I/O."""
 
 from collections.abc import Iterable, Iterator
 
@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from kouxing_client.messages import SILENCE, Phone, Speech
 
-_TOLERANCE = 160  # samples
+_TOLERANCE_SAMPLES = 160
 
 
 class PhoneTrack:
@@ -35,7 +35,7 @@ class PhoneTrack:
         """
         changed: list[Phone] = []
         if speech.sequence == 1:
-            known = max(self._end, self._speech_time) + _TOLERANCE
+            known = max(self._end, self._speech_time) + _TOLERANCE_SAMPLES
             is_voiced = self._is_speaking or speech.active
             if self._epoch and is_voiced and speech.media_time > known:
                 self.num_missed += 1  # one or more
@@ -54,7 +54,7 @@ class PhoneTrack:
         """Add or revise a phone; return the phones that change."""
         changed: list[Phone] = []
         if phone.epoch > self._epoch and phone.index < (self._next_final or 0):
-            self.num_missed += 1  # one or more: the other recognizer's first messages
+            self.num_missed += 1  # one or more of the other recognizer's first messages
             changed = self._restart()
         self._epoch = phone.epoch
         if phone.final:

@@ -1,4 +1,4 @@
-"""Finds out why an address cannot be reached, with the fix."""
+"""Returns the reason why an address cannot be reached, and how to fix it."""
 
 import contextlib
 import queue
@@ -33,21 +33,21 @@ def reach_error(
             " or write an IP address"
         )
     except OSError as error:
-        return _explain(error)
+        return _reason_for(error)
     reason = ""
     for family, kind, protocol, _, address in addresses:
         try:
             with socket.socket(family, kind, protocol) as connection:
                 connection.settimeout(timeout_s)
                 connection.connect(address)
-                if not is_zeromq or _greets(connection):
+                if not is_zeromq or _sends_greeting(connection):
                     return ""
                 reason = (
                     "another program answers there, or kouxing hangs; correct the address, or"
                     " restart kouxing"
                 )
         except OSError as error:
-            reason = reason or _explain(error)
+            reason = reason or _reason_for(error)
     return reason
 
 
@@ -68,7 +68,7 @@ def _look_up(look_up: LookUp, host: str, port: int, timeout_s: float) -> list[tu
     return answer
 
 
-def _explain(error: OSError) -> str:
+def _reason_for(error: OSError) -> str:
     if isinstance(error, TimeoutError):
         return "the connection times out; open this port in the firewalls between the machines"
     if isinstance(error, ConnectionRefusedError):
@@ -76,7 +76,7 @@ def _explain(error: OSError) -> str:
     return f"{error.strerror}; check the address and the network"
 
 
-def _greets(connection: socket.socket) -> bool:
+def _sends_greeting(connection: socket.socket) -> bool:
     """Return whether a peer sends the first byte of ZeroMQ's greeting."""
     with contextlib.suppress(OSError):
         return connection.recv(1) == b"\xff"

@@ -47,7 +47,7 @@ class Subscription:
     shape_set
         Name of the set of blendshapes, if ``classes`` has ``Shapes``.
     inbox
-        Gets the results; ends with the session.
+        Receives the results; ends with the session.
     on_result
         Called with each result, in place of the inbox.
 
@@ -98,7 +98,7 @@ class Subscription:
             self.inbox.end(None)
 
     def end(self, failure: KouxingError | None) -> None:
-        """Stop; a failure says why the session is over."""
+        """Stop; ``failure`` is the reason why the session has ended early."""
         self.follower.drain()
         self.follower.close()
         self.inbox.end(None if self.follower.has_ended else failure)
@@ -182,7 +182,7 @@ class SessionCore:
         self.errors: deque[Refused] = deque()  # errors about the audio
         self.failure: KouxingError | None = None  # reason for the end; None: closed
         self.is_over = False
-        self.is_blocked = False  # the audio socket takes no more
+        self.is_blocked = False  # the audio socket accepts no more
         self._audio: Connection | None = None
         self._subscriptions: list[Subscription] = []
         self._resubscribe_end_s = 0.0  # audio waits for subscriptions until this time
@@ -206,7 +206,7 @@ class SessionCore:
             self.send_audio()
 
     def send_audio(self) -> None:
-        """Give the socket as much audio as it takes, unless audio waits for subscriptions."""
+        """Pass audio to the socket until it is full, unless audio waits for subscriptions."""
         self.is_blocked = False
         if self.stream is None or self._audio is None or self._is_resubscribing():
             return
@@ -255,7 +255,7 @@ class SessionCore:
         return is_followed and self.sockets.now_s > max(arrivals) + SILENT_S
 
     def tick(self) -> None:
-        """Send audio that waits; notice missing answers and deadlines that have passed."""
+        """Send waiting audio; detect missing answers and expired deadlines."""
         now_s = self.sockets.now_s
         for subscription in self._subscriptions:
             subscription.tick()
@@ -273,7 +273,7 @@ class SessionCore:
         self._closing = self._closing or (self.sockets.now_s + LAST_S, reason)
 
     def end(self, failure: KouxingError | None) -> None:
-        """Close all connections; a failure says why the session is over."""
+        """Close all connections; ``failure`` is the reason for an early end."""
         self.is_over, self.failure = True, failure
         for subscription in self._subscriptions:
             subscription.end(failure)

@@ -170,7 +170,7 @@ class Sockets:
             connection.setsockopt(zmq.SUBSCRIBE if on else zmq.UNSUBSCRIBE, name)
 
     def send(self, connection: Connection, parts: list[bytes]) -> bool:
-        """Send a message; return whether the socket took it."""
+        """Send a message; return whether the socket accepted it."""
         try:
             connection.send_multipart(parts, zmq.DONTWAIT)
         except zmq.Again:
@@ -178,7 +178,7 @@ class Sockets:
         return True
 
     def drain(self, connection: Connection) -> None:
-        """Handle what has arrived, until the connection is closed."""
+        """Handle the messages that have arrived, until the connection is closed."""
         with contextlib.suppress(zmq.Again):
             while (handler := self._handlers.get(connection)) is not None:
                 handler(connection.recv_multipart(zmq.DONTWAIT))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-from kouxing_client.core import ClientCore, then
+from kouxing_client.core import ClientCore, map_future
 from kouxing_client.errors import KouxingError
 from kouxing_client.inbox import new_future
 from kouxing_client.keys import Key
@@ -62,7 +62,7 @@ class ClientThread:
         answer = new_future()
 
         def run() -> None:
-            then(function(self.core), lambda result: result, answer)
+            map_future(function(self.core), lambda result: result, answer)
 
         self._sockets.call(run)
         return answer
