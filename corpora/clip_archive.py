@@ -4,7 +4,7 @@ import zipfile
 from pathlib import Path
 
 from kouxing.corpora.lip_clips import read_clips
-from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.shared.errors import UserError
 from kouxing.shared.output_file import write_error
 
@@ -40,4 +40,4 @@ def write_clip_archive(folder: Path, archive: Path) -> int:
 
 def _may_share(license_name: str) -> bool:
     """Return whether clips may be passed on: a model may use footage by third parties."""
-    return may_ship(license_name) and "third part" not in license_name
+    return may_distribute(license_name) and "third part" not in license_name

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.corpora.tables import read_rows
 from kouxing.shared.errors import UserError
 
@@ -42,10 +42,10 @@ class EmotionRecording:
     stressed_s: tuple[float, ...] = ()  # starts of stressed vowels, if phone times are given
 
 
-def read_emotions(folder: Path, *, shipping: bool = False) -> list[EmotionRecording]:
+def read_emotions(folder: Path, *, only_distributable: bool = False) -> list[EmotionRecording]:
     """Read the list of a folder; ``UserError`` if it is missing or names no known emotion.
 
-    ``shipping`` excludes recordings whose license does not allow distributing a model.
+    ``only_distributable`` excludes recordings whose license does not allow distributing a model.
     """
     manifest = folder / "manifest.tsv"
     recordings = []
@@ -61,7 +61,7 @@ def read_emotions(folder: Path, *, shipping: bool = False) -> list[EmotionRecord
                 emotion,
                 _stressed(folder / row["phones_path"]) if row.get("phones_path") else (),
             )
-            if may_ship(recording.license) or not shipping:
+            if may_distribute(recording.license) or not only_distributable:
                 recordings.append(recording)
     except ValueError as error:
         raise UserError(f"{manifest}: {error}; write the seconds as a number") from error

@@ -113,7 +113,7 @@ def _face_square(center: Array, size: Array, right_to_left_eye: Array) -> _Squar
 
 
 def _crop(image: UInt8, square: _Square, side_px: int) -> Floats:
-    """Return a square of a image, (side_px, side_px, 3), black outside the image."""
+    """Return a square of an image, (side_px, side_px, 3), black outside the image."""
     steps = (np.arange(side_px) + 0.5) / side_px - 0.5
     y, x = np.meshgrid(steps, steps, indexing="ij")
     positions = square.to_pixels(np.stack([x, y], axis=-1)) - 0.5

@@ -98,12 +98,13 @@ def _cached(
     utterances: Sequence[Utterance],
     kind: str,
     empty: NDArray[Any],
-    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
+    compute_block: Callable[[NDArray[np.float32]], NDArray[Any]],
 ) -> list[NDArray[Any]]:
     """Return a memory-mapped block of every utterance, from the cache or computed.
 
-    ``kind`` names the file. ``block_of`` computes a block from samples at 16 kHz, (n,). ``empty``
-    is the block of audio that cannot be read. Utterances are identified by path, size and time.
+    ``kind`` names the file. ``compute_block`` computes a block from samples at 16 kHz, (n,).
+    ``empty`` is the block of audio that cannot be read. Utterances are identified
+    by path, size and time.
     """
     if not utterances:
         return []
@@ -118,7 +119,7 @@ def _cached(
 
         def compute(utterance: Utterance) -> NDArray[Any]:
             with suppress(ValueError):
-                return block_of(read_audio(utterance.path))
+                return compute_block(read_audio(utterance.path))
             return empty
 
         with rows.open("wb") as file:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import lip_tracks
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -54,7 +54,7 @@ _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
 _DEPTH_FAPS = (16, 17)
 _RIG_DELAY_S = 0.04  # lag of its lips behind filmed speakers' lips
-_RIG = {
+_RIG_SHAPES = {
     "mouth_stretch_c": [
         _JAW_SCALE * value
         for value in (1021, -47, -1995, -41, 153, -1649, -739, 0, 0, 129, -1884, -50, 276, -1438,
@@ -149,7 +149,9 @@ def read_clips(
 def training_clips(clips: Iterable[LipClip], *, any_license: bool = False) -> list[LipClip]:
     """Return the clips that a model may be trained on. By default, their license must allow it."""
     return [
-        clip for clip in clips if clip.split != "held" and (any_license or may_ship(clip.license))
+        clip
+        for clip in clips
+        if clip.split != "held" and (any_license or may_distribute(clip.license))
     ]
 
 
@@ -176,12 +178,12 @@ def _read_clip(
     """Read a clip; None if it is in another language."""
     with check_content(path, "a clip"):
         # a statistic of a clip with too few frames is NaN; this function does not use it
-        about = parse_json(read_text(path, _MAX_BYTES), allow_nan=True)
-        clip_language = str(about.get("language", "zh"))[:2]
+        metadata = parse_json(read_text(path, _MAX_BYTES), allow_nan=True)
+        clip_language = str(metadata.get("language", "zh"))[:2]
         if language not in (None, clip_language):
             return None
-        license_name = str(about.get("license", about.get("licence", "")))
-        speaker = str(about.get("speaker", ""))
+        license_name = str(metadata.get("license", metadata.get("licence", "")))
+        speaker = str(metadata.get("speaker", ""))
         table = path.with_suffix(".csv")
         lines = split_lines(table, read_text(table, _MAX_BYTES))
         rows = list(itertools.islice(csv.DictReader(lines), _MAX_ROWS + 1))
@@ -196,17 +198,17 @@ def _read_clip(
         faps = _rig_faps(values) if is_rig else _tracked_faps(values)
         if np.isnan(faps).all():
             raise ValueError("it contains no FAP of the mouth")
-        split = split_of(path.stem, may_train=any_license or may_ship(license_name))
+        split = split_of(path.stem, may_train=any_license or may_distribute(license_name))
         return LipClip(
             name=path.stem,
             speaker=speaker,
             license=license_name,
             language=clip_language,
             split="held" if {path.stem, speaker} & {*held_out} else split,
-            is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,
-            is_filmed=str(about.get("kind", _FILMED)).startswith(_FILMED),
+            is_in_sync=metadata.get("grade") not in _OUT_OF_SYNC_GRADES,
+            is_filmed=str(metadata.get("kind", _FILMED)).startswith(_FILMED),
             is_rig=is_rig,
-            transcript=about.get("transcript") or "",
+            transcript=metadata.get("transcript") or "",
             time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
             faps=faps,
             samples=read_audio(path.with_suffix(".flac")),
@@ -226,7 +228,7 @@ def _tracked_faps(tracks: dict[str, Array]) -> Array:
 def _rig_faps(tracks: dict[str, Array]) -> Array:
     faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
     faps[:, columns(_RIG_FAPS)] = 0.0
-    for shape, effect in _RIG.items():
+    for shape, effect in _RIG_SHAPES.items():
         # up to three letters are the side: mouth_suck_dl, mouth_press_l, mouth_funnel_dr
         sides = [
             values

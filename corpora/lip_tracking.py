@@ -80,15 +80,15 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
     """
     mesh = FaceMesh()
     times: list[float] = []
-    tracked: list[NDArray[np.float32] | None] = []
+    landmarks_by_image: list[NDArray[np.float32] | None] = []
 
     def track_image(time_s: float, image: NDArray[np.uint8]) -> None:
         landmarks = mesh.track(image)
         times.append(time_s)
-        tracked.append(None if landmarks is None else landmarks[list(LANDMARKS)])
+        landmarks_by_image.append(None if landmarks is None else landmarks[list(LANDMARKS)])
 
     samples = read_video(video, track_image, audio_track)
-    has_face = np.array([landmarks is not None for landmarks in tracked])
+    has_face = np.array([landmarks is not None for landmarks in landmarks_by_image])
     if has_face.sum() < MIN_FRAMES:
         raise UserError(
             f"{video}: a face was found in only {plural(has_face.sum(), 'image')}; film the face "
@@ -97,11 +97,11 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
     time_s = np.array(times)
     faps = np.full((len(has_face), len(MOUTH_FAPS)), np.nan)
     levels = np.array(level_track(samples))
-    landmarks = np.stack([one for one in tracked if one is not None])
+    landmarks = np.stack([points for points in landmarks_by_image if points is not None])
     faps[has_face] = mouth_faps(landmarks, np.interp(time_s[has_face], levels[:, 0], levels[:, 1]))
     soundfile.write(clip.with_suffix(".flac"), samples, SAMPLE_RATE_HZ)
     _write_tracks(clip.with_suffix(".csv"), time_s, faps)
-    about = {
+    metadata = {
         "clip": clip.stem,
         "kind": "tracked video (MediaPipe face mesh)",
         "license": "",
@@ -111,7 +111,7 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
         "frames": len(has_face),
         "frames_ok": int(has_face.sum()),
     }
-    clip.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    clip.with_suffix(".json").write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
     return int(has_face.sum()), len(has_face)
 
 

@@ -37,7 +37,7 @@ class ErrorCounts:
         )
 
 
-def matched_pairs(
+def align_symbols(
     reference: Sequence[str], recognized: Sequence[str]
 ) -> list[tuple[int | None, int | None]]:
     """Align two strings with the fewest errors (Levenshtein 1966).
@@ -73,7 +73,7 @@ def matched_pairs(
 def count_errors(reference: Sequence[str], recognized: Sequence[str]) -> ErrorCounts:
     """Count the fewest insertions, deletions and substitutions between two strings."""
     counts = ErrorCounts(reference=len(reference))
-    for i, j in matched_pairs(reference, recognized):
+    for i, j in align_symbols(reference, recognized):
         if i is None:
             counts.insertions += 1
         elif j is None:

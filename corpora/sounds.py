@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
-from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.corpora.tables import read_rows
 from kouxing.shared.errors import UserError
 
-_BY_FILE = ("music", "noise")
+_HELD_OUT_BY_FILE = ("music", "noise")
 _BACKGROUNDS = ("music", "noise", "babble")
 
 
@@ -32,10 +32,10 @@ class Sound:
     is_held_out: bool
 
 
-def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
+def read_sounds(folders: Sequence[Path], *, only_distributable: bool) -> list[Sound]:
     """Read folders; UserError if a file is missing or cannot be read.
 
-    ``shipping`` excludes sounds whose license does not allow distributing the model.
+    ``only_distributable`` excludes sounds whose license does not allow distributing the model.
     """
     sounds = []
     for folder in folders:
@@ -45,8 +45,8 @@ def read_sounds(folders: Sequence[Path], *, shipping: bool) -> list[Sound]:
             raise UserError(f"{manifest} lists no sounds")
         try:
             for row in rows:
-                if may_ship(row["license"]) or not shipping:
-                    sounds += _parts(row["kind"], folder / row["path"])
+                if may_distribute(row["license"]) or not only_distributable:
+                    sounds += _split_sound(row["kind"], folder / row["path"])
         except OSError as error:
             raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
         except ValueError as error:
@@ -66,9 +66,9 @@ def training_backgrounds(sounds: Sequence[Sound]) -> list[NDArray[np.int16]]:
     ]
 
 
-def _parts(kind: str, path: Path) -> list[Sound]:
+def _split_sound(kind: str, path: Path) -> list[Sound]:
     samples = as_integers(read_audio(path))
-    if kind in _BY_FILE:
+    if kind in _HELD_OUT_BY_FILE:
         return [Sound(path.name, kind, samples, zlib.crc32(path.name.encode()) % 4 == 2)]
     middle = len(samples) // 2
     halves = ((samples[:middle], False), (samples[middle:], True))

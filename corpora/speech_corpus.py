@@ -104,7 +104,7 @@ class RowErrors:
         return UserError(f"no usable recordings {where}{last}")
 
 
-def may_ship(license_name: str) -> bool:
+def may_distribute(license_name: str) -> bool:
     """Return whether a model trained on data under this license may be distributed."""
     return bool(_FREE_LICENSE.search(license_name)) and not _CLOSED_LICENSE.search(license_name)
 
@@ -219,9 +219,9 @@ def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
             f"{folder} has a file 'segments', which is not supported; write each segment as a file"
         )
     split = folder.name if folder.name in _KALDI_SPLITS else "train"
-    speakers = dict(_pairs(folder / "utt2spk")) if (folder / "utt2spk").is_file() else {}
-    texts = dict(_pairs(folder / "text"))
-    for number, (utterance_id, where) in enumerate(_pairs(folder / "wav.scp"), start=1):
+    speakers = dict(_read_pairs(folder / "utt2spk")) if (folder / "utt2spk").is_file() else {}
+    texts = dict(_read_pairs(folder / "text"))
+    for number, (utterance_id, where) in enumerate(_read_pairs(folder / "wav.scp"), start=1):
         path = Path(where) if Path(where).is_absolute() else folder / where
         yield (
             f"wav.scp line {number} ({utterance_id})",
@@ -238,7 +238,7 @@ def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
 def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
     audio = {path.stem: path for path in sorted((folder / "wav").rglob("*.wav"))}
     for transcript in sorted((folder / "transcript").glob("*.txt")):
-        for number, (utterance_id, text) in enumerate(_pairs(transcript), start=1):
+        for number, (utterance_id, text) in enumerate(_read_pairs(transcript), start=1):
             path = audio.get(utterance_id, folder / "wav" / f"{utterance_id}.wav")
             yield (
                 f"{transcript.name} line {number} ({utterance_id})",
@@ -256,14 +256,15 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
             )
 
 
-def _pairs(path: Path) -> Iterator[tuple[str, str]]:
+def _read_pairs(path: Path) -> Iterator[tuple[str, str]]:
     for line in split_lines(path, read_text(path, _MAX_LIST_BYTES)):
         key, _, value = line.strip().partition(" ")
         if key:
             yield key, value.strip()
 
 
-_PREFIXES = (  # prefixes of file names; they cover whole recordings and all recordings of a speaker
+# Prefixes of file names. They cover whole recordings, and all recordings of a speaker.
+_HELD_OUT_PREFIXES = (
     "MOSS-TTSD_",
     "MOSS-TTS_reference_zh_3",
     "MiMo-Audio_aa7ed1",
@@ -278,4 +279,4 @@ _PREFIXES = (  # prefixes of file names; they cover whole recordings and all rec
 
 def is_held_out(recording: Path) -> bool:
     """Return whether a recording is held out, by the name of its file."""
-    return recording.name.startswith(_PREFIXES)
+    return recording.name.startswith(_HELD_OUT_PREFIXES)

@@ -65,9 +65,11 @@ def universal_words(row: dict[str, str]) -> list[Syllable]:
     language = "zh" if row.get("pinyin") else row.get("language", "")
     if language == "yue":
         return [_cantonese_phones(row["text"])]
-    inventory = _by_code().get(language)
+    inventory = _inventories_by_code().get(language)
     if inventory is None:
-        raise UserError(f"language {language!r} has no tables; use {', '.join(_by_code())}")
+        raise UserError(
+            f"language {language!r} has no tables; use {', '.join(_inventories_by_code())}"
+        )
     return [
         inventory.in_universal_phones(syllable)
         for syllable in inventory.pronounce(row.get("pinyin") or row["text"])
@@ -80,18 +82,18 @@ def has_labels(row: dict[str, str]) -> bool:
 
 
 @cache
-def _by_code() -> dict[str, PhoneInventory]:
+def _inventories_by_code() -> dict[str, PhoneInventory]:
     inventories = map(load_inventory, BUILT_IN)
     return {inventory.code: inventory for inventory in inventories if inventory.code}
 
 
 @cache
-def _emodb() -> dict[str, Syllable]:
+def _emodb_symbols() -> dict[str, Syllable]:
     rows = read_table("kouxing.corpora", "emodb.tsv")
     return {row["symbol"]: tuple((row["phones"] or "").split()) for row in rows}
 
 
-def _known(table: dict[str, Syllable], symbol: str) -> Syllable:
+def _look_up(table: dict[str, Syllable], symbol: str) -> Syllable:
     try:
         return table[symbol]
     except KeyError:
@@ -107,7 +109,7 @@ def _ipa_phones(word: str) -> Syllable:
 
 def _english_phones(symbols: list[str]) -> list[str]:
     """Return the phones of ARPABET. p t k are aspirated before a vowel, but not after s."""
-    phones = [phone for symbol in symbols for phone in _known(phones_of_arpabet(), symbol)]
+    phones = [phone for symbol in symbols for phone in _look_up(phones_of_arpabet(), symbol)]
     vowels = load_inventory("english").vowels
     return [
         phone + _ASPIRATED if phone in _STOPS and after in vowels and before != "s" else phone
@@ -129,7 +131,7 @@ def labeled_phones(path: Path) -> list[tuple[float, str]]:
         if symbol == before and symbol != label:
             phones[-1] = end_s, phones[-1][1]
         else:
-            parts = _known(_emodb(), symbol) or (SILENCE,)
+            parts = _look_up(_emodb_symbols(), symbol) or (SILENCE,)
             step_s = (end_s - start_s) / len(parts)
             phones += [(start_s + step_s * n, part) for n, part in enumerate(parts, start=1)]
         before = symbol

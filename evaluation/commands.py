@@ -82,19 +82,19 @@ def recognizer(
     grouped by speaking rate. Without --sounds, the music is synthesized. The JSON file also
     contains figures by speaker and for other output rules.
     """
+    from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
     from kouxing.evaluation.recognizer.disturbances import (
         check_conditions,
         disturbances_for,
-        music_from,
+        held_out_music,
     )
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
-    from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.recognizer.report import print_figures
 
     check_output(json_file, inputs=[corpus], force=force)
     check_conditions(conditions or ())
     models = list(_models(acoustic))
-    music = music_from(_read_sounds(sounds))
+    music = held_out_music(_read_sounds(sounds))
     references = align_corpus(models[0][1], corpus, split, audio)
     disturbances = disturbances_for(references, music, conditions or ())
     results = {
@@ -119,8 +119,8 @@ def languages(
     package hama is installed (make report), it also recognizes the English recordings.
     """
     from kouxing.corpora.speech_corpus import LANGUAGES
+    from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
     from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
-    from kouxing.evaluation.recognizer.references import align_corpus
     from kouxing.evaluation.rivals.tables import FOLDER
 
     check_output(json_file, force=force)
@@ -144,22 +144,26 @@ def voice(
     The audio consists of clean and disturbed speech, the held-out files of --sounds, and
     synthesized voices and noises.
     """
+    from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
     from kouxing.evaluation.recognizer.disturbances import (
         BABBLE,
         MUSIC,
         disturbances_for,
-        music_from,
+        held_out_music,
     )
-    from kouxing.evaluation.recognizer.references import align_corpus
-    from kouxing.evaluation.recognizer.voice import evaluate_voice, materials_of, print_voice
+    from kouxing.evaluation.recognizer.voice_activity import (
+        evaluate_voice,
+        labeled_audio,
+        print_voice,
+    )
 
     check_output(json_file, inputs=[corpus], force=force)
     ((name, model, _),) = _models(None)
     recorded = _read_sounds(sounds)
-    music = music_from(recorded)
+    music = held_out_music(recorded)
     references = align_corpus(model, corpus, split)
     disturbances = disturbances_for(references, music, (MUSIC, BABBLE))
-    materials = materials_of(references, disturbances, music, recorded)
+    materials = labeled_audio(references, disturbances, music, recorded)
     results = evaluate_voice({name: model}, materials)
     print_voice(results, split, Console())
     write_json(json_file, results)
@@ -173,7 +177,7 @@ def face(
 ) -> None:
     """Measure the motion of a face apart from its lips: feeling, nods, brows, blinks, stillness."""
     from kouxing.corpora.emotions import read_emotions
-    from kouxing.evaluation.face import measure_face, print_face
+    from kouxing.evaluation.face_motion import measure_face, print_face
     from kouxing.services.recognizer.acoustic.load import load_model
 
     check_output(json_file, force=force)
@@ -185,7 +189,7 @@ def face(
 def _read_sounds(folders: list[Path] | None) -> list[Sound]:
     from kouxing.corpora.sounds import read_sounds
 
-    return read_sounds(folders or (), shipping=False)
+    return read_sounds(folders or (), only_distributable=False)
 
 
 def _models(
@@ -231,14 +235,14 @@ def lips(
     """
     from kouxing.evaluation.lips.lip_scores import CONDITIONS, score_lips
     from kouxing.evaluation.lips.lip_table import print_scores
-    from kouxing.evaluation.recognizer.disturbances import check_conditions, music_from
+    from kouxing.evaluation.recognizer.disturbances import check_conditions, held_out_music
 
     check_output(json_file, force=force)
     if tables and delay_ms and not lips:
         raise UserError("--delay-ms applies to lip models; add --lips MODEL")
     conditions = conditions or list(CONDITIONS)
     check_conditions(conditions, CONDITIONS)
-    music = music_from(_read_sounds(sounds))
+    music = held_out_music(_read_sounds(sounds))
     results = score_lips(clips, lips or (), delay_ms or (), music, conditions, tables or ())
     print_scores(results, Console())
     write_json(json_file, results)
@@ -372,7 +376,7 @@ def schemes(
     """
     from kouxing.evaluation.lips import sentences
     from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
-    from kouxing.evaluation.lips.scheme_report import print_outcome
+    from kouxing.evaluation.lips.scheme_report import print_comparison
     from kouxing.evaluation.lips.scheme_scores import score_schemes
     from kouxing.evaluation.lips.scheme_videos import write_videos
     from kouxing.services.lip_models import lip_models
@@ -390,12 +394,12 @@ def schemes(
         chosen = sentences.clip_sentences(model, clips)
     else:
         chosen = sentences.sample_sentences(model, SENTENCE.parent)
-    recognizers = load_recognizers(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
+    recognizers = load_recognizers(acoustic or ["blocks", "gmm"], uses_paper_rule=paper_rule)
     names = lips or list(lip_models())
     recognized = recognize_all(recognizers, chosen)
-    outcome = score_schemes(recognized, recognizers, names)
-    print_outcome(outcome, Console())
-    write_json(json_file, asdict(outcome))
+    comparison = score_schemes(recognized, recognizers, names)
+    print_comparison(comparison, Console())
+    write_json(json_file, asdict(comparison))
     if videos:
         written = write_videos(recognized, recognizers, names, videos, tables or ())
         print_message(f"wrote {plural(len(written), 'video')} to {videos}")
@@ -465,7 +469,9 @@ def plot_heads(
     """Draw every head and every viseme, from the front and from 40 degrees."""
     from kouxing.evaluation import head_pictures
 
-    pictures = head_pictures.sheets(folder) | (head_pictures.choices(choices) if choices else {})
+    pictures = head_pictures.sheet_renderers(folder) | (
+        head_pictures.thumbnail_renderers(choices) if choices else {}
+    )
     check_output(*(path for path in pictures if path.exists()), force=force)
     for path, draw in pictures.items():
         head_pictures.save(path, draw())

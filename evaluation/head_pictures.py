@@ -22,15 +22,15 @@ from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
 
 Float32 = NDArray[np.float32]
 
-_TURNS_DEG, _PROFILE_DEG = (0.0, 40.0), 80.0
-_HEAD_PX, _VISEME_PX, _CHOICE_PX = (240, 200), (160, 160), (160, 160)
+_YAWS_DEG, _PROFILE_DEG = (0.0, 40.0), 80.0
+_HEAD_PX, _VISEME_PX, _THUMBNAIL_PX = (240, 200), (160, 160), (160, 160)
 _MOUTH_PX, _FACE_PX = (176, 132), (272, 204)
-_MOUTHS = ("a", "i", "u", "o", "e", "v", "f", "b", "d", "g")
+_MOUTH_VISEMES = ("a", "i", "u", "o", "e", "v", "f", "b", "d", "g")
 _EXPRESSIONS = ("joy", "sadness", "anger", "surprise")
-_AMOUNTS = (0.5, 1.0, 1.4, 2.0)  # values of the expressiveness
-_VISEMES_A_ROW = 9
+_EXPRESSIVENESS = (0.5, 1.0, 1.4, 2.0)  # values of the expressiveness
+_VISEMES_PER_ROW = 9
 _REST = np.zeros(NUM_FAPS, np.float32)
-_SCALE = 2  # pictures are drawn larger and reduced, for smooth edges
+_SCALE = 2  # pictures are drawn larger and then reduced, for smooth edges
 
 
 def _head_names() -> list[str]:
@@ -38,19 +38,19 @@ def _head_names() -> list[str]:
     return sorted(HEAD_NAMES, key=lambda name: (name != DEFAULT_HEAD, name))
 
 
-def sheets(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
+def sheet_renderers(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
     """Return the functions that draw the files for the docs."""
-    drawn = {
+    image = {
         "heads": _draw_heads, "faces": _draw_visemes, "mouths": _draw_mouths,
         "expressions": _draw_expressions, "expressiveness": _draw_expressiveness,
     }  # fmt: skip
-    return {folder / f"{name}.webp": draw for name, draw in drawn.items()}
+    return {folder / f"{name}.webp": draw for name, draw in image.items()}
 
 
-def choices(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
+def thumbnail_renderers(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
     """Return the functions that draw the files for the page, ``head-NAME.webp``."""
     return {
-        folder / f"head-{name}.webp": partial(_picture, name, _REST, _CHOICE_PX)
+        folder / f"head-{name}.webp": partial(_render, name, _REST, _THUMBNAIL_PX)
         for name in _head_names()
     }
 
@@ -65,10 +65,10 @@ def save(path: Path, image: Image.Image) -> None:
 
 
 def _draw_heads() -> Image.Image:
-    return _sheet(
+    return _arrange_in_rows(
         [
-            [_labelled(_picture(name, _REST, _HEAD_PX, turn), name) for name in _head_names()]
-            for turn in _TURNS_DEG
+            [_add_label(_render(name, _REST, _HEAD_PX, turn), name) for name in _head_names()]
+            for turn in _YAWS_DEG
         ]
     )
 
@@ -77,23 +77,23 @@ def _draw_visemes() -> Image.Image:
     visemes = list(VISEME_INDEX)
     rows = [
         [
-            _labelled(_picture(DEFAULT_HEAD, _spoken(viseme), _VISEME_PX, turn), viseme)
-            for viseme in visemes[start : start + _VISEMES_A_ROW]
+            _add_label(_render(DEFAULT_HEAD, _viseme_faps(viseme), _VISEME_PX, turn), viseme)
+            for viseme in visemes[start : start + _VISEMES_PER_ROW]
         ]
-        for start in range(0, len(visemes), _VISEMES_A_ROW)
-        for turn in _TURNS_DEG
+        for start in range(0, len(visemes), _VISEMES_PER_ROW)
+        for turn in _YAWS_DEG
     ]
-    return _sheet(rows)
+    return _arrange_in_rows(rows)
 
 
 def _draw_mouths() -> Image.Image:
-    poses = {"rest": _REST} | {viseme: _spoken(viseme) for viseme in _MOUTHS}
-    views = [(name, turn) for name in _head_names() for turn in _TURNS_DEG]
-    views.insert(len(_TURNS_DEG), (DEFAULT_HEAD, _PROFILE_DEG))
-    return _sheet(
+    poses = {"rest": _REST} | {viseme: _viseme_faps(viseme) for viseme in _MOUTH_VISEMES}
+    views = [(name, turn) for name in _head_names() for turn in _YAWS_DEG]
+    views.insert(len(_YAWS_DEG), (DEFAULT_HEAD, _PROFILE_DEG))
+    return _arrange_in_rows(
         [
             [
-                _labelled(_picture(name, faps, _MOUTH_PX, turn, Framing.MOUTH), label)
+                _add_label(_render(name, faps, _MOUTH_PX, turn, Framing.MOUTH), label)
                 for label, faps in poses.items()
             ]
             for name, turn in views
@@ -105,30 +105,32 @@ def _draw_expressions() -> Image.Image:
     poses = {"rest": _REST} | {
         name: EXPRESSIONS[EXPRESSION_NAMES.index(name)] for name in _EXPRESSIONS
     }
-    return _sheet(
+    return _arrange_in_rows(
         [
-            [_labelled(_picture(name, faps, _FACE_PX), label) for label, faps in poses.items()]
+            [_add_label(_render(name, faps, _FACE_PX), label) for label, faps in poses.items()]
             for name in _head_names()
         ]
     )
 
 
 def _draw_expressiveness() -> Image.Image:
-    return _sheet(
+    return _arrange_in_rows(
         [
             [
-                _labelled(
-                    _picture(DEFAULT_HEAD, _spoken(viseme, amount), _FACE_PX),
+                _add_label(
+                    _render(DEFAULT_HEAD, _viseme_faps(viseme, amount), _FACE_PX),
                     f"{viseme} {amount:g}",
                 )
-                for viseme in _MOUTHS[:6]
+                for viseme in _MOUTH_VISEMES[:6]
             ]
-            for amount in _AMOUNTS
+            for amount in _EXPRESSIVENESS
         ]
     )
 
 
-def _spoken(viseme: str, expressiveness: float = SynthesizerConfig().expressiveness) -> Float32:
+def _viseme_faps(
+    viseme: str, expressiveness: float = SynthesizerConfig().expressiveness
+) -> Float32:
     """Return the FAPs (68,) of a viseme's target."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
@@ -136,7 +138,7 @@ def _spoken(viseme: str, expressiveness: float = SynthesizerConfig().expressiven
     return faps
 
 
-def _picture(
+def _render(
     name: str,
     faps: Float32,
     size: tuple[int, int],
@@ -146,17 +148,17 @@ def _picture(
     head = Head.load(name)
     view = camera(head, framing, yaw_deg)
     renderer = Renderer(head, _SCALE * size[0], _SCALE * size[1], camera=view)
-    drawn = Image.fromarray(renderer.draw(faps))
+    image = Image.fromarray(renderer.draw(faps))
     renderer.close()
-    return drawn.resize(size, Image.Resampling.LANCZOS)
+    return image.resize(size, Image.Resampling.LANCZOS)
 
 
-def _labelled(image: Image.Image, label: str) -> Image.Image:
+def _add_label(image: Image.Image, label: str) -> Image.Image:
     ImageDraw.Draw(image).text((5, 2), label, fill="white", font=ImageFont.load_default(13))
     return image
 
 
-def _sheet(rows: list[list[Image.Image]]) -> Image.Image:
+def _arrange_in_rows(rows: list[list[Image.Image]]) -> Image.Image:
     width, height = rows[0][0].size
     sheet = Image.new("RGB", (width * max(map(len, rows)), height * len(rows)), "#5c6e80")
     for row, images in enumerate(rows):

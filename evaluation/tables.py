@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from string import ascii_uppercase
 
 
-def format_number(value: float | None, form: str = ".2f") -> str:
+def format_number(value: float | None, format_spec: str = ".2f") -> str:
     """Format a figure; None is a dash."""
-    return "-" if value is None else format(value, form)
+    return "-" if value is None else format(value, format_spec)
 
 
-def percent(rate: float | None, form: str = ".1f") -> str:
+def percent(rate: float | None, format_spec: str = ".1f") -> str:
     """Format a rate as a percentage; None is a dash."""
-    return format_number(None if rate is None else 100 * rate, form)
+    return format_number(None if rate is None else 100 * rate, format_spec)
 
 
 def letters_of(names: Sequence[str]) -> tuple[dict[str, str], str]:

@@ -1,4 +1,4 @@
-"""A headless Chromium with one page, of which pictures can be taken, and a server of files."""
+"""A headless Chromium with one page, and screenshots of that page."""
 
 import base64
 import io
@@ -13,7 +13,7 @@ from tests.system import wait_until
 
 SIZE_PX = (480, 360)
 IS_CURRENT = "window.kouxing?.state.drawing?.isCurrent ?? true"
-TWO_TICKS = (
+AFTER_TWO_FRAMES = (
     "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
 )
 READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
@@ -40,7 +40,7 @@ class Browser(Chromium):
         """Load a page of another origin, without the errors of the previous page."""
         self.command("Page.navigate", url="about:blank")
         self.wait_for("location.href === 'about:blank'")
-        self.complaints.clear()
+        self.page_errors.clear()
         self.command("Page.navigate", url=address)
 
     def keep_resolution(self) -> None:
@@ -64,7 +64,7 @@ class Browser(Chromium):
         images = [np.zeros(0, np.uint8)]
 
         def is_steady() -> bool:
-            self.evaluate(TWO_TICKS)
+            self.evaluate(AFTER_TWO_FRAMES)
             self.wait_for(IS_CURRENT)
             images.append(self.image())
             return bool(self.evaluate(IS_CURRENT)) and np.array_equal(images[-1], images[-2])

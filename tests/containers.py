@@ -1,4 +1,4 @@
-"""Containers without an engine: processes with the isolation that a container would have.
+"""Containers without a container engine: processes with the isolation that a container would have.
 
 Each has a network namespace and a file system that is read-only except for ``/tmp``. It gets the
 environment, secrets and hosts of its description. Its user may only read this machine's Python.

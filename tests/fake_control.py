@@ -34,7 +34,7 @@ LOCAL = "tcp://127.0.0.1:*"
 TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls it
 FACTS = SessionFacts(language="mandarin", frame_rate_hz=50.0)
 EPOCH = 1
-M = TypeVar("M", bound=Message)
+MessageType = TypeVar("MessageType", bound=Message)
 
 
 class FakeControl:
@@ -107,7 +107,7 @@ class FakeControl:
         self.openings.clear()
         self.audio_messages.clear()
 
-    def do(self, job: Callable[[], object]) -> None:
+    def run_job(self, job: Callable[[], object]) -> None:
         """Run a job on the thread that owns the sockets, and wait until it is done."""
         done = threading.Event()
         self._jobs.put(job)
@@ -115,17 +115,17 @@ class FakeControl:
         assert done.wait(LIMIT_S)
 
     def publish(self, publisher: Socket, *messages: Message) -> None:
-        self.do(lambda: [publisher.send(message) for message in messages])
+        self.run_job(lambda: [publisher.send(message) for message in messages])
 
     def send(self, message: Message) -> None:
         """Send a message to the service."""
-        self.do(lambda: self.commands.send(message, to=self.service))
+        self.run_job(lambda: self.commands.send(message, to=self.service))
 
     def start(self, session: str, **fields: Any) -> None:
         """Start a session at the service, and wait until it has started."""
-        num_started = len(self.of(SessionStarted))
+        num_started = len(self.messages_of(SessionStarted))
         self.send_start(session, **fields)
-        wait_until(lambda: len(self.of(SessionStarted)) > num_started)
+        wait_until(lambda: len(self.messages_of(SessionStarted)) > num_started)
 
     def send_start(self, session: str, **fields: Any) -> None:
         self.send(self._start_message(session, **fields))
@@ -138,13 +138,13 @@ class FakeControl:
         self.audio = self.bus.bind_router(self.audio_endpoint, "audio")
         self._poller.add(self.audio)
 
-    def of(self, kind: type[M]) -> list[M]:
+    def messages_of(self, kind: type[MessageType]) -> list[MessageType]:
         """Return the received messages of a kind."""
         return [message for message in [*self.received] if isinstance(message, kind)]
 
     def sessions_of(self, kind: type[Message]) -> list[str]:
         """Return the sessions of the received messages of a kind."""
-        return [message.session for message in self.of(kind)]
+        return [message.session for message in self.messages_of(kind)]
 
     @property
     def page(self) -> str:
@@ -178,8 +178,8 @@ class FakeControl:
         """Handle a message to the recognizer."""
         self.audio_messages.append(chunk)
         self.audio_sender = sender
-        taken = Acknowledge(session=chunk.session, sequence=chunk.sequence)
-        self.audio.send(taken, to=sender)
+        acknowledgement = Acknowledge(session=chunk.session, sequence=chunk.sequence)
+        self.audio.send(acknowledgement, to=sender)
 
     def on_tick(self) -> None:
         """Work between messages."""

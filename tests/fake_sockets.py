@@ -29,7 +29,7 @@ class FakeConnection:
 
 
 class FakeSockets:
-    """Implements what a client's core and a follower need of ``Sockets``."""
+    """The part of ``Sockets`` that a client's core and a follower use."""
 
     def __init__(self) -> None:
         self.now_s = 100.0

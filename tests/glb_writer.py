@@ -1,4 +1,4 @@
-"""Writes small GLBs like other programs (dense accessors, no kouxing extras), and reads GLBs."""
+"""Writes small GLBs as other programs do (dense accessors, no kouxing extras), and reads GLBs."""
 
 import json
 import struct

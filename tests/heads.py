@@ -45,7 +45,7 @@ def travel_m(head: Head, fap: Fap, value: float) -> tuple[int, float]:
     return axis, sign * value * head.fapu[fap.fapu] / 1024
 
 
-def only(number: int, value: float) -> NDArray[np.float32]:
+def single_fap(number: int, value: float) -> NDArray[np.float32]:
     """Return FAPs (68,) with one value."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[number - 1] = value

@@ -9,7 +9,7 @@ NUM_FEATURES, NUM_COMPONENTS, UNITS, NUM_LIPS = 160 + 307, 6, 5, 51  # log-mel, 
 DELAYS_S = (-0.005, 0.055, 0.155)
 
 
-def made_up_model() -> LipPredictor:
+def random_lip_predictor() -> LipPredictor:
     rng = np.random.default_rng(0)
     outputs = (len(DELAYS_S), NUM_OUTPUTS)
 

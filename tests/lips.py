@@ -70,7 +70,7 @@ def advance(face: FaceAnimator, time_s: float) -> list[Frame]:
     return face.process(Progress(time_s=time_s, level_db=SILENT_DB))
 
 
-def moment(
+def frame_context(
     time_s: float,
     articulation: Articulation | None = None,
     levels: Sequence[tuple[float, float]] = (),

@@ -18,7 +18,7 @@ STIFF = ("brows", "lashes")  # transparent parts that move, which these meshes o
 def meshes(shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
     """Return the parts with morph targets, given as FAPs (68,) by name."""
     shown = [part for part in ORIGINAL.parts if not part.name.startswith(STIFF)]
-    made = {
+    shape_faps = {
         part.name: Mesh(
             part.name,
             ORIGINAL.vertices[part.vertices],
@@ -33,8 +33,8 @@ def meshes(shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
         shift = (ORIGINAL.basis @ np.asarray(faps, np.float32)).reshape(-1, 3)
         for part in shown:
             if np.abs(shift[part.vertices]).max() > 1e-6:
-                made[part.name].targets[name] = shift[part.vertices]
-    return list(made.values())
+                shape_faps[part.name].targets[name] = shift[part.vertices]
+    return list(shape_faps.values())
 
 
 def write_obj(path: Path, parts: list[Mesh]) -> None:

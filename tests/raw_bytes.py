@@ -5,12 +5,12 @@ import socket
 import time
 from random import Random
 
-from kouxing.evaluation.system.attackers import GREETING, LOCALHOST, LONG, ready
+from kouxing.evaluation.system.attackers import GREETING, LOCALHOST, LONG, ready_command
 
 MORE = 1  # flag of a frame
 
 
-def pour(port: int, seconds: float) -> None:
+def flood(port: int, seconds: float) -> None:
     """Send invalid bytes over many connections, the same ones in every run."""
     random = Random(1)  # noqa: S311
     end_s = time.monotonic() + seconds
@@ -20,7 +20,7 @@ def pour(port: int, seconds: float) -> None:
             socket.create_connection(("127.0.0.1", port), timeout=0.02) as connection,
         ):
             for _ in range(random.choice([1, 1, 20])):
-                connection.sendall(_nonsense(random))
+                connection.sendall(_invalid_bytes(random))
             connection.recv(1000)
 
 
@@ -35,13 +35,13 @@ def answer_handshake(listener: socket.socket, curve: bool, rest: bytes) -> None:
             pass
 
 
-def _nonsense(random: Random) -> bytes:
+def _invalid_bytes(random: Random) -> bytes:
     """Return random bytes after the first bytes of a valid message."""
     beginnings = [
         b"",
         GREETING,
-        GREETING + ready("DEALER"),
-        GREETING + ready("SUB"),
+        GREETING + ready_command("DEALER"),
+        GREETING + ready_command("SUB"),
         GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32),
         b"\xff" + bytes(8) + b"\x7f\x01\x05",
         b"\x01\x00",
@@ -52,14 +52,14 @@ def _nonsense(random: Random) -> bytes:
     return random.choice(beginnings) + random.randbytes(random.choice([1, 10, 100, 10_000]))
 
 
-def connected(port: int, kind: str = "DEALER", host: str = LOCALHOST) -> socket.socket:
+def connect_raw(port: int, kind: str = "DEALER", host: str = LOCALHOST) -> socket.socket:
     """Connect from ``host`` to a port of this machine, with the handshake of a socket without keys.
 
     ``kind`` is ZeroMQ's name of the socket kind. Raises OSError if the other end refuses.
     """
     connection = socket.create_connection((LOCALHOST, port), 5.0, (host, 0))
     try:
-        connection.sendall(GREETING + ready(kind))
+        connection.sendall(GREETING + ready_command(kind))
         answer = b""
         while len(answer) < len(GREETING) + 2:  # up to the start of the peer's READY
             received = connection.recv(1024)

@@ -114,7 +114,7 @@ def gmm(
         output,
         load_inventory(language or DEFAULT_LANGUAGE),
         phone_lm=phone_lm,
-        shipping=not context.obj,
+        only_distributable=not context.obj,
     )
 
 
@@ -147,7 +147,7 @@ def blocks(
         untranscribed=untranscribed or [],
         sounds=sounds or [],
         num_steps=steps,
-        shipping=not context.obj,
+        only_distributable=not context.obj,
     )
 
 
@@ -185,7 +185,7 @@ def universal(
         languages=languages or [],
         clips=clips,
         num_steps=steps,
-        shipping=not context.obj,
+        only_distributable=not context.obj,
     )
 
 
@@ -218,7 +218,7 @@ def encoder(
         untranscribed=untranscribed or [],
         sounds=sounds,
         num_steps=steps,
-        shipping=not context.obj,
+        only_distributable=not context.obj,
     )
 
 
@@ -274,10 +274,10 @@ def traits(
     force: Force = False,
 ) -> None:
     """Train the readout of arousal, valence, laughter and breath (.npz), with its model card."""
-    from kouxing.training.traits import train_traits
+    from kouxing.training.voice_traits import train_traits
 
     check_output(output, force=force)
-    train_traits(recordings, sounds, output, shipping=not context.obj)
+    train_traits(recordings, sounds, output, only_distributable=not context.obj)
 
 
 @app.command()

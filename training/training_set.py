@@ -21,7 +21,7 @@ from kouxing.corpora.speech_corpus import (
     audio_files,
     is_held_out,
     is_synthetic,
-    may_ship,
+    may_distribute,
     read_corpus,
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
@@ -71,20 +71,22 @@ def load_examples(
     inventory: PhoneInventory,
     *,
     split: str = "train",
-    shipping: bool = True,
+    only_distributable: bool = True,
     with_samples: bool = False,
 ) -> list[Example]:
     """Read the recordings of one split, with their log-mel features and weights.
 
-    ``errors`` receives a message for every row that cannot be used. ``shipping`` excludes rows
-    whose license does not allow distributing the model. ``with_samples`` also loads the samples.
-    Raises UserError if no recording can be used.
+    ``errors`` receives a message for every row that cannot be used. ``only_distributable`` excludes
+    rows whose license does not allow distributing the model. ``with_samples`` also loads the
+    samples. Raises UserError if no recording can be used.
     """
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
     sounds: list[NDArray[np.int16]] = []
     for corpus in corpora:
-        rows = read_utterances(corpus, errors, inventory, split=split, shipping=shipping)
+        rows = read_utterances(
+            corpus, errors, inventory, split=split, only_distributable=only_distributable
+        )
         utterances += rows
         log_mels += log_mel_of(rows, errors)
         sounds += samples_of(rows) if with_samples else [_NO_SAMPLES] * len(rows)
@@ -117,16 +119,21 @@ def load_examples(
 
 
 def read_utterances(
-    corpus: Path, errors: RowErrors, inventory: PhoneInventory, *, split: str, shipping: bool
+    corpus: Path,
+    errors: RowErrors,
+    inventory: PhoneInventory,
+    *,
+    split: str,
+    only_distributable: bool,
 ) -> list[Utterance]:
     """Read the list of a corpus. For the arguments, see :func:`load_examples`."""
     rows = read_corpus(corpus, errors, inventory, split=split)
     for row in rows:
-        if shipping and not may_ship(row.license):
+        if only_distributable and not may_distribute(row.license):
             license_name = row.license or "none"
             problem = f"its license ({license_name}) does not allow distributing a model"
             errors.add(row.utterance_id, problem)
-    return [row for row in rows if not shipping or may_ship(row.license)]
+    return [row for row in rows if not only_distributable or may_distribute(row.license)]
 
 
 def weights_of(utterances: Sequence[Utterance]) -> list[float]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.closures import Detections, closures
+from kouxing.evaluation.lips.closures import DetectionCounts, closures
 from kouxing.evaluation.lips.curves import LAGS_S, Moments, best_lag, pooled_moments
 from kouxing.evaluation.lips.mouths import CURVES, Mouth
 
 Array = NDArray[np.float64]
-Pair = tuple[Mouth, Mouth]  # the predicted and the real mouth
+MouthPair = tuple[Mouth, Mouth]  # the predicted and the real mouth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,25 +25,25 @@ class Agreement:
     closure_f1: float | None
 
 
-def agreement_of(pairs: Sequence[Pair]) -> Agreement:
+def agreement_of(pairs: Sequence[MouthPair]) -> Agreement:
     """Compare mouths."""
     return Agreement(
         num_clips=len(pairs),
         correlation={name: moments(pairs, name).correlation for name in CURVES},
         error=moments(pairs, "opening").rmse,
         lag_ms=lag_ms(pairs),
-        closure_f1=sum((closures(*pair) for pair in pairs), Detections()).f1,
+        closure_f1=sum((closures(*pair) for pair in pairs), DetectionCounts()).f1,
     )
 
 
-def moments(pairs: Sequence[Pair], curve: str, lag_s: float = 0.0) -> Moments:
+def moments(pairs: Sequence[MouthPair], curve: str, lag_s: float = 0.0) -> Moments:
     """Compare a curve over all frames, after removal of each clip's means."""
     return pooled_moments(
         (predicted.at(curve, real.time_s + lag_s), real.curves[curve]) for predicted, real in pairs
     )
 
 
-def lag_ms(pairs: Sequence[Pair]) -> float | None:
+def lag_ms(pairs: Sequence[MouthPair]) -> float | None:
     """Return the lag of the opening with the highest correlation, ms; positive: late.
 
     Viewers notice sound that is 45 ms early or 125 ms late (ITU-R BT.1359-1).

@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from kouxing.evaluation.lips.closures import WINDOW_S, Detections, is_closed_at
+from kouxing.evaluation.lips.closures import WINDOW_S, DetectionCounts, is_closed_at
 from kouxing.evaluation.lips.references import PAUSE, Reference
 from kouxing.evaluation.lips.scored_clip import ScoredClips
 
@@ -18,9 +18,9 @@ CLOSURE_CLASSES = {
 }
 
 
-def closure_detections(clips: ScoredClips) -> Detections:
+def closure_detections(clips: ScoredClips) -> DetectionCounts:
     """Compare the closures of all clips."""
-    return sum((clip.closures for clip in clips), Detections())
+    return sum((clip.closures for clip in clips), DetectionCounts())
 
 
 def class_precision(clips: ScoredClips, name: str) -> float | None:
@@ -43,17 +43,17 @@ def closure_class(reference: Reference, time_s: float) -> str:
     return next((name for name, members in CLOSURE_CLASSES.items() if viseme in members), "other")
 
 
-def labials_shut(clips: ScoredClips) -> float | None:
+def labial_closure_rate(clips: ScoredClips) -> float | None:
     """Return the fraction of b p m whose lips are closed within 40 ms of the quietest moment."""
     shut = [
-        is_closed_at(clip.reference.quietest_moments(clip.reference.labials()), clip.predicted)
+        is_closed_at(clip.reference.quietest_times(clip.reference.labials()), clip.predicted)
         for clip in clips
     ]
     flags = np.concatenate([np.zeros(0, bool), *shut])
     return float(flags.mean()) if len(flags) else None
 
 
-def share_shut(clips: ScoredClips) -> float | None:
+def closed_fraction(clips: ScoredClips) -> float | None:
     """Return the fraction of the frames in speech in which the lips are closed."""
     flags = [
         clip.predicted.is_closed[clip.reference.is_speech(clip.predicted.time_s)] for clip in clips

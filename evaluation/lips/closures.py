@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOW_S = 0.04
-_OPEN = 100.0  # opening of predicted lips in FAP units: 3 mm on a face
+_MIN_OPEN = 100.0  # opening of predicted lips in FAP units: 3 mm on a face
 _OPEN_FRACTION, _OPEN_WINDOW_S = 0.5, 0.2  # fraction of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)
-class Detections:
+class DetectionCounts:
     """Numbers of real, reproduced and predicted events, and of predictions that are true."""
 
     real: int = 0
@@ -30,8 +30,8 @@ class Detections:
     predicted: int = 0
     true: int = 0
 
-    def __add__(self, other: Detections) -> Detections:
-        return Detections(
+    def __add__(self, other: DetectionCounts) -> DetectionCounts:
+        return DetectionCounts(
             self.real + other.real,
             self.met + other.met,
             self.predicted + other.predicted,
@@ -69,18 +69,18 @@ def real_closures(mouth: Mouth) -> Array:
     """Return when real lips close, seconds: minima of closed lips near an opening."""
     before, here, after = mouth.opening[:-2], mouth.opening[1:-1], mouth.opening[2:]
     is_minimum = (here <= before) & (here < after) & mouth.is_closed[1:-1]
-    moments_s: Array = mouth.time_s[1:-1][is_minimum]
-    if not len(moments_s):
-        return moments_s
+    events_s: Array = mouth.time_s[1:-1][is_minimum]
+    if not len(events_s):
+        return events_s
     low, high = np.percentile(mouth.opening, [1, 99])
-    opened_s = mouth.time_s[mouth.opening > low + _OPEN_FRACTION * (high - low)]
-    return np.asarray(moments_s[is_near(moments_s, opened_s, _OPEN_WINDOW_S)])
+    opening_times_s = mouth.time_s[mouth.opening > low + _OPEN_FRACTION * (high - low)]
+    return np.asarray(events_s[is_near(events_s, opening_times_s, _OPEN_WINDOW_S)])
 
 
-def is_closed_at(moments_s: Array, mouth: Mouth) -> Mask:
+def is_closed_at(events_s: Array, mouth: Mouth) -> Mask:
     """Whether lips close within 40 ms of each moment and are open within 0.2 s."""
-    near = is_near(moments_s, mouth.time_s[mouth.is_closed], WINDOW_S)
-    return near & is_near(moments_s, mouth.time_s[mouth.opening > _OPEN], _OPEN_WINDOW_S)
+    near = is_near(events_s, mouth.time_s[mouth.is_closed], WINDOW_S)
+    return near & is_near(events_s, mouth.time_s[mouth.opening > _MIN_OPEN], _OPEN_WINDOW_S)
 
 
 def contacts(predicted: Mouth, real: Mouth) -> list[Contact]:
@@ -88,9 +88,11 @@ def contacts(predicted: Mouth, real: Mouth) -> list[Contact]:
 
     Closures where the real mouth is unknown, such as after the end of the clip, do not count.
     """
-    is_open = predicted.opening > _OPEN
-    opened_s = predicted.time_s[is_open]
-    touching = predicted.is_closed & ~is_open & is_near(predicted.time_s, opened_s, _OPEN_WINDOW_S)
+    is_open = predicted.opening > _MIN_OPEN
+    opening_times_s = predicted.time_s[is_open]
+    touching = (
+        predicted.is_closed & ~is_open & is_near(predicted.time_s, opening_times_s, _OPEN_WINDOW_S)
+    )
     touching &= is_near(predicted.time_s, real.time_s, WINDOW_S)
     # A contact's number is how often the lips have opened before it. Contact 0 is the initial rest.
     state = np.where(is_open, 1, -1)[is_open | touching]
@@ -104,7 +106,7 @@ def contacts(predicted: Mouth, real: Mouth) -> list[Contact]:
     ]
 
 
-def closures(predicted: Mouth, real: Mouth) -> Detections:
+def closures(predicted: Mouth, real: Mouth) -> DetectionCounts:
     """Compare closures. A real closure is reproduced if the predicted lips also close within 40 ms.
 
     Adapted from the closure accuracy of Electronic Arts, which measures only recall.
@@ -123,4 +125,4 @@ def closures(predicted: Mouth, real: Mouth) -> Detections:
     real_s, predicted_contacts = real_closures(real), contacts(predicted, real)
     num_met = int(is_closed_at(real_s, predicted).sum())
     num_true = sum(contact.is_true for contact in predicted_contacts)
-    return Detections(len(real_s), num_met, len(predicted_contacts), num_true)
+    return DetectionCounts(len(real_s), num_met, len(predicted_contacts), num_true)

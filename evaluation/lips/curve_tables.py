@@ -44,7 +44,7 @@ class CurveTable:
 
 
 @dataclass(frozen=True, slots=True)
-class ShippedMouth:
+class FapConversion:
     """Converts curves to FAPs: ``basis`` (num_curves, 68) and ``offset`` (68,)."""
 
     basis: Array
@@ -99,7 +99,7 @@ def read_table(path: Path) -> CurveTable:
     return CurveTable(time_s, tuple(name for name in names if name != TIME), values)
 
 
-def shipped_mouth(folder: Path, tables: Collection[CurveTable]) -> ShippedMouth:
+def fap_conversion(folder: Path, tables: Collection[CurveTable]) -> FapConversion:
     """Return the conversion of a folder's curves to FAPs.
 
     Shapes have the FAPs of this package's tables. An opening has no unit. Over all tables, its
@@ -115,7 +115,7 @@ def shipped_mouth(folder: Path, tables: Collection[CurveTable]) -> ShippedMouth:
         )
         scale = _MAX_OPENING / max(float(high - low), 1e-9)
         basis[column, _LOWER_LIP], offset[_LOWER_LIP] = -scale, scale * low
-        return ShippedMouth(basis, offset)
+        return FapConversion(basis, offset)
     known: Mapping[str, NDArray[np.float32]] = {
         name: row
         for shapes in (ARKIT, OCULUS)
@@ -129,4 +129,4 @@ def shipped_mouth(folder: Path, tables: Collection[CurveTable]) -> ShippedMouth:
             f"{folder}: no column is a curve of a mouth; name a column {OPENING}, jawOpen or"
             " another ARKit shape, or viseme_aa or another Oculus viseme"
         )
-    return ShippedMouth(basis, offset)
+    return FapConversion(basis, offset)

@@ -20,22 +20,22 @@ class Moments:
 
     num_frames: int = 0
     products: float = 0.0
-    made_power: float = 0.0
+    predicted_power: float = 0.0
     real_power: float = 0.0
 
     @property
     def correlation(self) -> float | None:
         """Pearson correlation; None if a curve is constant."""
-        if min(self.made_power, self.real_power) <= _NO_POWER * self.num_frames:
+        if min(self.predicted_power, self.real_power) <= _NO_POWER * self.num_frames:
             return None
-        return self.products / float(np.sqrt(self.made_power * self.real_power))
+        return self.products / float(np.sqrt(self.predicted_power * self.real_power))
 
     @property
     def rmse(self) -> float | None:
         """Root mean square error; None without frames."""
         if not self.num_frames:
             return None
-        squares = self.made_power + self.real_power - 2.0 * self.products
+        squares = self.predicted_power + self.real_power - 2.0 * self.products
         return float(np.sqrt(max(squares, 0.0) / self.num_frames))
 
 
@@ -86,13 +86,13 @@ def rms_jerk(curves: Sequence[Array], rate_hz: float) -> float | None:
     return float(np.sqrt(np.mean(jerks**2))) if len(jerks) else None
 
 
-def is_near(moments_s: Array, others_s: Array, window_s: float) -> Mask:
+def is_near(events_s: Array, others_s: Array, window_s: float) -> Mask:
     """Whether one of the others, which are sorted, is within a window around each moment."""
     if not len(others_s):
-        return np.zeros(len(moments_s), dtype=bool)
-    after = np.searchsorted(others_s, moments_s)
+        return np.zeros(len(events_s), dtype=bool)
+    after = np.searchsorted(others_s, events_s)
     gaps = [
-        np.abs(others_s[np.clip(index, 0, len(others_s) - 1)] - moments_s)
+        np.abs(others_s[np.clip(index, 0, len(others_s) - 1)] - events_s)
         for index in (after - 1, after)
     ]
     near: Mask = np.minimum(*gaps) <= window_s + _ROUNDING_S

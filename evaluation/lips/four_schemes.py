@@ -58,13 +58,13 @@ class Condition:
 
 
 @dataclass(frozen=True, slots=True)
-class TestedRecognizer:
+class RecognizerSetup:
     """A recognizer with the settings that suit its acoustic model."""
 
     name: str
     model: AcousticModel
     config: RecognizerConfig
-    has_paper_rule: bool  # phones are emitted as in the paper and never corrected
+    uses_paper_rule: bool  # phones are emitted as in the paper and never corrected
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class RecognizerOutput:
 
     offline: AnalyzedRecording
     live: Mapping[float, Sequence[SoundEvent]]  # by the face's delay in seconds
-    has_paper_rule: bool
+    uses_paper_rule: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +86,8 @@ class RecognizedSentence:
 
 
 def load_recognizers(
-    names: Sequence[str], *, has_paper_rule: bool = False
-) -> list[TestedRecognizer]:
+    names: Sequence[str], *, uses_paper_rule: bool = False
+) -> list[RecognizerSetup]:
     """Load recognizers by the names or paths of their acoustic models.
 
     With the paper's output rule, their names end in ``-paper``.
@@ -96,14 +96,14 @@ def load_recognizers(
     for name in names:
         model = load_model(name)
         config = RecognizerConfig(acoustic=name)
-        if has_paper_rule:
+        if uses_paper_rule:
             config = RecognizerConfig(acoustic=name, num_stable_frames=3, min_confidence=0.0)
-        title = Path(name).stem + ("-paper" if has_paper_rule else "")
-        recognizers.append(TestedRecognizer(title, model, config, has_paper_rule))
+        title = Path(name).stem + ("-paper" if uses_paper_rule else "")
+        recognizers.append(RecognizerSetup(title, model, config, uses_paper_rule))
     return recognizers
 
 
-def all_conditions(recognizers: Sequence[TestedRecognizer], lips: Sequence[str]) -> list[Condition]:
+def all_conditions(recognizers: Sequence[RecognizerSetup], lips: Sequence[str]) -> list[Condition]:
     """Return all conditions, grouped by lip model."""
     conditions = []
     for name in lips:
@@ -114,7 +114,7 @@ def all_conditions(recognizers: Sequence[TestedRecognizer], lips: Sequence[str])
 
 
 def recognize_all(
-    recognizers: Sequence[TestedRecognizer], sentences: Sequence[Sentence]
+    recognizers: Sequence[RecognizerSetup], sentences: Sequence[Sentence]
 ) -> list[RecognizedSentence]:
     """Run all recognizers on all sentences."""
     lips = load_lip_predictor()
@@ -131,7 +131,7 @@ def recognize_all(
                     is_text_known=False,
                 ),
                 live_events(tested.model, samples, lips, _DELAYS_S, tested.config),
-                tested.has_paper_rule,
+                tested.uses_paper_rule,
             )
             for tested in recognizers
         }
@@ -164,7 +164,7 @@ def face_input(condition: Condition, output: RecognizerOutput) -> Sequence[Sound
     """Return the events that the face of a live condition receives."""
     events = output.live[lip_model_info(condition.lips).delay_ms / 1e3]
     is_delayed = condition.scheme == NEXT_PHONE
-    if output.has_paper_rule:
+    if output.uses_paper_rule:
         return delay_by_one_phone(events) if is_delayed else without_corrections(events)
     return drop_first_hypotheses(events) if is_delayed else events
 

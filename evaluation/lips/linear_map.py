@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.evaluation.lips.closures import Detections, closures
+from kouxing.evaluation.lips.closures import DetectionCounts, closures
 from kouxing.evaluation.lips.curve_tables import CurveTable
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import CURVES, predicted_mouth, real_faps, real_mouth
@@ -49,14 +49,14 @@ class LinearMap:
 
     def faps(self, table: CurveTable, time_s: Array) -> Array:
         """Return FAPs (num_frames, 68) at given times."""
-        opening, width, jaw = (_history(table, time_s + self.delay_s) @ self.weights).T
+        opening, width, jaw = (_stack_history(table, time_s + self.delay_s) @ self.weights).T
         faps = np.zeros((len(time_s), NUM_FAPS))
         faps[:, _JAW], faps[:, _LOWER_LIP] = jaw, -opening - self.opening
         faps[:, _CORNERS] = width[:, None] / 2.0
         return faps
 
 
-def _history(table: CurveTable, known_s: Array) -> Array:
+def _stack_history(table: CurveTable, known_s: Array) -> Array:
     return table.at(known_s[:, None] - _HISTORY_S).reshape(len(known_s), -1)
 
 
@@ -74,7 +74,7 @@ def fit_map(
 
 
 def _fit(clips: Sequence[LipClip], tables: Mapping[str, CurveTable], delay_s: float) -> LinearMap:
-    inputs = [_history(tables[clip.name], clip.time_s + delay_s) for clip in clips]
+    inputs = [_stack_history(tables[clip.name], clip.time_s + delay_s) for clip in clips]
     weights = []
     correlation = 0.0
     for name, curve in CURVES.items():
@@ -108,7 +108,7 @@ def _best_constant(
         shift[_LOWER_LIP] = -constant
         pairs = zip(predicted, reals, strict=True)
         detections = (closures(predicted_mouth(faps + shift), real) for faps, real in pairs)
-        return sum(detections, Detections()).f1 or 0.0
+        return sum(detections, DetectionCounts()).f1 or 0.0
 
     openings = np.concatenate([CURVES["opening"](faps) for faps in predicted])
     return max((float(c) for c in -np.percentile(openings, _CLOSED_PERCENTS)), key=f1)

@@ -4,23 +4,23 @@ from functools import partial
 
 import numpy as np
 
-from kouxing.evaluation.lips.agreement import Pair, lag_ms, moments
+from kouxing.evaluation.lips.agreement import MouthPair, lag_ms, moments
 from kouxing.evaluation.lips.closure_measures import (
     CLOSURE_CLASSES,
     class_precision,
+    closed_fraction,
     closure_detections,
-    labials_shut,
-    share_shut,
+    labial_closure_rate,
 )
-from kouxing.evaluation.lips.effort import effort_correlation, speech_lip_intensity
-from kouxing.evaluation.lips.in_speech import correlation_in_speech, turns_per_s
+from kouxing.evaluation.lips.effort_measures import effort_correlation, speech_lip_intensity
 from kouxing.evaluation.lips.mouths import CURVES
 from kouxing.evaluation.lips.phone_spread import phone_correlation, phone_spread
-from kouxing.evaluation.lips.rest import closing_time_ms, rest_opening
+from kouxing.evaluation.lips.rest_measures import closing_time_ms, rest_opening
 from kouxing.evaluation.lips.scored_clip import Measure, ScoredClips
+from kouxing.evaluation.lips.speech_measures import correlation_in_speech, turns_per_s
 
 
-def pairs_of(clips: ScoredClips) -> list[Pair]:
+def pairs_of(clips: ScoredClips) -> list[MouthPair]:
     """Return the predicted and the real mouth of each clip."""
     return [(clip.predicted, clip.real) for clip in clips]
 
@@ -40,8 +40,8 @@ MEASURES: dict[str, Measure] = {
     "closure_precision": lambda clips: closure_detections(clips).precision,
     "closure_recall": lambda clips: closure_detections(clips).recall,
     **{f"precision_{name}": partial(class_precision, name=name) for name in CLOSURE_CLASSES},
-    "labials_shut": labials_shut,
-    "share_shut": share_shut,
+    "labials_shut": labial_closure_rate,
+    "share_shut": closed_fraction,
     "rest_opening": rest_opening,
     "closing_time_ms": closing_time_ms,
     "effort_correlation": effort_correlation,

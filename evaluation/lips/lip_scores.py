@@ -15,7 +15,7 @@ from kouxing.corpora.lip_clips import LipClip, aligned_phones
 from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
 from kouxing.evaluation.lips.live_faces import Samples, live_events, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth
-from kouxing.evaluation.lips.other_programs import MouthOf, load_programs
+from kouxing.evaluation.lips.other_programs import MouthFunction, load_programs
 from kouxing.evaluation.lips.references import read_parts, reference_of
 from kouxing.evaluation.lips.scored_clip import ScoredClip
 from kouxing.evaluation.recognizer.disturbances import (
@@ -42,14 +42,14 @@ from kouxing.shared.phones.inventory import PhoneInventory
 REAL = "real"
 CONDITIONS = CLEAN, BABBLE, MUSIC
 ALL, MOCAP = "all", "mocap"
-_BELOW_DB = 10.0
+_SNR_DB = 10.0
 
 Scores = dict[str, float | None]  # by measure
 Results = dict[str, dict[str, dict[str, Scores]]]  # by face, condition and group of clips
 
 
 @dataclass(frozen=True, slots=True)
-class Face:
+class LiveFace:
     """A lip model with its lip predictor and its delay."""
 
     lips: LipModel
@@ -63,7 +63,7 @@ class Face:
 
 def load_faces(
     names: Sequence[str], delays_ms: Sequence[float], inventory: PhoneInventory
-) -> dict[str, Face]:
+) -> dict[str, LiveFace]:
     """Load faces by title. A name is a lip model, a lip predictor (.npz) or visemes (.json).
 
     Without names, all lip models are loaded. Without delays, each has its default delay. Raises
@@ -81,7 +81,7 @@ def load_faces(
             lips = DynamicVisemes(load_parameters(path), inventory)
         predictor = load_lip_predictor(path) if path.suffix == ".npz" else default_predictor
         for delay_ms in delays_ms or [lip_model_info(kind).delay_ms]:
-            faces[f"{name}, {delay_ms:g} ms"] = Face(lips, predictor, delay_ms)
+            faces[f"{name}, {delay_ms:g} ms"] = LiveFace(lips, predictor, delay_ms)
     return faces
 
 
@@ -103,17 +103,17 @@ def score_lips(
     parameters = [Path(name) for name in names if name.endswith(".json")]
     clips, training = read_parts(folder, parameters)
     programs = load_programs(tables, clips, training)
-    known = {clip.speaker for clip in training}
+    training_speakers = {clip.speaker for clip in training}
     disturbances: dict[str, Disturb] = {CLEAN: lambda samples: samples}
     if faces and BABBLE in conditions:
         voices = babble([clip.samples for clip in clips])
-        disturbances[BABBLE] = lambda samples: add_sound(samples, voices, _BELOW_DB)
+        disturbances[BABBLE] = lambda samples: add_sound(samples, voices, _SNR_DB)
     if faces and MUSIC in conditions:
-        disturbances[MUSIC] = lambda samples: add_sound(samples, music, _BELOW_DB)
+        disturbances[MUSIC] = lambda samples: add_sound(samples, music, _SNR_DB)
     scored_clips: dict[tuple[str, str, str], list[ScoredClip]] = {}
     for clip in track(clips, description="clips", transient=True):
         for title, condition, scored in scored_clips_of(model, clip, faces, disturbances, programs):
-            for group in groups_of(clip, known):
+            for group in groups_of(clip, training_speakers):
                 scored_clips.setdefault((title, condition, group), []).append(scored)
     results: Results = {}
     for (title, condition, group), members in scored_clips.items():
@@ -130,9 +130,9 @@ def score_lips(
 def scored_clips_of(
     model: AcousticModel,
     clip: LipClip,
-    faces: Mapping[str, Face],
+    faces: Mapping[str, LiveFace],
     disturbances: Mapping[str, Disturb],
-    programs: Mapping[str, MouthOf],
+    programs: Mapping[str, MouthFunction],
 ) -> Iterator[tuple[str, str, ScoredClip]]:
     """Yield title, condition and scored clip of the real mouth and of each face.
 
@@ -161,9 +161,9 @@ def scored_clips_of(
             yield title, condition, ScoredClip(reference, face.mouth(received))
 
 
-def groups_of(clip: LipClip, known: set[str]) -> list[str]:
+def groups_of(clip: LipClip, training_speakers: set[str]) -> list[str]:
     """Return the groups that a clip belongs to."""
-    is_new = clip.speaker not in known
+    is_new = clip.speaker not in training_speakers
     return [
         ALL,
         clip.language,

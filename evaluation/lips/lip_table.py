@@ -36,17 +36,17 @@ def print_scores(results: Results, console: Console) -> None:
     real = results[REAL][CLEAN]
     counts = ", ".join(f"{group} {real[group]['clips']:.0f}" for group in _main_groups(real))
     title = f"{legend}\nclips: {counts}\n{LEGEND}"
-    print_table(console, title, ("clips", *COLUMNS), _rows(results, letters))
+    print_table(console, title, ("clips", *COLUMNS), _table_rows(results, letters))
 
 
-def _rows(results: Results, letters: Mapping[str, str]) -> Iterator[list[str]]:
+def _table_rows(results: Results, letters: Mapping[str, str]) -> Iterator[list[str]]:
     real = results[REAL][CLEAN]
     for group in _main_groups(real):
-        yield [group, *_cells(real[group])]
+        yield [group, *_score_cells(real[group])]
         for face, letter in letters.items():
             for condition, scores in results[face].items():
                 if condition == CLEAN or group == ALL:
-                    yield [f"  {letter}{_MARKS[condition]}", *_cells(scores[group])]
+                    yield [f"  {letter}{_MARKS[condition]}", *_score_cells(scores[group])]
 
 
 def _main_groups(real: Mapping[str, Scores]) -> list[str]:
@@ -65,10 +65,14 @@ class _Figure:
     def __init__(self, value: float | None) -> None:
         self._value = value
 
-    def __format__(self, form: str) -> str:
-        return percent(self._value, ".0f") if form == "%" else format_number(self._value, form)
+    def __format__(self, format_spec: str) -> str:
+        return (
+            percent(self._value, ".0f")
+            if format_spec == "%"
+            else format_number(self._value, format_spec)
+        )
 
 
-def _cells(scores: Scores) -> list[str]:
+def _score_cells(scores: Scores) -> list[str]:
     figures = {name: _Figure(scores.get(name)) for name in MEASURES}
     return [column.format_map(figures) for column in COLUMNS.values()]

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.evaluation.lips.agreement import moments
-from kouxing.evaluation.lips.curve_tables import CurveTable, read_tables, shipped_mouth
+from kouxing.evaluation.lips.curve_tables import CurveTable, fap_conversion, read_tables
 from kouxing.evaluation.lips.linear_map import fit_map
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_faps, real_mouth
 
 Array = NDArray[np.float64]
-MouthOf = Callable[[LipClip], Mouth]
-FapsOf = Callable[[LipClip, Array], Array]  # clip, times (n,) in s; FAPs (n, 68)
+MouthFunction = Callable[[LipClip], Mouth]
+FapsFunction = Callable[[LipClip, Array], Array]  # clip, times (n,) in s; FAPs (n, 68)
 
 _DELAYS_S = tuple(step / 50.0 for step in range(16))  # 0 to 0.3 s
 _TAIL_S = 0.5  # frames after the end of a clip's audio
@@ -29,12 +29,12 @@ _TAIL_S = 0.5  # frames after the end of a clip's audio
 
 def load_programs(
     folders: Sequence[Path], held_out: Sequence[LipClip], training: Sequence[LipClip]
-) -> dict[str, MouthOf]:
+) -> dict[str, MouthFunction]:
     """Load the mouths of other programs from folders of tables; return them by title.
 
     Raises UserError if a table is missing or cannot be used (see ``read_tables``).
     """
-    mouths: dict[str, MouthOf] = {}
+    mouths: dict[str, MouthFunction] = {}
     for folder in folders:
         tables = read_tables(folder, held_out, training)
         fitting = [clip for clip in training if clip.name in tables and clip.is_in_sync]
@@ -42,20 +42,20 @@ def load_programs(
     return mouths
 
 
-def load_shipped(folder: Path, clips: Sequence[LipClip]) -> FapsOf:
+def load_program_faps(folder: Path, clips: Sequence[LipClip]) -> FapsFunction:
     """Load a program's curves as shipped, at the delay that agrees best with the given clips.
 
     Raises UserError if a table is missing or cannot be used (see ``read_tables``).
     """
-    faps_of, _ = _shipped(folder, read_tables(folder, clips, ()), clips)
+    faps_of, _ = _program_faps(folder, read_tables(folder, clips, ()), clips)
     return faps_of
 
 
-def _shipped(
+def _program_faps(
     folder: Path, tables: Mapping[str, CurveTable], fitting: Sequence[LipClip]
-) -> tuple[FapsOf, float]:
+) -> tuple[FapsFunction, float]:
     """Return the FAPs of a face, and its delay, seconds."""
-    shipped = shipped_mouth(folder, [*tables.values()])
+    shipped = fap_conversion(folder, [*tables.values()])
 
     def faps(clip: LipClip, time_s: Array, delay_s: float) -> Array:
         return shipped.faps(tables[clip.name].at(time_s + delay_s))
@@ -75,10 +75,10 @@ def _shipped(
 
 def _mouths_of(
     folder: Path, tables: Mapping[str, CurveTable], fitting: Sequence[LipClip]
-) -> dict[str, MouthOf]:
-    faps_of, delay_s = _shipped(folder, tables, fitting)
+) -> dict[str, MouthFunction]:
+    faps_of, delay_s = _program_faps(folder, tables, fitting)
     title = f"{folder.name}, {1e3 * delay_s:.0f} ms"
-    mouths: dict[str, MouthOf] = {
+    mouths: dict[str, MouthFunction] = {
         title: lambda clip: predicted_mouth(faps_of(clip, _frames_s(clip)))
     }
     if fitting:

@@ -89,7 +89,7 @@ class Reference:
         """Return the phones b p m."""
         return [phone for phone in self.phones if self.visemes[phone.symbol][0][0] == _LABIAL]
 
-    def quietest_moments(self, phones: Sequence[Phone]) -> Array:
+    def quietest_times(self, phones: Sequence[Phone]) -> Array:
         """Return when each phone is quietest, seconds."""
         hop = round(_POWER_STEP_S * SAMPLE_RATE_HZ)
         samples = self.clip.samples

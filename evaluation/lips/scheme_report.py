@@ -6,7 +6,7 @@ from itertools import groupby, pairwise
 from rich.console import Console
 
 from kouxing.evaluation.lips.agreement import Agreement
-from kouxing.evaluation.lips.scheme_scores import ConditionScore, Outcome
+from kouxing.evaluation.lips.scheme_scores import ConditionScore, SchemeComparison
 from kouxing.evaluation.tables import format_number
 from kouxing.shared.terminal import print_table
 
@@ -21,7 +21,7 @@ LEGEND = (
 )
 
 
-def print_outcome(outcome: Outcome, console: Console) -> None:
+def print_comparison(outcome: SchemeComparison, console: Console) -> None:
     """Print each lip model against scheme 1 and real lips, then the cost of each step."""
     references: dict[str, Callable[[ConditionScore], Agreement | None]] = {
         "scheme 1": lambda score: score.like_scheme_1,

@@ -16,15 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.scoring import matched_pairs
-from kouxing.evaluation.lips.agreement import Agreement, Pair, agreement_of
+from kouxing.corpora.scoring import align_symbols
+from kouxing.evaluation.lips.agreement import Agreement, MouthPair, agreement_of
 from kouxing.evaluation.lips.curves import rms_jerk
 from kouxing.evaluation.lips.four_schemes import (
     ALIGNED,
     RECOGNIZED,
     Condition,
     RecognizedSentence,
-    TestedRecognizer,
+    RecognizerSetup,
     all_conditions,
     face_input,
     make_frames,
@@ -58,7 +58,7 @@ class ConditionScore:
 
 
 @dataclass(slots=True, kw_only=True)
-class Outcome:
+class SchemeComparison:
     """Results of the experiment."""
 
     sentences: list[str]
@@ -67,9 +67,9 @@ class Outcome:
 
 def score_schemes(
     sentences: Sequence[RecognizedSentence],
-    recognizers: Sequence[TestedRecognizer],
+    recognizers: Sequence[RecognizerSetup],
     lips: Sequence[str],
-) -> Outcome:
+) -> SchemeComparison:
     """Score all conditions; raises UserError if there are neither texts nor tracked lips."""
     if all(s.aligned is None and not len(s.sentence.clip.time_s) for s in sentences):
         raise UserError("no sentence has a text or tracked lips")
@@ -79,7 +79,7 @@ def score_schemes(
         for condition in conditions
     }
     inventory = recognizers[0].model.inventory
-    return Outcome(
+    return SchemeComparison(
         sentences=[sentence.sentence.clip.name for sentence in sentences],
         scores=[
             _condition_score(
@@ -98,7 +98,7 @@ def score_schemes(
 
 def _pairs_with_aligned(
     frames: Sequence[Array | None], aligned: Sequence[Array | None]
-) -> list[Pair]:
+) -> list[MouthPair]:
     return [
         (predicted_mouth(faps), real_mouth(np.arange(len(reference)) / FRAME_RATE_HZ, reference))
         for faps, reference in zip(frames, aligned, strict=True)
@@ -108,7 +108,7 @@ def _pairs_with_aligned(
 
 def _pairs_with_tracked(
     frames: Sequence[Array | None], sentences: Sequence[RecognizedSentence]
-) -> list[Pair]:
+) -> list[MouthPair]:
     clips = [sentence.sentence.clip for sentence in sentences]
     return [
         (predicted_mouth(faps), real_mouth(clip.time_s, real_faps(clip)))
@@ -129,8 +129,8 @@ def _condition_score(
     condition: Condition,
     frames: Sequence[Array],
     delays_s: Sequence[float],
-    like_aligned: Sequence[Pair],
-    like_real: Sequence[Pair],
+    like_aligned: Sequence[MouthPair],
+    like_real: Sequence[MouthPair],
 ) -> ConditionScore:
     p50, p95 = np.percentile(delays_s, [50, 95]) * 1e3 if delays_s else (None, None)
     is_live = condition.scheme > RECOGNIZED
@@ -155,13 +155,15 @@ def phone_delays_s(
     if condition.scheme <= RECOGNIZED or sentence.sentence.aligned is None:
         return []
     events = face_input(condition, sentence.outputs[condition.recognizer])
-    made = [pair for pair in first_hypotheses(events) if pair[0].symbol != inventory.silence]
+    hypotheses = [pair for pair in first_hypotheses(events) if pair[0].symbol != inventory.silence]
     truth = spoken(sentence.sentence.aligned, inventory)
-    pairs = matched_pairs([phone.symbol for phone in truth], [phone.symbol for phone, _ in made])
+    pairs = align_symbols(
+        [phone.symbol for phone in truth], [phone.symbol for phone, _ in hypotheses]
+    )
     return [
-        made[j][1] - truth[i].onset_s
+        hypotheses[j][1] - truth[i].onset_s
         for i, j in pairs
-        if i is not None and j is not None and truth[i].symbol == made[j][0].symbol
+        if i is not None and j is not None and truth[i].symbol == hypotheses[j][0].symbol
     ]
 
 

@@ -13,11 +13,11 @@ from kouxing.evaluation.lips.four_schemes import (
     ALIGNED,
     Condition,
     RecognizedSentence,
-    TestedRecognizer,
+    RecognizerSetup,
     all_conditions,
     make_frames,
 )
-from kouxing.evaluation.lips.other_programs import FapsOf, load_shipped
+from kouxing.evaluation.lips.other_programs import FapsFunction, load_program_faps
 from kouxing.services.driver.config import Framing
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
@@ -35,7 +35,7 @@ MakeFrames = Callable[[RecognizedSentence], list[Frame]]
 
 def write_videos(
     recognized: Sequence[RecognizedSentence],
-    recognizers: Sequence[TestedRecognizer],
+    recognizers: Sequence[RecognizerSetup],
     lips: Sequence[str],
     folder: Path,
     programs: Sequence[Path] = (),
@@ -78,7 +78,7 @@ def write_video(
 
 def _conditions(
     recognized: Sequence[RecognizedSentence],
-    recognizers: Sequence[TestedRecognizer],
+    recognizers: Sequence[RecognizerSetup],
     lips: Sequence[str],
     programs: Sequence[Path],
 ) -> Iterator[tuple[str, MakeFrames]]:
@@ -95,7 +95,10 @@ def _conditions(
         return
     clips = [sentence.sentence.clip for sentence in recognized]
     for program in programs:
-        yield program.name, partial(_frames_with_mouth, conditions[0], load_shipped(program, clips))
+        yield (
+            program.name,
+            partial(_frames_with_mouth, conditions[0], load_program_faps(program, clips)),
+        )
     if all(len(clip.time_s) and clip.is_in_sync for clip in clips):
         yield "reference", partial(_frames_with_mouth, conditions[0], tracked_frames)
         yield "anchor", partial(_frames_with_mouth, conditions[0], _mouth_at_rest)
@@ -111,7 +114,7 @@ def _frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
 
 def _frames_with_mouth(
     condition: Condition,
-    mouth_of: FapsOf,
+    mouth_of: FapsFunction,
     sentence: RecognizedSentence,
 ) -> list[Frame]:
     """Replace the mouth of a condition's face; keep its blinks and head motion."""

@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.closures import Contact, Detections, closures, contacts
-from kouxing.evaluation.lips.extrema import misalignment_s
+from kouxing.evaluation.lips.closures import Contact, DetectionCounts, closures, contacts
+from kouxing.evaluation.lips.misalignment import misalignment_s
 from kouxing.evaluation.lips.mouths import Mouth
 from kouxing.evaluation.lips.references import Reference
 
@@ -43,13 +43,13 @@ class ScoredClip:
         return self.predicted.at("opening", self.real.time_s)[self.in_speech]
 
     @cached_property
-    def closures(self) -> Detections:
+    def closures(self) -> DetectionCounts:
         """Real and predicted closures."""
         return closures(self.predicted, self.real)
 
     @cached_property
     def contacts(self) -> list[Contact]:
-        """Made closures."""
+        """Predicted closures."""
         return contacts(self.predicted, self.real)
 
     @cached_property

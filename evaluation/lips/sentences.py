@@ -36,7 +36,7 @@ def sample_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
     with (folder / "transcripts.tsv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file, delimiter="\t"))
     clips = [
-        _clip(model, folder / row["file"], Path(row["file"]).stem, row["voice"], row["text"])
+        _make_clip(model, folder / row["file"], Path(row["file"]).stem, row["voice"], row["text"])
         for row in rows
     ]
     return [Sentence(clip, aligned_phones(model, clip)) for clip in clips]
@@ -49,15 +49,15 @@ def corpus_sentences(model: AcousticModel, corpus: Path) -> list[Sentence]:
     if not utterances:
         raise errors.no_recording_error(f"in the split 'test' of {corpus}")
     sentences = []
-    for utterance in choose(utterances):
-        clip = _clip(model, utterance.path, utterance.utterance_id, utterance.speaker)
+    for utterance in choose_utterances(utterances):
+        clip = _make_clip(model, utterance.path, utterance.utterance_id, utterance.speaker)
         syllables = syllables_of(utterance, model.inventory)
         phones = align_syllables(model, clip.samples, SAMPLE_RATE_HZ, syllables).phones
         sentences.append(Sentence(clip, phones))
     return sentences
 
 
-def choose(utterances: Sequence[Utterance]) -> list[Utterance]:
+def choose_utterances(utterances: Sequence[Utterance]) -> list[Utterance]:
     """Choose twenty utterances, equally many of each speaker, preferably about 4 s long."""
     by_speaker: dict[str, list[Utterance]] = defaultdict(list)
     for utterance in sorted(utterances, key=lambda u: (abs(u.seconds - _MEAN_S), u.utterance_id)):
@@ -73,7 +73,9 @@ def clip_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
     return [Sentence(clip, aligned_phones(model, clip)) for clip in clips]
 
 
-def _clip(model: AcousticModel, path: Path, name: str, speaker: str, text: str = "") -> LipClip:
+def _make_clip(
+    model: AcousticModel, path: Path, name: str, speaker: str, text: str = ""
+) -> LipClip:
     try:
         samples = read_audio(path)
     except ValueError as error:

@@ -3,7 +3,7 @@
 With the displacements ``V`` of the lips' feature points from the closed mouth (eq. 7 to 9,
 *reconstructed*),
 
-    accuracy = 1 - sum |V_made - V_real| / sum |V_real|
+    accuracy = 1 - sum |V_predicted - V_real| / sum |V_real|
 
 over all vertical displacements of lip points, once over all frames, and once over the mean mouths
 of the phones (tables 3 and 4). In the paper, ``V_real`` is the mean of several people who say the
@@ -53,7 +53,7 @@ from kouxing.shared.terminal import print_table
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.float32]
-Curves = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
+MouthCurve = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
 
 RATES = (0.8, 1.0, 1.5, 2.0)
 _MIN_MOUTHS = 3
@@ -63,7 +63,7 @@ _LIP_COLUMNS = [
     if FAPS[fap - 1].direction in ("up", "down") and FAPS[fap - 1].feature_points[0][0] in "28"
     if fap != 3
 ]
-_MIDDLES = [MOUTH_FAPS.index(4), MOUTH_FAPS.index(5)]
+_MIDDLE_LIP_COLUMNS = [MOUTH_FAPS.index(4), MOUTH_FAPS.index(5)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,7 +105,7 @@ def _score_rate(
     for clip, faps in zip(progress, real, strict=True):
         samples = clip.samples if rate == 1.0 else change_speed(clip.samples, rate)
         times_s = clip.time_s / rate
-        syllables, phones = _text(model, clip, samples)
+        syllables, phones = _syllables_and_phones(model, clip, samples)
         num_syllables += len(syllables)
         seconds += sum(phone.duration_s for phone in phones)
         onsets_s = np.array([phone.onset_s for phone in phones])
@@ -117,14 +117,14 @@ def _score_rate(
     frames_of = {name: np.concatenate(mouths) for name, mouths in frames.items()}
     means_of = {name: mean_mouths(symbols, np.concatenate(faps)) for name, faps in onsets.items()}
 
-    def accuracies(predicted: Mapping[str, Array], real: Array) -> dict[str, float]:
+    def method_accuracies(predicted: Mapping[str, Array], real: Array) -> dict[str, float]:
         return {name: accuracy_of(mouths, real) for name, mouths in predicted.items()}
 
     return RateScore(
         rate=rate,
         syllables_per_s=num_syllables / max(seconds, 1e-9),
-        of_frames=accuracies(frames_of, np.concatenate(real)),
-        of_phones=accuracies(means_of, mean_mouths(symbols, np.concatenate(real_onsets))),
+        of_frames=method_accuracies(frames_of, np.concatenate(real)),
+        of_phones=method_accuracies(means_of, mean_mouths(symbols, np.concatenate(real_onsets))),
     )
 
 
@@ -145,12 +145,12 @@ def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
 
 def scale_openings(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
     """Scale FAPs (num_frames, num_mouth_faps) so that every speaker's widest opening is R = 5."""
-    full = -float(faps_of([MAX_OPENING])[0, _MIDDLES].sum())
+    full = -float(faps_of([MAX_OPENING])[0, _MIDDLE_LIP_COLUMNS].sum())
     _, widest = openings_of(speakers, mouths)
     return [faps * full / widest[speaker] for speaker, faps in zip(speakers, mouths, strict=True)]
 
 
-def _text(
+def _syllables_and_phones(
     model: AcousticModel, clip: LipClip, samples: Samples
 ) -> tuple[list[Syllable], list[Phone]]:
     """Return the syllables of a clip, known or recognized, and their phones with real times."""
@@ -166,7 +166,7 @@ def _text(
 
 def _methods(
     model: AcousticModel, samples: Samples, syllables: Sequence[Syllable], phones: Sequence[Phone]
-) -> Iterator[tuple[str, Curves]]:
+) -> Iterator[tuple[str, MouthCurve]]:
     """Yield the name and the curves of each method."""
     inventory = model.inventory
     table = load_table(inventory)
@@ -183,7 +183,7 @@ def _methods(
         yield f"{name}, live", partial(_interpolate, frame_s=frame_s, mouths=mouth)
 
 
-def _curves_of(motion: KeyFrames) -> Curves:
+def _curves_of(motion: KeyFrames) -> MouthCurve:
     return lambda times_s: faps_of(motion.openings_at(times_s))
 
 
@@ -193,10 +193,12 @@ def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:
 
 def print_rates(scores: Sequence[RateScore], console: Console) -> None:
     """Print accuracies by speaking rate as in the paper's table 3, one row per method."""
-    for title, accuracies in _TITLES.items():
+    for title, method_accuracies in _TITLES.items():
         rows = [["syllables per second", *(f"{score.syllables_per_s:.1f}" for score in scores)]]
-        for name in accuracies(scores[0]):
-            rows.append([name, *(f"{100 * accuracies(score)[name]:.0f} %" for score in scores)])
+        for name in method_accuracies(scores[0]):
+            rows.append(
+                [name, *(f"{100 * method_accuracies(score)[name]:.0f} %" for score in scores)]
+            )
         print_table(console, "", (title, *(f"{score.rate:g}" for score in scores)), rows)
 
 

@@ -18,9 +18,9 @@ from rich.progress import track
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import LipClip, label_clip
-from kouxing.evaluation.lips.full_model import synthesize
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import CURVES, real_faps
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters

@@ -73,7 +73,7 @@ def serve(
     import asyncio
 
     from kouxing.evaluation.mos import server
-    from kouxing.evaluation.mos.store import Store
+    from kouxing.evaluation.mos.store import AnswerStore
     from kouxing.evaluation.mos.study import load_study
     from kouxing.services.gateway.config import GatewayConfig
     from kouxing.services.kinds import read_settings
@@ -81,7 +81,7 @@ def serve(
 
     overrides = parse_assignments(assignments or [], "gateway")
     gateway = read_settings(config).load(GatewayConfig, overrides)
-    study, store = load_study(folder), Store(folder)
+    study, store = load_study(folder), AnswerStore(folder)
     try:
         asyncio.run(
             server.serve(study, store, gateway, lambda url: print_message(f"judges open {url}"))

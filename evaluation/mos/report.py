@@ -21,12 +21,12 @@ from kouxing.evaluation.mos.study import SCALES, Study
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
-WHISKERS = 1.5  # interquartile ranges from the quartiles to the fences
+FENCE_RANGES = 1.5  # distance of the fences from the quartiles, in interquartile ranges
 Scores = dict[tuple[int, str], int]  # one condition on one scale, by judge and sentence
 
 
 @dataclass(frozen=True, slots=True)
-class Mean:
+class MeanScore:
     """Mean score with its 95 % confidence interval, by Student's t over judges."""
 
     value: float
@@ -42,8 +42,8 @@ class Opinion:
 
     scale: str
     condition: str
-    of_all: Mean
-    without_outliers: Mean  # as in the paper
+    of_all: MeanScore
+    without_outliers: MeanScore  # as in the paper
     num_judges: int
     num_scores: int
     num_outliers: int
@@ -73,7 +73,7 @@ def is_within_fences(scores: ArrayLike) -> NDArray[np.bool_]:
     """Return which scores (n,) are not outliers; quartiles are interpolated linearly."""
     values = np.asarray(scores, float)
     lower, upper = np.quantile(values, [0.25, 0.75])
-    reach = WHISKERS * (upper - lower)
+    reach = FENCE_RANGES * (upper - lower)
     return np.asarray((values >= lower - reach) & (values <= upper + reach))
 
 
@@ -88,19 +88,21 @@ def opinion_of(scale: str, condition: str, scores: Scores) -> Opinion:
     return Opinion(scale, condition, *means, num_judges, len(scores), len(scores) - len(included))
 
 
-def mean_of(scores: Scores) -> Mean:
+def mean_of(scores: Scores) -> MeanScore:
     """Return the mean of at least one score."""
     by_judge: defaultdict[int, list[int]] = defaultdict(list)
     for (judge, _), score in scores.items():
         by_judge[judge].append(score)
     mean, num_judges = float(np.mean([*scores.values()])), len(by_judge)
     if num_judges < 2:
-        return Mean(mean, None)
+        return MeanScore(mean, None)
     # Variance of a ratio whose parts are sums over judges (Cochran 1977, section 6.3). If all
     # judges gave equally many scores, it is the variance of their means.
-    surplus = [sum(values) - mean * len(values) for values in by_judge.values()]
-    variance = num_judges / (num_judges - 1) * np.sum(np.square(surplus))
-    return Mean(mean, float(stats.t.ppf(0.975, num_judges - 1) * np.sqrt(variance) / len(scores)))
+    deviations = [sum(values) - mean * len(values) for values in by_judge.values()]
+    variance = num_judges / (num_judges - 1) * np.sum(np.square(deviations))
+    return MeanScore(
+        mean, float(stats.t.ppf(0.975, num_judges - 1) * np.sqrt(variance) / len(scores))
+    )
 
 
 def print_report(study: Study, opinions: Iterable[Opinion], console: Console) -> None:

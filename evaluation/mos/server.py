@@ -15,7 +15,7 @@ from typing import Any
 
 from aiohttp import web
 
-from kouxing.evaluation.mos.store import Answer, Store
+from kouxing.evaluation.mos.store import Answer, AnswerStore
 from kouxing.evaluation.mos.study import LANGUAGES, SCALES, Study, places_of_judge
 from kouxing.services.gateway import http
 from kouxing.services.gateway.access import AccessPolicy
@@ -36,7 +36,7 @@ _POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; frame-ancesto
 class ListeningTest:
     """Handles the requests of judges."""
 
-    def __init__(self, study: Study, store: Store) -> None:
+    def __init__(self, study: Study, store: AnswerStore) -> None:
         self._study = study
         self._store = store
 
@@ -104,7 +104,7 @@ class ListeningTest:
 
 
 async def serve(
-    study: Study, store: Store, config: GatewayConfig, on_ready: Callable[[str], None]
+    study: Study, store: AnswerStore, config: GatewayConfig, on_ready: Callable[[str], None]
 ) -> None:
     """Serve a study until SIGINT or SIGTERM, with the gateway's address and access rules.
 

@@ -23,8 +23,8 @@ _MAX_BYTES = 256 << 20
 class Answer:
     """One score."""
 
-    judge: int  # chooses the order of the videos
-    place: int  # in that order; below 0: practice
+    judge: int  # determines the order of the videos
+    place: int  # position in that order; negative: practice
     sentence: str
     condition: str
     scale: str
@@ -33,7 +33,7 @@ class Answer:
     unix_s: float
 
 
-class Store:
+class AnswerStore:
     """Adds judges and answers to a study's file, which only its owner can read."""
 
     def __init__(self, folder: Path) -> None:
@@ -54,7 +54,7 @@ class Store:
         self.judges: dict[str, int] = {}  # number by token
         self.last_places: dict[int, int] = {}  # newest place that each judge has scored
         for line in _read_lines(path):
-            self._note(line)
+            self._index_line(line)
         self._file.write("\n")  # ends a line that a crash has cut
 
     def close(self) -> None:
@@ -78,9 +78,9 @@ class Store:
         self._file.flush()
         os.fsync(self._file.fileno())
         for line in lines:
-            self._note(line)
+            self._index_line(line)
 
-    def _note(self, line: dict[str, Any]) -> None:
+    def _index_line(self, line: dict[str, Any]) -> None:
         if "token" in line:
             self.judges[line["token"]] = line["judge"]
         else:

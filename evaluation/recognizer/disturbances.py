@@ -23,7 +23,7 @@ from scipy.signal import butter, fftconvolve, sosfilt
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.sounds import Sound, held_out
 from kouxing.evaluation.recognizer import synthetic_sounds
-from kouxing.evaluation.recognizer.references import Reference
+from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples, as_samples, pink_noise
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.shared.errors import UserError
@@ -33,25 +33,25 @@ CONDITIONS = ("clean", "noise 10 dB", "music 10 dB", "babble 10 dB", "room", "te
 CLEAN, NOISE, MUSIC, BABBLE, ROOM, TELEPHONE = CONDITIONS
 _REVERBERATION_S = 0.5  # time in which echoes fall by 60 dB
 _NUM_VOICES, _MAX_BABBLE_RECORDINGS = 6, 60
-_BELOW_DB = 10.0
+_SNR_DB = 10.0
 _MUSIC_S = 60.0
-_TINY = 1e-9
+_EPSILON = 1e-9
 
 
 def disturbances_for(
-    references: Sequence[Reference], music: Samples, names: Sequence[str] = ()
+    references: Sequence[AlignedRecording], music: Samples, names: Sequence[str] = ()
 ) -> dict[str, Disturb]:
     """Return clean speech and the disturbances with the given names, by default all.
 
     The babble is mixed from ``references``.
     """
     step = len(references) // _MAX_BABBLE_RECORDINGS + 1
-    others = babble([reference.read_audio() for reference in references[::step]])
+    crowd_babble = babble([reference.read_audio() for reference in references[::step]])
     known: dict[str, Disturb] = {
         CLEAN: lambda samples: samples,
-        NOISE: lambda samples: add_noise(samples, _BELOW_DB),
-        MUSIC: lambda samples: add_sound(samples, music, _BELOW_DB),
-        BABBLE: lambda samples: add_sound(samples, others, _BELOW_DB),
+        NOISE: lambda samples: add_noise(samples, _SNR_DB),
+        MUSIC: lambda samples: add_sound(samples, music, _SNR_DB),
+        BABBLE: lambda samples: add_sound(samples, crowd_babble, _SNR_DB),
         ROOM: add_echoes,
         TELEPHONE: limit_to_telephone_band,
     }
@@ -64,7 +64,7 @@ def check_conditions(names: Sequence[str], known: Sequence[str] = CONDITIONS) ->
         raise UserError(f"unknown condition {unknown[0]!r}; choose from: {', '.join(known)}")
 
 
-def music_from(sounds: Sequence[Sound]) -> Samples:
+def held_out_music(sounds: Sequence[Sound]) -> Samples:
     """Return the held-out music, or synthesized music if ``sounds`` is empty.
 
     Raises UserError if the sounds contain no held-out music.
@@ -77,10 +77,10 @@ def music_from(sounds: Sequence[Sound]) -> Samples:
     return np.concatenate([_to_equal_level(piece) for piece in pieces])
 
 
-def add_noise(samples: Samples, below_db: float) -> Samples:
-    """Add pink noise ``below_db`` decibels below the speech's level."""
+def add_noise(samples: Samples, snr_db: float) -> Samples:
+    """Add pink noise at a signal-to-noise ratio of ``snr_db``."""
     noise = pink_noise(len(samples), np.random.default_rng(len(samples)))
-    return _mix(samples, noise, below_db)
+    return _mix(samples, noise, snr_db)
 
 
 def babble(voices: Sequence[Samples]) -> Samples:
@@ -91,10 +91,10 @@ def babble(voices: Sequence[Samples]) -> Samples:
     return together
 
 
-def add_sound(samples: Samples, sound: Samples, below_db: float) -> Samples:
-    """Add a part of a sound, repeated if necessary, ``below_db`` below the speech's level."""
+def add_sound(samples: Samples, sound: Samples, snr_db: float) -> Samples:
+    """Add a part of a sound, repeated if necessary, at a signal-to-noise ratio of ``snr_db``."""
     start = np.random.default_rng(len(samples)).integers(len(sound))
-    return _mix(samples, np.resize(np.roll(sound, -start), len(samples)), below_db)
+    return _mix(samples, np.resize(np.roll(sound, -start), len(samples)), snr_db)
 
 
 def add_echoes(samples: Samples) -> Samples:
@@ -133,13 +133,13 @@ def change_speed(samples: Samples, factor: float) -> Samples:
     return as_samples(out[hop:])
 
 
-def _mix(samples: Samples, sound: NDArray[np.floating], below_db: float) -> Samples:
+def _mix(samples: Samples, sound: NDArray[np.floating], snr_db: float) -> Samples:
     energy = float(np.sum(samples.astype(np.float64) ** 2))
     power = energy / max(1, int(np.count_nonzero(samples)))  # padding does not count
-    gain = np.sqrt(power / max(_TINY, float(np.mean(sound**2))))
-    return as_samples(samples + gain * 10 ** (-below_db / 20) * sound)
+    gain = np.sqrt(power / max(_EPSILON, float(np.mean(sound**2))))
+    return as_samples(samples + gain * 10 ** (-snr_db / 20) * sound)
 
 
 def _to_equal_level(samples: Samples) -> Samples:
-    scaled: Samples = samples / max(_TINY, float(np.sqrt(np.mean(samples**2))))
+    scaled: Samples = samples / max(_EPSILON, float(np.sqrt(np.mean(samples**2))))
     return scaled

@@ -29,15 +29,15 @@ from rich.progress import track
 
 from kouxing.corpora.scoring import (
     ErrorCounts,
+    align_symbols,
     count_errors,
     feature_errors,
     final_hypothesis,
     first_hypothesis,
-    matched_pairs,
 )
+from kouxing.evaluation.recognizer.aligned_corpus import RATE_NAMES, AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import CLEAN, Disturb
-from kouxing.evaluation.recognizer.labials import Labials
-from kouxing.evaluation.recognizer.references import RATE_NAMES, Reference
+from kouxing.evaluation.recognizer.labials import LabialCounts
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import spoken
@@ -50,7 +50,7 @@ from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory
 from kouxing.shared.terminal import CONSOLE
 
 # the paper's rule and a rule with fewer errors, which are measured in clean speech
-RULES = (OutputRuleConfig(3, 0.0), OutputRuleConfig(3, 0.99))
+COMPARED_RULES = (OutputRuleConfig(3, 0.0), OutputRuleConfig(3, 0.99))
 CHUNK_SAMPLES = 160  # 10 ms, as live audio arrives
 HYPOTHESES = ("first", "final")
 _NUM_RESAMPLES = 2000
@@ -65,7 +65,7 @@ class Recognition:
     final: list[Phone] = field(default_factory=list)
 
 
-class Score:
+class ErrorStats:
     """Accumulates errors and delays in one kind of audio."""
 
     def __init__(self, inventory: PhoneInventory) -> None:
@@ -78,10 +78,10 @@ class Score:
             for unit in ("phone", "viseme")
         }
         self._feature_errors = dict.fromkeys(HYPOTHESES, 0.0)
-        self._labials = {hypothesis: Labials(inventory) for hypothesis in HYPOTHESES}
+        self._labials = {hypothesis: LabialCounts(inventory) for hypothesis in HYPOTHESES}
         self._delays_s: list[float] = []
 
-    def add(self, reference: Reference, recognition: Recognition) -> None:
+    def add(self, reference: AlignedRecording, recognition: Recognition) -> None:
         """Count the errors of a recording, and the delays of right first hypotheses."""
         self._num_recordings += 1
         speaker = reference.utterance.speaker
@@ -96,7 +96,7 @@ class Score:
             self._labials[hypothesis].add(truth, symbols)
         self._delays_s += [
             recognition.emitted_s[j] - reference.phones[i].onset_s
-            for i, j in matched_pairs(truth, [phone.symbol for phone in recognition.first])
+            for i, j in align_symbols(truth, [phone.symbol for phone in recognition.first])
             if i is not None and j is not None and truth[i] == recognition.first[j].symbol
         ]
 
@@ -156,17 +156,17 @@ def bootstrap_interval(
 
 def evaluate_recognizer(
     model: AcousticModel,
-    references: Sequence[Reference],
+    references: Sequence[AlignedRecording],
     disturbances: Mapping[str, Disturb],
     rule: OutputRuleConfig,
 ) -> dict[str, Any]:
     """Measure a model; return figures for a JSON file.
 
     ``speech`` in the figures contains the scores with ``rule``, by disturbance and speaking rate.
-    ``rules`` contains the scores with ``RULES`` in clean speech.
+    ``rules`` contains the scores with ``COMPARED_RULES`` in clean speech.
     """
-    speech: dict[str, Score] = defaultdict(lambda: Score(model.inventory))
-    by_rule: dict[str, Score] = defaultdict(lambda: Score(model.inventory))
+    speech: dict[str, ErrorStats] = defaultdict(lambda: ErrorStats(model.inventory))
+    by_rule: dict[str, ErrorStats] = defaultdict(lambda: ErrorStats(model.inventory))
     for reference in track(references, "recognizing", console=CONSOLE, transient=True):
         samples = reference.read_audio()
         for name, disturb in disturbances.items():
@@ -175,7 +175,7 @@ def evaluate_recognizer(
             speech[name].add(reference, recognition)
             if name == CLEAN:
                 speech[reference.group].add(reference, recognition)
-                for other in RULES:
+                for other in COMPARED_RULES:
                     by_rule[_rule_name(other)].add(reference, recognize_live(model, scored, other))
     rng = np.random.default_rng(0)
     return {

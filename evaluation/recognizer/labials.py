@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 
-from kouxing.corpora.scoring import matched_pairs
+from kouxing.corpora.scoring import align_symbols
 from kouxing.shared.phones.inventory import PhoneInventory
 
 _VISEMES = {"b", "f"}  # visemes of b p m and of f
 
 
-class Labials:
+class LabialCounts:
     """Counts spoken labials, recognized labials, and labials that are both."""
 
     def __init__(self, inventory: PhoneInventory) -> None:
@@ -18,7 +18,7 @@ class Labials:
 
     def add(self, reference: Sequence[str], recognized: Sequence[str]) -> None:
         """Count the phones of a recording."""
-        for i, j in matched_pairs(reference, recognized):
+        for i, j in align_symbols(reference, recognized):
             is_spoken = i is not None and reference[i] in self._labials
             is_recognized = j is not None and recognized[j] in self._labials
             self._num_spoken += is_spoken

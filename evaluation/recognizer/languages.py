@@ -25,14 +25,14 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.error_rates import (
     HYPOTHESES,
+    ErrorStats,
     Recognition,
-    Score,
     recognize_live,
     score_live,
 )
-from kouxing.evaluation.recognizer.references import Reference
 from kouxing.evaluation.rivals.tables import FOLDER, find_installed
 from kouxing.evaluation.tables import percent
 from kouxing.services.recognizer.acoustic.languages import model_of_language
@@ -52,21 +52,21 @@ Figures = Mapping[str, Any]
 
 
 def evaluate_languages(
-    references: Sequence[Reference], rule: OutputRuleConfig, *, with_hama: bool = False
+    references: Sequence[AlignedRecording], rule: OutputRuleConfig, *, with_hama: bool = False
 ) -> dict[str, dict[str, Any]]:
     """Measure the recognizers; return figures in the form of ``evaluate_recognizer``.
 
     A language is a code such as ``en`` or ``en-GRID``. Raises UserError if a recording's language
     is unknown, or hama is not installed.
     """
-    scores: dict[str, dict[str, Score]] = defaultdict(
-        lambda: defaultdict(lambda: Score(load_inventory(UNIVERSAL)))
+    scores: dict[str, dict[str, ErrorStats]] = defaultdict(
+        lambda: defaultdict(lambda: ErrorStats(load_inventory(UNIVERSAL)))
     )
     for reference in track(references, "recognizing", console=CONSOLE, transient=True):
         for name, recognition in _recognitions(reference, rule):
             scores[name][reference.group].add(reference, recognition)
     if with_hama:
-        english = [one for one in references if _code_of(one) == _HAMA_LANGUAGE]
+        english = [reference for reference in references if _code_of(reference) == _HAMA_LANGUAGE]
         for reference, phones in zip(english, _run_hama(english), strict=True):
             recognition = Recognition(final=[_phone(symbol) for symbol in phones])
             scores[HAMA][reference.group].add(reference, recognition)
@@ -77,21 +77,21 @@ def evaluate_languages(
         if name == HAMA:
             for summary in speech.values():
                 del summary["first"]
-        of_name = [one for one in references if one.group in by_language]
+        scored = [reference for reference in references if reference.group in by_language]
         results[name] = {
-            "recordings": len(of_name),
-            "speakers": len({one.utterance.speaker for one in of_name}),
+            "recordings": len(scored),
+            "speakers": len({reference.utterance.speaker for reference in scored}),
             "speech": speech,
         }
     return results
 
 
-def _code_of(reference: Reference) -> str:
+def _code_of(reference: AlignedRecording) -> str:
     return reference.utterance.language.partition("-")[0]
 
 
 def _recognitions(
-    reference: Reference, rule: OutputRuleConfig
+    reference: AlignedRecording, rule: OutputRuleConfig
 ) -> Iterator[tuple[str, Recognition]]:
     samples, universal = reference.read_audio(), model_of_language(UNIVERSAL)
     scored = score_live(universal, samples)
@@ -114,7 +114,7 @@ def _phone(symbol: str) -> Phone:
     return Phone(index=0, symbol=symbol, onset_s=0.0, duration_s=0.1, confidence=1.0, final=True)
 
 
-def _run_hama(references: Sequence[Reference]) -> Iterator[tuple[str, ...]]:
+def _run_hama(references: Sequence[AlignedRecording]) -> Iterator[tuple[str, ...]]:
     """Yield the phones of each recording. Raises UserError if hama's output has unknown letters."""
     with tempfile.TemporaryDirectory() as name:
         for number, reference in enumerate(references):

@@ -109,7 +109,7 @@ def breathing(seconds: float) -> Samples:
     return _normalize(noise * strength)
 
 
-WITHOUT_VOICE: dict[str, Callable[[float], Samples]] = {  # by name; the argument is in seconds
+VOICELESS_SOUNDS: dict[str, Callable[[float], Samples]] = {  # by name; the argument is in seconds
     "plucked strings": music,
     "pink noise": varying_noise,
     "keyboard": keyboard,

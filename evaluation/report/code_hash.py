@@ -19,14 +19,16 @@ _INSTALLED = {"node_modules", ".venv"}
 def code_hash(patterns: Iterable[str], root: Path = ROOT) -> str:
     """Return a hash of files and folders, and of the modules that their Python files import."""
     digest = hashlib.sha256()
-    for name, content in sorted(_contents(patterns, root).items()):
+    for name, content in sorted(_read_code(patterns, root).items()):
         digest.update(name.encode() + content)
     return digest.hexdigest()[:16]
 
 
-def _contents(patterns: Iterable[str], root: Path) -> dict[str, bytes]:
+def _read_code(patterns: Iterable[str], root: Path) -> dict[str, bytes]:
     contents: dict[str, bytes] = {}
-    waiting = [file for pattern in patterns for path in root.glob(pattern) for file in _files(path)]
+    waiting = [
+        file for pattern in patterns for path in root.glob(pattern) for file in _python_files(path)
+    ]
     while waiting:
         file = waiting.pop()
         name = str(file.relative_to(root))
@@ -40,7 +42,7 @@ def _contents(patterns: Iterable[str], root: Path) -> dict[str, bytes]:
     return contents
 
 
-def _files(path: Path) -> Iterator[Path]:
+def _python_files(path: Path) -> Iterator[Path]:
     for file in path.rglob("*") if path.is_dir() else (path,):
         if file.suffix in _SOURCES and file.is_file():
             yield file

@@ -12,7 +12,7 @@ from kouxing.evaluation.tables import format_number, percent
 
 _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
 _COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", ALL: "all clips"}
-_OWN = "learned"
+_OUR_LIP_MODEL = "learned"
 _COMPARED = {  # compared measures, and whether higher is better
     "r_opening": ("correlation of the opening", True),
     "r_width": ("correlation of the width", True),
@@ -26,7 +26,7 @@ _COMPARED = {  # compared measures, and whether higher is better
     "precision_pause": ("precision of closures in pauses", True),
     "mtm_ms": ("MTM", False),
 }
-_LIKE_REAL = {  # measures that are best when they equal the value of real lips
+_REALISM_MEASURES = {  # measures that are best when they equal the value of real lips
     "slcc": "SLCC",
     "effort_correlation": "effort",
     "rest_opening": "opening at rest",
@@ -55,8 +55,8 @@ _MOTION_COLUMNS = {  # measures and formats by title
     "spread": ("phone_spread", ".0f"),
     "turns per s": ("turns_per_s", ".1f"),
 }
-_MEASURE_NAMES = {name: title for name, (title, _) in _COMPARED.items()} | _LIKE_REAL
-_NAMES = {
+_MEASURE_NAMES = {name: title for name, (title, _) in _COMPARED.items()} | _REALISM_MEASURES
+_PROGRAM_TITLES = {
     "headaudio": "HeadAudio 0.1.0",
     "wlipsync": "wLipSync 1.3.1",
     "wawa": "wawa-lipsync 0.0.2",
@@ -71,11 +71,11 @@ _NAMES = {
 def title_of(face: str) -> str:
     """Return the title of a face such as ``wawa, fitted, 100 ms``."""
     program, _, rest = face.partition(", ")
-    name = _NAMES.get(program, f"**{program}**")
+    name = _PROGRAM_TITLES.get(program, f"**{program}**")
     return f"{name}, {rest}"
 
 
-def agreement(results: Results) -> Table:
+def agreement_table(results: Results) -> Table:
     """Return the correlations with tracked lips in speech, best opening first."""
     faces = _clean_scores(results.get("rivals", {}))
     columns = ("face, delay", *(f"{name}: opening / width / jaw" for name in _GROUPS.values()))
@@ -95,18 +95,18 @@ def agreement(results: Results) -> Table:
 
 
 def better_programs(results: Results) -> list[list[str]]:
-    """Return a row for each measure in which another program is better than ``_OWN``."""
+    """Return a row for each measure in which another program is better than ``_OUR_LIP_MODEL``."""
     faces = results.get("rivals", {})
     scores = _clean_scores(faces)
-    own = next((face for face in scores if face.startswith(f"{_OWN}, ")), None)
+    own = next((face for face in scores if face.startswith(f"{_OUR_LIP_MODEL}, ")), None)
     if own is None:
         return []
-    others = [face for face in scores if face.partition(", ")[0] in _NAMES]
+    others = [face for face in scores if face.partition(", ")[0] in _PROGRAM_TITLES]
     rows = []
     for group, group_title in _COMPARED_GROUPS.items():
         real = faces[REAL][CLEAN].get(group, {})
         for measure, name in _MEASURE_NAMES.items():
-            if measure in _LIKE_REAL and group != ALL:
+            if measure in _REALISM_MEASURES and group != ALL:
                 continue
             values = {face: scores[face].get(group, {}).get(measure) for face in (own, *others)}
             losses = {
@@ -123,7 +123,7 @@ def better_programs(results: Results) -> list[list[str]]:
                         f"{figure}, recall {format_number(recall)}"
                         for figure, recall in zip(figures, recalls, strict=True)
                     ]
-                if measure in _LIKE_REAL:
+                if measure in _REALISM_MEASURES:
                     figures.append(f"real lips {_format_measure(measure, real[measure])}")
                 program, ours = title_of(best), ", ".join(figures[1:])
                 rows.append([f"{group_title}, {name}", program, figures[0], ours])
@@ -132,7 +132,7 @@ def better_programs(results: Results) -> list[list[str]]:
 
 def _loss(measure: str, value: float, real: float | None) -> float:
     """Return a figure's loss; lower is better."""
-    if measure in _LIKE_REAL:
+    if measure in _REALISM_MEASURES:
         return abs(value - (real or 0.0))
     return -value if _COMPARED[measure][1] else value
 
@@ -143,7 +143,7 @@ def _format_measure(measure: str, value: float | None) -> str:
     return format_number(value, ".0f" if measure in ("rest_opening", "phone_spread") else ".2f")
 
 
-def closures(results: Results) -> Table:
+def closures_table(results: Results) -> Table:
     """Return recall and precision of closures in percent, also by class of phones."""
     return ("face, delay", *_CLOSURE_COLUMNS), [
         [title, *(percent(scores.get(name), ".0f") for name in _CLOSURE_COLUMNS.values())]
@@ -151,10 +151,16 @@ def closures(results: Results) -> Table:
     ]
 
 
-def motion(results: Results) -> Table:
+def motion_table(results: Results) -> Table:
     """Return timing, effort and rest of the faces, and of real lips."""
     return ("face, delay", *_MOTION_COLUMNS), [
-        [title, *(format_number(scores.get(name), form) for name, form in _MOTION_COLUMNS.values())]
+        [
+            title,
+            *(
+                format_number(scores.get(name), format_spec)
+                for name, format_spec in _MOTION_COLUMNS.values()
+            ),
+        ]
         for title, scores in _all_faces(results)
     ]
 
@@ -174,7 +180,7 @@ def disturbed_lips(results: Results) -> list[str]:
     return sentences
 
 
-def lookahead(results: Results) -> Table:
+def lookahead_table(results: Results) -> Table:
     """Return the correlation of the opening and the F1 of closures by look-ahead."""
     curves = lookahead_curves(results)
     delays = sorted({delay for points in curves.values() for delay in points})
@@ -196,7 +202,7 @@ def lookahead_curves(results: Results) -> dict[str, dict[int, dict[str, Any]]]:
     return curves
 
 
-def schemes(results: Results) -> Table:
+def schemes_table(results: Results) -> Table:
     """Return the four schemes of Li et al. 2011 with the paper's scores."""
     columns = (
         "lips",
@@ -226,7 +232,7 @@ def schemes(results: Results) -> Table:
     ]
 
 
-def viseme_fit(results: Results) -> Table:
+def viseme_fit_table(results: Results) -> Table:
     """Return the errors of the visemes of Wang & Cai 2003 by viseme and measure."""
     errors = results.get("visemes", {}).get("errors", [])
     measures = list(dict.fromkeys(error["measure"] for error in errors))
@@ -247,7 +253,7 @@ def viseme_fit(results: Results) -> Table:
     return ("viseme", "frames", *measures), rows
 
 
-def ferguson(results: Results) -> Table:
+def ferguson_table(results: Results) -> Table:
     """Return the accuracies of Zhang et al. 2021 by method and speaking rate."""
     scores: Sequence[Any] = results.get("ferguson", [])
     columns = ("method", *(f"{s['rate']:g} ({s['syllables_per_s']:.1f} per s)" for s in scores))

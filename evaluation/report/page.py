@@ -21,7 +21,7 @@ _TEMPLATE = Path(__file__).with_name("template.md")
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class ReportTable:
     """A table, with the steps whose results it shows."""
 
     steps: tuple[str, ...]
@@ -29,16 +29,18 @@ class Part:
 
 
 TABLES = {
-    "recognition": Part(("read", "conversation", "disturbed", "languages"), recognition),
-    "agreement": Part(("rivals",), lip_tables.agreement),
-    "closures": Part(("rivals",), lip_tables.closures),
-    "lookahead": Part(("lookahead",), lip_tables.lookahead),
-    "motion": Part(("rivals",), lip_tables.motion),
-    "schemes": Part(("schemes", "schemes-paper-rule"), lip_tables.schemes),
-    "visemes": Part(("visemes",), lip_tables.viseme_fit),
-    "ferguson": Part(("ferguson",), lip_tables.ferguson),
-    "system": Part(("chain", "load", "busy", "browser", "package", "sizes"), system_tables.system),
-    "faults": Part(("faults",), system_tables.faults),
+    "recognition": ReportTable(("read", "conversation", "disturbed", "languages"), recognition),
+    "agreement": ReportTable(("rivals",), lip_tables.agreement_table),
+    "closures": ReportTable(("rivals",), lip_tables.closures_table),
+    "lookahead": ReportTable(("lookahead",), lip_tables.lookahead_table),
+    "motion": ReportTable(("rivals",), lip_tables.motion_table),
+    "schemes": ReportTable(("schemes", "schemes-paper-rule"), lip_tables.schemes_table),
+    "visemes": ReportTable(("visemes",), lip_tables.viseme_fit_table),
+    "ferguson": ReportTable(("ferguson",), lip_tables.ferguson_table),
+    "system": ReportTable(
+        ("chain", "load", "busy", "browser", "package", "sizes"), system_tables.system_table
+    ),
+    "faults": ReportTable(("faults",), system_tables.faults_table),
 }
 
 
@@ -59,13 +61,13 @@ def write_page(folder: Path, page: Path) -> None:
     ]
     columns = ("measure", "best other program", "its figure", "kouxing")
     text = _TEMPLATE.read_text("utf-8").replace("[[better]]\n", markdown((columns, better)))
-    parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _part(match[1], steps, results), text)
+    parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _render_table(match[1], steps, results), text)
     page.write_text(parts, encoding="utf-8")
     if "lookahead" in results:
         save_figure(_lookahead_figure(results), page.with_name(PICTURE))
 
 
-def _part(name: str, steps: Results, results: Results) -> str:
+def _render_table(name: str, steps: Results, results: Results) -> str:
     part = TABLES[name]
     missing = [step for step in part.steps if step not in steps]
     command = f'Not measured yet: `make report STEPS="{" ".join(missing)}"`'

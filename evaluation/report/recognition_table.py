@@ -4,17 +4,17 @@ from kouxing.evaluation.recognizer.disturbances import CLEAN
 from kouxing.evaluation.report.markdown import Results, Table, join_values
 from kouxing.evaluation.tables import format_number, percent
 
-_RECOGNIZERS = {  # in the rows by language
+_RECOGNIZER_TITLES = {  # in the rows by language
     "auto": "`universal`, no language chosen",
     "own": "the language's own phones",
     "hama": "hama 1.7.0, offline",
 }
-_ERRORS = {
+_ERROR_TITLES = {
     "phone": "errors of phones",
     "viseme": "errors of visemes",
     "feature": "errors of features",
 }
-_SPEECH = {
+_SPEECH_TITLES = {
     "de": "German, EmoDB",
     "en-GRID": "English, GRID",
     "en-learner": "English, native speakers of Mandarin",
@@ -39,14 +39,20 @@ def recognition(results: Results) -> Table:
     rows = []
     for speech in ("read", "conversation"):
         for model, figures in results.get(speech, {}).items():
-            rows.append([speech, f"`{model}`", *_cells(figures["speech"][CLEAN])])
+            rows.append([speech, f"`{model}`", *_score_cells(figures["speech"][CLEAN])])
     for model, figures in results.get("disturbed", {}).items():
         for kind, score in figures["speech"].items():
             if kind != CLEAN and not kind.endswith("/s"):
-                rows.append([f"read, {kind}", f"`{model}`", *_cells(score)])
+                rows.append([f"read, {kind}", f"`{model}`", *_score_cells(score)])
     for group, scores in _by_language(results).items():
         for recognizer, score in scores.items():
-            rows.append([_SPEECH.get(group, group), _RECOGNIZERS[recognizer], *_cells(score)])
+            rows.append(
+                [
+                    _SPEECH_TITLES.get(group, group),
+                    _RECOGNIZER_TITLES[recognizer],
+                    *_score_cells(score),
+                ]
+            )
     paper = ["read, own corpus", "Li et al. 2011, N = 3", "", "26.3 / -", "", "45", ""]
     return columns, [*rows, paper]
 
@@ -55,10 +61,10 @@ def better_recognizers(results: Results) -> list[list[str]]:
     """Return a row for each error rate of a language in which hama is better."""
     rows = []
     for group, scores in _by_language(results).items():
-        for unit, name in _ERRORS.items() if "hama" in scores else ():
+        for unit, name in _ERROR_TITLES.items() if "hama" in scores else ():
             hama, own = (scores[key]["final"][f"{unit}_error_rate"] for key in ("hama", "own"))
             if hama < own:
-                measure, figures = f"{_SPEECH.get(group, group)}, {name}", (hama, own)
+                measure, figures = f"{_SPEECH_TITLES.get(group, group)}, {name}", (hama, own)
                 rows.append([measure, "hama 1.7.0, offline", *(f"{percent(f)} %" for f in figures)])
     return rows
 
@@ -72,12 +78,12 @@ def _by_language(results: Results) -> dict[str, dict[str, Results]]:
     return scores
 
 
-def _cells(score: Results) -> list[str]:
+def _score_cells(score: Results) -> list[str]:
     delay = score.get("delay_ms", {})
     errors = (
         join_values(
             percent(score[hypothesis][key])
-            for unit in _ERRORS
+            for unit in _ERROR_TITLES
             if (key := f"{unit}_error_rate") in score[hypothesis]
         )
         if hypothesis in score

@@ -20,11 +20,11 @@ from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.steps import FOLDER_OPTIONS, ROOT, STEPS
 from kouxing.shared.terminal import print_message
 
-_DROPPED = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
-_DROPPED_GROUPS = ("source ", "speaker ")
+_OMITTED_KEYS = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
+_OMITTED_GROUPS = ("source ", "speaker ")
 _DIGITS = 5
 # The report itself writes these files, so their changes do not make a commit dirty.
-_WRITTEN = (":!docs/results", ":!docs/results.md", ":!docs/*.png")
+_REPORT_FILES = (":!docs/results", ":!docs/results.md", ":!docs/*.png")
 
 
 def run_steps(
@@ -79,7 +79,7 @@ def describe_run() -> dict[str, Any]:
     lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.exists() else []
     models = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
     commit = _git("describe", "--always")
-    if commit and _git("status", "--porcelain", "--untracked-files=no", "--", ".", *_WRITTEN):
+    if commit and _git("status", "--porcelain", "--untracked-files=no", "--", ".", *_REPORT_FILES):
         commit += "-dirty"
     return {
         "machine": f"{models[0] if models else platform.processor()}, {os.cpu_count()} cores",
@@ -155,7 +155,7 @@ def _trim_figures(value: Any) -> Any:
         return {
             key: _trim_figures(item)
             for key, item in value.items()
-            if key not in _DROPPED and not key.startswith(_DROPPED_GROUPS)
+            if key not in _OMITTED_KEYS and not key.startswith(_OMITTED_GROUPS)
         }
     if isinstance(value, list | tuple):
         return [_trim_figures(item) for item in value]

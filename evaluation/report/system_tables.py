@@ -18,23 +18,30 @@ _PACKAGE_FIGURES = {  # lower is better: name, scale and unit
 }
 
 
-def system(results: Results) -> Table:
+def system_table(results: Results) -> Table:
     """Return each figure of the running system with its physical floor."""
     return ("figure", "value", "floor", "source of the floor"), [
-        row for rows in (_chain, _load, _busy, _browser, _package, _sizes) for row in rows(results)
+        row
+        for rows in (_chain_rows, _load_rows, _busy_rows, _browser_rows, _package_rows, _size_rows)
+        for row in rows(results)
     ]
 
 
-def _chain(results: Results) -> Iterator[list[str]]:
+def _chain_rows(results: Results) -> Iterator[list[str]]:
     chain = results.get("chain")
     if not chain:
         return
     floor_cores = results.get("sizes", {}).get("floor_cores", {}).get("hop 1")
     to_frame, from_sound = chain["chunk_to_frame_ms"], chain["sound_to_frame_ms"]
-    yield ["end of a chunk to its frame, p50 / p95, ms", _percentiles(to_frame), "0", "computation"]
+    yield [
+        "end of a chunk to its frame, p50 / p95, ms",
+        _format_percentiles(to_frame),
+        "0",
+        "computation",
+    ]
     yield [
         "sound to its frame, p50 / p95, ms",
-        _percentiles(from_sound),
+        _format_percentiles(from_sound),
         str(_LOOK_AHEAD_MS),
         "look-ahead of the lips",
     ]
@@ -56,7 +63,7 @@ def _chain(results: Results) -> Iterator[list[str]]:
             ]
 
 
-def _load(results: Results) -> Iterator[list[str]]:
+def _load_rows(results: Results) -> Iterator[list[str]]:
     load = results.get("load")
     if not load:
         return
@@ -79,7 +86,7 @@ def _load(results: Results) -> Iterator[list[str]]:
         ]
 
 
-def _busy(results: Results) -> Iterator[list[str]]:
+def _busy_rows(results: Results) -> Iterator[list[str]]:
     busy = results.get("busy")
     for run, summary in zip(busy["runs"], busy["summary"], strict=True) if busy else ():
         yield [
@@ -90,13 +97,13 @@ def _busy(results: Results) -> Iterator[list[str]]:
         ]
 
 
-def _browser(results: Results) -> Iterator[list[str]]:
+def _browser_rows(results: Results) -> Iterator[list[str]]:
     browser = results.get("browser")
     if not browser:
         return
     yield [
         "lips in the browser: sound to weights, p50 / p95, ms",
-        _percentiles(browser["delay_ms"]),
+        _format_percentiles(browser["delay_ms"]),
         format_number(_LOOK_AHEAD_MS + _FRAME_MS / 2, ".0f"),
         "look-ahead + half a frame",
     ]
@@ -138,7 +145,7 @@ def _browser(results: Results) -> Iterator[list[str]]:
         ]
 
 
-def _package(results: Results) -> Iterator[list[str]]:
+def _package_rows(results: Results) -> Iterator[list[str]]:
     package = results.get("package")
     if not package:
         return
@@ -167,7 +174,7 @@ def better_packages(results: Results) -> list[list[str]]:
     return rows
 
 
-def _sizes(results: Results) -> Iterator[list[str]]:
+def _size_rows(results: Results) -> Iterator[list[str]]:
     sizes = results.get("sizes")
     if not sizes:
         return
@@ -181,11 +188,11 @@ def _sizes(results: Results) -> Iterator[list[str]]:
     ]
 
 
-def _percentiles(values: Results) -> str:
+def _format_percentiles(values: Results) -> str:
     return join_values(format_number(values.get(key), ".1f") for key in ("p50", "p95"))
 
 
-def faults(results: Results) -> Table:
+def faults_table(results: Results) -> Table:
     """Return the effects of each fault on a viewer."""
     columns = (
         "fault",

@@ -1,20 +1,20 @@
 // The audio thread of a browser in Node: runs an audio worklet over a recording, as fast as possible. Messages
-// between a node and its processor arrive at once. The clock is the length of the audio so far.
+// between a node and its processor arrive immediately. The clock is the duration of the audio so far.
 
 export const SAMPLE_RATE_HZ = 48000;
 export const BLOCK = 128; // samples
 
 class Port {
   onmessage = null;
-  other;
+  peer;
 
   postMessage(data) {
-    this.other.onmessage?.({ data });
+    this.peer.onmessage?.({ data });
   }
 }
 
 const processors = new Map();
-let processorPort; // of the processor that is being made
+let processorPort; // port of the processor that is being constructed
 
 globalThis.sampleRate = SAMPLE_RATE_HZ;
 globalThis.currentTime = 0;
@@ -27,11 +27,11 @@ globalThis.AudioWorkletNode = class {
   constructor(_context, name, options) {
     this.port = new Port();
     processorPort = new Port();
-    [this.port.other, processorPort.other] = [processorPort, this.port];
+    [this.port.peer, processorPort.peer] = [processorPort, this.port];
     const Processor = processors.get(name);
     this.processor = new Processor(options);
     this.parameterData = Object.fromEntries(
-      (Processor.parameterDescriptors ?? []).map((each) => [each.name, [each.defaultValue]]),
+      (Processor.parameterDescriptors ?? []).map(({ name: parameter, defaultValue }) => [parameter, [defaultValue]]),
     );
   }
 };
@@ -40,7 +40,7 @@ globalThis.AudioWorkletNode = class {
  * Pass a recording to `processBlock` in blocks of 128 samples. After every `stepS`, `makeRow` returns the values of
  * a row. The rows start with their time: the length of the audio so far, in seconds.
  */
-export function play(samples, stepS, processBlock, makeRow) {
+export function runBlocks(samples, stepS, processBlock, makeRow) {
   const rows = [];
   globalThis.currentTime = 0;
   for (let start = 0; start < samples.length; start += BLOCK) {

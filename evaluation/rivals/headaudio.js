@@ -1,7 +1,7 @@
 // HeadAudio: the weights of the 15 Oculus visemes, then the viseme that it has detected (1 or 0).
 
 import { readFile } from "node:fs/promises";
-import { play } from "./audio-thread.js";
+import { runBlocks } from "./audio-thread.js";
 import "@met4citizen/headaudio/modules/headworklet.mjs";
 import { HeadAudio } from "@met4citizen/headaudio/modules/headaudio.mjs";
 
@@ -9,7 +9,7 @@ const MODEL = new URL(import.meta.resolve("@met4citizen/headaudio/dist/model-en-
 const STEP_S = 0.01;
 const model = await readFile(MODEL, "base64");
 
-export async function curvesOf(samples) {
+export async function computeCurves(samples) {
   const node = new HeadAudio(null, { processorOptions: { visemeEventsEnabled: true } });
   await node.loadModel(`data:application/octet-stream;base64,${model}`);
   const weights = new Map(node.visemeNames.map((name) => [name, 0]));
@@ -18,7 +18,7 @@ export async function curvesOf(samples) {
   let detected = silence;
   node.onviseme = ({ viseme }) => (detected = viseme ?? detected);
   node.onended = () => (detected = silence);
-  const rows = play(
+  const rows = runBlocks(
     samples,
     STEP_S,
     (block) => node.processor.process([[block]], [], node.parameterData),

@@ -2,7 +2,7 @@
 // with one parameter per vowel. The package expects a document, to which it adds its core as a script.
 
 import { runInThisContext } from "node:vm";
-import { SAMPLE_RATE_HZ, play } from "./audio-thread.js";
+import { SAMPLE_RATE_HZ, runBlocks } from "./audio-thread.js";
 
 const PARAMETERS = { ParamA: "aa", ParamI: "ih", ParamU: "ou", ParamE: "E", ParamO: "oh" };
 const STEP_S = 1 / 60;
@@ -33,18 +33,18 @@ const coreModel = {
     if (index < weights.length) weights[index] = value ?? 0; // the model has no parameter for silence
   },
 };
-const sync = new MotionSync({ coreModel, motionManager: { update() {} } }); // the core has room for few of them
+const sync = new MotionSync({ coreModel, motionManager: { update() {} } }); // the core supports only a few instances
 await sync.loadDefaultMotionSync();
-await sync.play({ getAudioTracks: () => [null] });
+await sync.runBlocks({ getAudioTracks: () => [null] });
 console.log = log;
 
-export async function curvesOf(samples) {
-  run(new Float32Array(SAMPLE_RATE_HZ)); // a second of silence after the recording before
+export async function computeCurves(samples) {
+  run(new Float32Array(SAMPLE_RATE_HZ)); // a second of silence after the previous recording
   return { names: Object.values(PARAMETERS).map((viseme) => `viseme_${viseme}`), rows: run(samples) };
 }
 
 function run(samples) {
-  return play(
+  return runBlocks(
     samples,
     STEP_S,
     (block) => sync.onMessage({ data: { eventType: "data", audioBuffer: block } }),

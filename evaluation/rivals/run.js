@@ -8,12 +8,12 @@ import { argv } from "node:process";
 const OCULUS = { viseme_I: "ih", viseme_O: "oh", viseme_U: "ou" }; // from the names of Ready Player Me
 
 const [program, sounds, tables, profile] = argv.slice(2);
-const { curvesOf } = await import(`./${program}.js`);
+const { computeCurves } = await import(`./${program}.js`);
 const settings = profile ? JSON.parse(await readFile(profile, "utf8")) : null;
 for (const file of await readdir(sounds)) {
   const sound = await readFile(join(sounds, file));
   const samples = new Float32Array(sound.buffer, sound.byteOffset, sound.length / 4);
-  const { names, rows } = await curvesOf(samples, settings);
+  const { names, rows } = await computeCurves(samples, settings);
   const header = ["t", ...names.map((name) => OCULUS[name] ?? name.replace(/^viseme_/, ""))].join(",");
   const lines = rows.map((row) => row.map((value) => Number(value.toFixed(4))).join(","));
   await writeFile(join(tables, `${parse(file).name}.csv`), [header, ...lines, ""].join("\n"));

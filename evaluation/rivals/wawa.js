@@ -1,7 +1,7 @@
 // wawa-lipsync: the viseme that it has detected (1 or 0), then its spectrum bands and its volume, at 60 Hz.
 // The analyser node follows the Web Audio API, 1.8.6: Blackman window, smoothing of 0.8, -100 to -30 dB.
 
-import { SAMPLE_RATE_HZ, play } from "./audio-thread.js";
+import { SAMPLE_RATE_HZ, runBlocks } from "./audio-thread.js";
 
 const STEP_S = 1 / 60;
 const [SMOOTHING, MIN_DB, MAX_DB] = [0.8, -100, -30];
@@ -34,8 +34,8 @@ class Analyser {
     for (let k = 0; k < bytes.length; k++) {
       const magnitude = Math.hypot(real[k], imaginary[k]) / size;
       this.#smoothed[k] = SMOOTHING * this.#smoothed[k] + (1 - SMOOTHING) * magnitude;
-      const share = (20 * Math.log10(this.#smoothed[k]) - MIN_DB) / (MAX_DB - MIN_DB);
-      bytes[k] = Math.max(0, Math.min(255, Math.floor(255 * share)));
+      const level = (20 * Math.log10(this.#smoothed[k]) - MIN_DB) / (MAX_DB - MIN_DB);
+      bytes[k] = Math.max(0, Math.min(255, Math.floor(255 * level)));
     }
   }
 }
@@ -54,12 +54,12 @@ function transform(real, imaginary) {
       const [cosine, sine] = [Math.cos((Math.PI * k) / half), -Math.sin((Math.PI * k) / half)];
       for (let even = k; even < size; even += 2 * half) {
         const odd = even + half;
-        const turnedReal = cosine * real[odd] - sine * imaginary[odd];
-        const turnedImaginary = cosine * imaginary[odd] + sine * real[odd];
-        real[odd] = real[even] - turnedReal;
-        imaginary[odd] = imaginary[even] - turnedImaginary;
-        real[even] += turnedReal;
-        imaginary[even] += turnedImaginary;
+        const rotatedReal = cosine * real[odd] - sine * imaginary[odd];
+        const rotatedImaginary = cosine * imaginary[odd] + sine * real[odd];
+        real[odd] = real[even] - rotatedReal;
+        imaginary[odd] = imaginary[even] - rotatedImaginary;
+        real[even] += rotatedReal;
+        imaginary[even] += rotatedImaginary;
       }
     }
   }
@@ -73,10 +73,10 @@ globalThis.window = {
 };
 const { Lipsync, VISEMES } = await import("wawa-lipsync");
 
-export async function curvesOf(samples) {
+export async function computeCurves(samples) {
   const node = new Lipsync();
   const visemes = Object.values(VISEMES);
-  const rows = play(
+  const rows = runBlocks(
     samples,
     STEP_S,
     (block) => node.analyser.add(block),

@@ -2,7 +2,7 @@
 
 import { readFile } from "node:fs/promises";
 import { setTimeout } from "node:timers/promises";
-import { play } from "./audio-thread.js";
+import { runBlocks } from "./audio-thread.js";
 import "wlipsync/audio-processor.js";
 import { WLipSyncAudioNode } from "wlipsync/wlipsync.js";
 
@@ -11,7 +11,7 @@ const VISEMES = { A: "aa", E: "E", I: "ih", O: "oh", U: "ou" };
 const STEP_S = 0.01;
 const module = await WebAssembly.compile(await readFile(WASM));
 
-export async function curvesOf(samples, profile) {
+export async function computeCurves(samples, profile) {
   const node = new WLipSyncAudioNode(null, profile, module);
   const { processor } = node;
   while (processor.exports === null) await setTimeout(1);
@@ -21,7 +21,7 @@ export async function curvesOf(samples, profile) {
     profile.mfccNum,
   );
   const vowels = Object.keys(node.weights);
-  const rows = play(
+  const rows = runBlocks(
     samples,
     STEP_S,
     (block) => processor.process([[block]], [], node.parameterData),

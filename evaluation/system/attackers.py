@@ -44,7 +44,7 @@ class Attack:
     has_key: bool = False
 
 
-def ready(kind: str) -> bytes:
+def ready_command(kind: str) -> bytes:
     """Return the READY command of a socket kind, such as ``DEALER``."""
     command = b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind.encode()
     return bytes([COMMAND, len(command)]) + command
@@ -72,10 +72,16 @@ def spin(_endpoint: str, _source: str, seconds: float) -> None:
 def random_bytes(endpoint: str, source: str, seconds: float) -> None:
     """Open connections and send random bytes, some of them after a valid greeting."""
     random = Random(1)  # noqa: S311 - no secret
-    starts = (b"", GREETING, GREETING + ready("DEALER"), CURVE_GREETING, b"GET / HTTP/1.1\r\n")
+    starts = (
+        b"",
+        GREETING,
+        GREETING + ready_command("DEALER"),
+        CURVE_GREETING,
+        b"GET / HTTP/1.1\r\n",
+    )
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
-        with contextlib.suppress(OSError), _open(endpoint, source) as connection:
+        with contextlib.suppress(OSError), _open_connection(endpoint, source) as connection:
             connection.settimeout(0.02)
             connection.sendall(random.choice(starts) + random.randbytes(random.choice((10, 10**4))))
             connection.recv(1000)
@@ -85,7 +91,7 @@ def half_open_connections(endpoint: str, source: str, seconds: float) -> None:
     """Hold many connections, each with an unfinished handshake or web request."""
     start = b"GET / HTTP/1.1\r\nHost: " if endpoint.startswith("http") else CURVE_GREETING[:40]
     end_s = time.monotonic() + seconds
-    with many_connections(_port(endpoint), NUM_CONNECTIONS, source) as connections:
+    with many_connections(_port_of(endpoint), NUM_CONNECTIONS, source) as connections:
         for connection in connections:
             with contextlib.suppress(OSError):  # closed by the peer
                 connection.sendall(start)
@@ -96,7 +102,7 @@ def endless_handshake(endpoint: str, source: str, seconds: float) -> None:
     """Announce a command of a terabyte in the handshake, and send it as fast as possible."""
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
-        with contextlib.suppress(OSError), _open(endpoint, source) as connection:
+        with contextlib.suppress(OSError), _open_connection(endpoint, source) as connection:
             connection.sendall(
                 CURVE_GREETING + bytes([COMMAND | LONG]) + (2**40).to_bytes(8, "big")
             )
@@ -118,18 +124,18 @@ def many_connections(
         yield connections
 
 
-def _open(endpoint: str, source: str) -> socket.socket:
-    return socket.create_connection((LOCALHOST, _port(endpoint)), 1.0, (source, 0))
+def _open_connection(endpoint: str, source: str) -> socket.socket:
+    return socket.create_connection((LOCALHOST, _port_of(endpoint)), 1.0, (source, 0))
 
 
-def _port(endpoint: str) -> int:
+def _port_of(endpoint: str) -> int:
     return int(endpoint.partition(" ")[0].rstrip("/").rpartition(":")[2])
 
 
 # Attackers with a client key.
 
 
-def _send(make_message: Callable[[int], list[bytes]], kind: int = zmq.DEALER) -> AttackFunction:
+def _flood(make_message: Callable[[int], list[bytes]], kind: int = zmq.DEALER) -> AttackFunction:
     """Return an attack that sends messages as fast as the socket takes them."""
 
     def attack(endpoint: str, source: str, seconds: float) -> None:
@@ -150,7 +156,7 @@ def _random_message(number: int) -> list[bytes]:
     return [random.randbytes(random.choice((0, 1, 30, 3000))) for _ in range(random.randint(1, 4))]
 
 
-def _subscription(number: int) -> list[bytes]:
+def _random_subscription(number: int) -> list[bytes]:
     return [b"\x01" + b"%0120d" % number]
 
 
@@ -211,12 +217,12 @@ ATTACKS: dict[str, Attack] = {
     **{
         name: Attack(run, targets, has_key=True)
         for name, run, targets in (
-            ("huge messages", _send(lambda _: [bytes(64 * 2**20)]), _INPUTS),
-            ("messages of many parts", _send(lambda _: [bytes(300)] * 300_000), _INPUTS),
-            ("flood of large messages", _send(lambda _: [bytes(65_000)]), _INPUTS),
-            ("flood of small messages", _send(lambda _: [bytes(10)]), _INPUTS),
-            ("malformed messages", _send(_random_message), _INPUTS),
-            ("many subscriptions", _send(_subscription, zmq.XSUB), ("faps",)),
+            ("huge messages", _flood(lambda _: [bytes(64 * 2**20)]), _INPUTS),
+            ("messages of many parts", _flood(lambda _: [bytes(300)] * 300_000), _INPUTS),
+            ("flood of large messages", _flood(lambda _: [bytes(65_000)]), _INPUTS),
+            ("flood of small messages", _flood(lambda _: [bytes(10)]), _INPUTS),
+            ("malformed messages", _flood(_random_message), _INPUTS),
+            ("many subscriptions", _flood(_random_subscription, zmq.XSUB), ("faps",)),
             ("many connections", keyed_connections, _INPUTS),
             ("silent subscribers", silent_subscribers, ("commands",)),
             ("many sessions", many_sessions, ("commands",)),

@@ -44,7 +44,7 @@ RELEASE_DEADLINE_S = 15.0
 RELEASED_MB = 4.0  # a service that has grown by no more has released the memory
 
 
-class Memory:
+class MemoryUsage:
     """Memory of a process, relative to when this object was made; MB of 2^20 bytes."""
 
     def __init__(self, process_id: int) -> None:
@@ -143,7 +143,7 @@ def _result(
         services = client.status().services
     endpoints = {key: endpoint for state in services for key, endpoint in state.endpoints.items()}
     processes = {kind: system.supervisor.process(kind).pid for kind in KINDS}
-    memories = {kind: Memory(process_id) for kind, process_id in processes.items()}
+    memories = {kind: MemoryUsage(process_id) for kind, process_id in processes.items()}
 
     def restart_growth() -> None:  # the memory of the other client's session is now allocated
         for memory in memories.values():

@@ -21,7 +21,7 @@ from kouxing_client import Client
 from numpy.typing import NDArray
 from rich.console import Console
 
-from kouxing.evaluation.system.load import SETTLE_S, Crowd, Spoken
+from kouxing.evaluation.system.load import SETTLE_S, LoadGenerator, Speaker
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.kinds import KINDS
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -42,7 +42,7 @@ _COLUMNS = 10  # seconds in a row of the table
 
 
 @dataclass(frozen=True, slots=True)
-class Usage:
+class UsageRate:
     """Resources that a service used per second."""
 
     cpu_cores: float
@@ -50,7 +50,7 @@ class Usage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Run:
+class BusyRun:
     """Lateness of the face with a number of busy programs."""
 
     num_programs: int
@@ -104,12 +104,12 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Busy:
+class BusyResults:
     """All figures."""
 
-    runs: list[Run]
-    idle: dict[str, Usage]  # by service, in silence
-    speaking: dict[str, Usage]  # by service, before the load
+    runs: list[BusyRun]
+    idle: dict[str, UsageRate]  # by service, in silence
+    speaking: dict[str, UsageRate]  # by service, before the load
     machine_load: float  # load average of the minute before
 
 
@@ -119,15 +119,15 @@ def measure(
     load_s: float,
     console: Console,
     language: str | None = None,
-) -> Busy:
+) -> BusyResults:
     """Start all services, and speak while each number of busy programs runs.
 
     ``language`` is the language of the speech. If None, it is the recognizer's. Raises
     ``UserError`` if a file is not audio, or the services cannot start.
     """
-    text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
+    speech = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
-    runs: list[Run] = []
+    runs: list[BusyRun] = []
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalSystem(Path(folder), console) as system,
@@ -135,50 +135,50 @@ def measure(
     ):
         processes = {name: system.supervisor.process(name).pid for name in KINDS}
         time.sleep(SETTLE_S)
-        idle = _usage(processes, lambda: time.sleep(QUIET_S))
-        with _speaker(client, text, language) as (crowd, quiet_s):
-            speaking = _usage(processes, lambda: crowd.speak_until(quiet_s + QUIET_S))
+        idle = _measure_usage(processes, lambda: time.sleep(QUIET_S))
+        with _speaker(client, speech, language) as (generator, quiet_s):
+            speaking = _measure_usage(processes, lambda: generator.speak_until(quiet_s + QUIET_S))
         for num in programs:
             console.print(f"speaking with {num} busy programs")
-            runs.append(_run(client, text, num, load_s, language))
-    return Busy(runs=runs, idle=idle, speaking=speaking, machine_load=machine_load)
+            runs.append(_run(client, speech, num, load_s, language))
+    return BusyResults(runs=runs, idle=idle, speaking=speaking, machine_load=machine_load)
 
 
 @contextlib.contextmanager
 def _speaker(
-    client: Client, text: NDArray[np.float32], language: str | None
-) -> Iterator[tuple[Crowd, float]]:
+    client: Client, speech: NDArray[np.float32], language: str | None
+) -> Iterator[tuple[LoadGenerator, float]]:
     """Open a session and speak for a moment; yield the speaker and the time reached."""
-    crowd = Crowd(client, text, 1, language)
-    if not crowd.spoken:
-        raise UserError(f"control rejects the session: {', '.join(crowd.refusals)}")
-    crowd.start()
+    generator = LoadGenerator(client, speech, 1, language)
+    if not generator.speakers:
+        raise UserError(f"control rejects the session: {', '.join(generator.refusals)}")
+    generator.start()
     quiet_s = time.perf_counter() + SETTLE_S
-    crowd.speak_until(quiet_s)
-    yield crowd, quiet_s
-    crowd.close()
+    generator.speak_until(quiet_s)
+    yield generator, quiet_s
+    generator.close()
 
 
 def _run(
     client: Client,
-    text: NDArray[np.float32],
+    speech: NDArray[np.float32],
     num_programs: int,
     load_s: float,
     language: str | None,
-) -> Run:
-    with _speaker(client, text, language) as (crowd, quiet_s):
+) -> BusyRun:
+    with _speaker(client, speech, language) as (generator, quiet_s):
         start_s = quiet_s + QUIET_S
-        crowd.speak_until(start_s)
+        generator.speak_until(start_s)
         with _busy_programs(num_programs):
-            crowd.speak_until(start_s + load_s)
+            generator.speak_until(start_s + load_s)
         end_s = start_s + load_s + AFTER_S
-        crowd.speak_until(end_s)
-        (spoken,) = crowd.spoken
-        frames = _frames(spoken)
-        num_due = round((end_s - start_s) * spoken.session.info["facts"]["frame_rate_hz"])
+        generator.speak_until(end_s)
+        (speaker,) = generator.speakers
+        frames = _frames(speaker)
+        num_due = round((end_s - start_s) * speaker.session.info["facts"]["frame_rate_hz"])
     median_s = float(np.median(_ages_s(frames, quiet_s, start_s)))
     num_shown = sum(start_s <= due_s < end_s for due_s, _ in frames)
-    return Run(
+    return BusyRun(
         num_programs=num_programs,
         quiet_median_s=median_s,
         lateness_s=[float(age_s) for age_s in _ages_s(frames, start_s, end_s) - median_s],
@@ -187,11 +187,11 @@ def _run(
     )
 
 
-def _frames(spoken: Spoken) -> list[tuple[float, float]]:
+def _frames(speaker: Speaker) -> list[tuple[float, float]]:
     """Return, for each frame in order, when its audio was due and when the frame arrived."""
-    arrived_s = spoken.arrived_s.copy()  # another thread adds frames
+    arrived_s = speaker.arrived_s.copy()  # another thread adds frames
     return sorted(
-        (spoken.start_s + to_seconds(media_time), at_s) for media_time, at_s in arrived_s.items()
+        (speaker.start_s + to_seconds(media_time), at_s) for media_time, at_s in arrived_s.items()
     )
 
 
@@ -223,24 +223,26 @@ def _busy_programs(num: int) -> Iterator[None]:
             program.wait()
 
 
-def _usage(processes: Mapping[str, int], action: Callable[[], None]) -> dict[str, Usage]:
+def _measure_usage(
+    processes: Mapping[str, int], action: Callable[[], None]
+) -> dict[str, UsageRate]:
     """Return the resources that each service uses while an action runs."""
     started_s = time.monotonic()
-    before = {name: _used(process) for name, process in processes.items()}
+    before = {name: _read_usage(process) for name, process in processes.items()}
     action()
     passed_s = time.monotonic() - started_s
     return {
-        name: Usage(
+        name: UsageRate(
             *(
                 (now - then) / passed_s
-                for now, then in zip(_used(process), before[name], strict=True)
+                for now, then in zip(_read_usage(process), before[name], strict=True)
             )
         )
         for name, process in processes.items()
     }
 
 
-def _used(process_id: int) -> tuple[float, int]:
+def _read_usage(process_id: int) -> tuple[float, int]:
     """Return the CPU seconds of a process and the number of wake-ups of its threads.
 
     Raises ``UserError`` if the system has no /proc, or the process has ended.
@@ -253,8 +255,8 @@ def _used(process_id: int) -> tuple[float, int]:
             for thread in (_PROC / str(process_id) / "task").iterdir()
         ]
     except OSError as error:
-        text = f"cannot read the processor time of a service: {error}; run this command on Linux"
-        raise UserError(text) from None
+        speech = f"cannot read the processor time of a service: {error}; run this command on Linux"
+        raise UserError(speech) from None
     wake_ups = sum(
         int(line.split()[1])
         for state in states
@@ -264,7 +266,7 @@ def _used(process_id: int) -> tuple[float, int]:
     return cpu_s, wake_ups
 
 
-def show(busy: Busy, console: Console) -> None:
+def show(busy: BusyResults, console: Console) -> None:
     """Print the lateness by second, a summary, and the resources that each service uses."""
     for run in busy.runs:
         rows = run.worst_by_second_s
@@ -314,7 +316,7 @@ def show(busy: Busy, console: Console) -> None:
     console.print(f"load average before: {busy.machine_load:.1f}")
 
 
-def _cells(usage: Mapping[str, Usage], name: str) -> tuple[str, str]:
+def _cells(usage: Mapping[str, UsageRate], name: str) -> tuple[str, str]:
     services = [usage[name]] if name in usage else usage.values()
     cpu_cores = sum(service.cpu_cores for service in services)
     return f"{cpu_cores:.3f}", f"{sum(service.wake_ups for service in services):.0f}"

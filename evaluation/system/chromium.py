@@ -26,7 +26,7 @@ _TIMEOUT_S = 60.0
 
 def is_installed() -> bool:
     """Whether Chromium is installed."""
-    return _program() is not None
+    return _find_chromium() is not None
 
 
 class Chromium:
@@ -39,7 +39,7 @@ class Chromium:
     def __init__(
         self, folder: Path, size_px: tuple[int, int], microphone: Path, camera: Path | None = None
     ) -> None:
-        program = _program()
+        program = _find_chromium()
         if program is None:
             raise UserError("Chromium is not installed; install the package chromium")
         self._process = subprocess.Popen(  # noqa: S603 - found on the path
@@ -62,7 +62,7 @@ class Chromium:
         )
         self._loop = asyncio.new_event_loop()
         self._num_sent = 0
-        self.complaints: list[str] = []
+        self.page_errors: list[str] = []
         port_file = folder / "DevToolsActivePort"
         try:
             wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), _TIMEOUT_S)
@@ -101,7 +101,7 @@ class Chromium:
         while True:
             answer = await self._socket.receive_json(timeout=_TIMEOUT_S)
             if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
-                self.complaints.append(json.dumps(answer["params"]))
+                self.page_errors.append(json.dumps(answer["params"]))
             if answer.get("id") == self._num_sent:
                 if "error" in answer:
                     raise RuntimeError(answer["error"])
@@ -180,7 +180,7 @@ class Chromium:
             wait_until(holds, limit_s)
         except TimeoutError:
             state = self.evaluate("JSON.stringify(window.kouxing?.state)")
-            raise TimeoutError(f"{condition}; state {state}; {self.complaints}") from None
+            raise TimeoutError(f"{condition}; state {state}; {self.page_errors}") from None
 
 
 @contextlib.contextmanager
@@ -226,5 +226,5 @@ def wait_until(condition: Callable[[], object], limit_s: float) -> None:
         time.sleep(0.03)
 
 
-def _program() -> str | None:
+def _find_chromium() -> str | None:
     return shutil.which("chromium") or shutil.which("google-chrome")

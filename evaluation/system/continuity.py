@@ -13,7 +13,7 @@ from kouxing.shared.face.faps import FAPS
 
 MIN_STEP = 1.0  # FAP units; a smaller step is invisible
 LATE_S = 0.06  # a frame is late if it arrives more than this after its audio
-CALM_S = 1.0  # frames are on time again after this time without late frames
+ON_TIME_S = 1.0  # frames are on time again after this time without late frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +85,7 @@ def _late_until_s(due_s: NDArray[np.float64], late_s: NDArray[np.float64], fault
     """Return when the last frame arrived that the fault made late."""
     until_s = fault_s
     for due, late in sorted(zip(due_s, late_s, strict=True)):
-        if due > until_s + CALM_S:
+        if due > until_s + ON_TIME_S:
             break
         if late > LATE_S:
             until_s = max(until_s, float(due + late))

@@ -70,9 +70,9 @@ def _cpu_s(
     starts = np.arange(num_sessions) * len(samples) // num_sessions
     sounds = [np.roll(samples, -start) for start in starts]
     start_s = time.process_time()
-    for at in range(0, len(samples), CHUNK):
+    for start in range(0, len(samples), CHUNK):
         for stream, sound in zip(streams, sounds, strict=True):
-            stream.accept_waveform(sound[at : at + CHUNK])
+            stream.accept_waveform(sound[start : start + CHUNK])
         recognizer.decode_streams(streams)
         for stream in streams:
             recognizer.get_result(stream)
@@ -81,7 +81,7 @@ def _cpu_s(
 
 
 @dataclass(frozen=True, slots=True)
-class Rendering:
+class RenderingCosts:
     """Figures of one run."""
 
     opengl: str  # renderer and version
@@ -91,7 +91,7 @@ class Rendering:
     load_s: dict[str, float]  # by detail
 
 
-def measure_images() -> Rendering:
+def measure_images() -> RenderingCosts:
     """Render the default head with visemes, blinks and nods; needs OpenGL, or raises UserError."""
     rates, stages = {}, {}
     load_s: dict[str, float] = {}
@@ -102,7 +102,7 @@ def measure_images() -> Rendering:
         load_s[detail] = time.perf_counter() - start_s
         renderer = Renderer(head, *size, samples=samples)
         opengl = renderer.description
-        frames = [_frame(number) for number in range(NUM_IMAGES)]
+        frames = [_moving_face(number) for number in range(NUM_IMAGES)]
         images = [renderer.draw(faps) for faps in frames[:10]]  # warm up
         start_s = time.perf_counter()
         for faps in frames:
@@ -117,10 +117,10 @@ def measure_images() -> Rendering:
             stages[name]["encode"] = _encode_ms(images)
         renderer.close()
     size_bytes = (ASSETS / f"{DEFAULT_HEAD}.npz").stat().st_size
-    return Rendering(opengl, rates, stages, size_bytes, load_s)
+    return RenderingCosts(opengl, rates, stages, size_bytes, load_s)
 
 
-def show_images(rendering: Rendering, console: Console) -> None:
+def show_images(rendering: RenderingCosts, console: Console) -> None:
     """Print the figures as a table."""
     names = list(dict.fromkeys(stage for ms in rendering.stages_ms.values() for stage in ms))
     rows = [
@@ -133,11 +133,11 @@ def show_images(rendering: Rendering, console: Console) -> None:
     ]
     columns = (f"rendering with {rendering.opengl}", "images per s", *(f"{n} ms" for n in names))
     print_table(console, "", columns, rows)
-    loading = ", ".join(f"{detail} {took:.2f} s" for detail, took in rendering.load_s.items())
+    loading = ", ".join(f"{detail} {seconds:.2f} s" for detail, seconds in rendering.load_s.items())
     console.print(f"the head: {rendering.asset_bytes / 1e6:.2f} MB, load time: {loading}")
 
 
-def _frame(number: int) -> NDArray[np.float32]:
+def _moving_face(number: int) -> NDArray[np.float32]:
     """Return the FAPs (68,) of an image: one viseme after another, blinks and nods."""
     amount = np.float32(0.5 - 0.5 * np.cos(number * 0.7))
     faps: NDArray[np.float32] = VISEMES[1 + number // 5 % 14] * amount

@@ -54,7 +54,7 @@ class Timing:
 
     length_s: float = 24.0  # duration of the audio
     fault_at_s: float = 8.0
-    also_at_s: tuple[float, ...] = (3.2, 4.6)  # in other sessions
+    other_times_s: tuple[float, ...] = (3.2, 4.6)  # in other sessions
     frozen_s: float = 10.0  # how long a service or the machine is blocked
     cut_s: float = 2.0  # how long a host is cut off
 
@@ -77,7 +77,7 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class FaultOutcome:
     """Effects of a fault."""
 
     fault: str
@@ -88,13 +88,13 @@ class Outcome:
     load: float  # load average of the last minute
 
 
-def _signal(service: str, number: int) -> Actions:
+def _signal_service(service: str, number: int) -> Actions:
     """Return a fault that signals the process that serves the session."""
 
     def actions(system: System, session: str, timing: Timing) -> list[Action]:
         process_id = system.process_of(session, service)
         if number == signal.SIGSTOP:
-            return _stopped(process_id, timing.fault_at_s, timing.frozen_s)
+            return _stop_and_continue(process_id, timing.fault_at_s, timing.frozen_s)
         return [_send_signal(process_id, number, timing.fault_at_s)]
 
     return actions
@@ -108,14 +108,14 @@ def _send_signal(process_id: int, number: int, at_s: float) -> Action:
     return at_s, send
 
 
-def _stopped(process_id: int, at_s: float, for_s: float) -> list[Action]:
+def _stop_and_continue(process_id: int, at_s: float, for_s: float) -> list[Action]:
     return [
         _send_signal(process_id, signal.SIGSTOP, at_s),
         _send_signal(process_id, signal.SIGCONT, at_s + for_s),
     ]
 
 
-def _busy(_system: System, _session: str, timing: Timing) -> list[Action]:
+def _load_processor(_start_system: System, _session: str, timing: Timing) -> list[Action]:
     """Run four busy processes per core."""
     busy: list[subprocess.Popen[bytes]] = []
 
@@ -133,11 +133,11 @@ def _busy(_system: System, _session: str, timing: Timing) -> list[Action]:
     return [(timing.fault_at_s, start), (stop_at_s, stop)]
 
 
-def _nothing(_system: System, _session: str, _timing: Timing) -> list[Action]:
+def _no_actions(_start_system: System, _session: str, _timing: Timing) -> list[Action]:
     return []
 
 
-def _cut(which: str, *, is_mended: bool) -> Actions:
+def _cut_link(which: str, *, is_mended: bool) -> Actions:
     """Return a fault that cuts off a host, for some time or permanently.
 
     ``which`` is the client's host, or the kind of the service that serves the session.
@@ -154,7 +154,7 @@ def _cut(which: str, *, is_mended: bool) -> Actions:
 
 _WORKERS = ("recognizer", "synthesizer")
 _SIGNALS = {"killed": signal.SIGKILL, "stopped": signal.SIGSTOP, "hangs": signal.SIGUSR1}
-_SPARED = (
+_WORKER_FAULTS = (
     ("killed", False),
     ("killed", True),
     ("stopped", True),
@@ -163,28 +163,28 @@ _SPARED = (
     ("hangs", False),
 )  # fault of a worker, and whether there is a spare worker
 FAULTS = {
-    "none": Fault(_nothing, is_sudden=False),
+    "none": Fault(_no_actions, is_sudden=False),
     **{
         f"{worker} {event}" + (", one more" if is_spared else ""): Fault(
-            _signal(worker, _SIGNALS[event]), worker if is_spared else ""
+            _signal_service(worker, _SIGNALS[event]), worker if is_spared else ""
         )
-        for event, is_spared in _SPARED
+        for event, is_spared in _WORKER_FAULTS
         for worker in _WORKERS
     },
-    "control killed": Fault(_signal("control", signal.SIGKILL)),
-    "busy machine": Fault(_busy, is_sudden=False),
-    f"{NUM_SESSIONS} sessions": Fault(_nothing, num_sessions=NUM_SESSIONS, is_sudden=False),
+    "control killed": Fault(_signal_service("control", signal.SIGKILL)),
+    "busy machine": Fault(_load_processor, is_sudden=False),
+    f"{NUM_SESSIONS} sessions": Fault(_no_actions, num_sessions=NUM_SESSIONS, is_sudden=False),
     **{
         f"hosts, {delay_ms} ms, {loss:.0%} lost": Fault(
-            _nothing, link=NetworkLink(delay_ms, loss), is_sudden=False
+            _no_actions, link=NetworkLink(delay_ms, loss), is_sudden=False
         )
         for delay_ms in (0, 20, 50)
         for loss in (0.0, 0.01, 0.03)
     },
-    "hosts, client cut off for 2 s": Fault(_cut(CLIENT, is_mended=True), link=NetworkLink()),
+    "hosts, client cut off for 2 s": Fault(_cut_link(CLIENT, is_mended=True), link=NetworkLink()),
     **{
         f"hosts, {worker} gone for good, one more": Fault(
-            _cut(worker, is_mended=False), worker, link=NetworkLink()
+            _cut_link(worker, is_mended=False), worker, link=NetworkLink()
         )
         for worker in _WORKERS
     },
@@ -193,7 +193,7 @@ FAULTS = {
 
 def measure(
     path: Path, names: Collection[str], logs: Path | None, console: Console, timing: Timing
-) -> Iterator[Outcome]:
+) -> Iterator[FaultOutcome]:
     """Stream an audio file during faults, one after another; yield the effects of each.
 
     ``names`` are keys of ``FAULTS``; if empty, all run. ``logs`` gets a subfolder for each fault
@@ -205,28 +205,28 @@ def measure(
     sentence = to_16_khz(*read_audio(path))
     undisturbed: list[ReceivedResults] = []  # empty until it is measured
     for name in names or FAULTS:
-        also_at_s = timing.also_at_s if FAULTS[name].is_sudden else ()
+        other_times_s = timing.other_times_s if FAULTS[name].is_sudden else ()
         outcomes = []
-        for at_s in (*also_at_s, timing.fault_at_s):
+        for at_s in (*other_times_s, timing.fault_at_s):
             console.print(f"fault: {name}, at {at_s:g} s")
             with tempfile.TemporaryDirectory() as temporary:
                 folder = Path(temporary) if logs is None else logs / f"{name}-{at_s:g}-s"
                 folder.mkdir(parents=True, exist_ok=True)
                 timing = replace(timing, fault_at_s=at_s)
                 try:
-                    outcome = _outcome(name, folder, sentence, undisturbed, timing, console)
+                    outcome = _measure_fault(name, folder, sentence, undisturbed, timing, console)
                 except UserError as error:
-                    outcome = Outcome(fault=name, failure=str(error), load=os.getloadavg()[0])
+                    outcome = FaultOutcome(fault=name, failure=str(error), load=os.getloadavg()[0])
             outcomes.append(outcome)
-        yield _worst(outcomes)
+        yield _worst_outcome(outcomes)
 
 
-def _worst(outcomes: Sequence[Outcome]) -> Outcome:
+def _worst_outcome(outcomes: Sequence[FaultOutcome]) -> FaultOutcome:
     """Return the worst value of each figure."""
     faces = [outcome.face for outcome in outcomes if outcome.face is not None]
     late_ms = [outcome.late_p95_ms for outcome in outcomes if outcome.late_p95_ms is not None]
     numbers = ("num_refused", "load")
-    return Outcome(
+    return FaultOutcome(
         fault=outcomes[0].fault,
         failure="; ".join(sorted({outcome.failure for outcome in outcomes} - {""})),
         face=worst(faces) if faces else None,
@@ -235,14 +235,14 @@ def _worst(outcomes: Sequence[Outcome]) -> Outcome:
     )
 
 
-def show(outcomes: Collection[Outcome], console: Console) -> None:
+def show(outcomes: Collection[FaultOutcome], console: Console) -> None:
     """Print the figures as a table, and which sessions did not complete."""
     columns = ("fault", "stopped s", "late s", "phones lost, doubled, changed")
     more = ("frames lost, doubled, at rest", "largest step", "p50, p95 ms", "load")
-    print_table(console, "", (*columns, *more), map(_row, outcomes))
+    print_table(console, "", (*columns, *more), map(_fault_row, outcomes))
 
 
-def _row(outcome: Outcome) -> list[str]:
+def _fault_row(outcome: FaultOutcome) -> list[str]:
     notes = [f"not completed: {outcome.failure}"] if outcome.failure else []
     if outcome.num_refused:
         notes.append(f"{outcome.num_refused} refused")
@@ -262,7 +262,7 @@ def _row(outcome: Outcome) -> list[str]:
 
 
 @contextlib.contextmanager
-def _system(fault: Fault, folder: Path, timing: Timing, console: Console) -> Iterator[System]:
+def _start_system(fault: Fault, folder: Path, timing: Timing, console: Console) -> Iterator[System]:
     if fault.link is None:
         (folder / "sitecustomize.py").write_text(
             SPIN.format(seconds=timing.frozen_s), encoding="utf-8"
@@ -281,19 +281,19 @@ def _system(fault: Fault, folder: Path, timing: Timing, console: Console) -> Ite
         yield system
 
 
-def _outcome(
+def _measure_fault(
     name: str,
     folder: Path,
     sentence: NDArray[np.float32],
     undisturbed: list[ReceivedResults],
     timing: Timing,
     console: Console,
-) -> Outcome:
+) -> FaultOutcome:
     fault = FAULTS[name]
     sound = np.resize(sentence, round(timing.length_s * MEDIA_RATE_HZ))
     delay_s = SynthesizerConfig().delay_ms / 1e3
     with (
-        _system(fault, folder, timing, console) as system,
+        _start_system(fault, folder, timing, console) as system,
         system.on_client(),
         connect(system.control, key=system.key) as client,
     ):
@@ -321,7 +321,7 @@ def _outcome(
         for received in all_received
         if received.frames
     ]
-    return Outcome(
+    return FaultOutcome(
         fault=name,
         failure=", ".join(sorted(set(failures))),
         face=faces[0] if faces else None,

@@ -24,7 +24,7 @@ from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, animate_live
 from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
 from kouxing.evaluation.lips.references import clips_to_score
-from kouxing.evaluation.recognizer.references import Reference, align_corpus
+from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording, align_corpus
 from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.tables import format_number, percent
 from kouxing.services.cli.web_model import web_model
@@ -173,22 +173,22 @@ def _compare_lips(models: Path, folder: Path) -> tuple[int, dict[str, Agreement]
 
 
 def _compare_phones(
-    models: Path, references: Sequence[Reference], acoustic: str
+    models: Path, references: Sequence[AlignedRecording], acoustic: str
 ) -> dict[str, ErrorCounts]:
     """Count the errors of server and package, and the differences between the two."""
     counts = {name: ErrorCounts() for name in (SERVER, PACKAGE, DIFFERENCE)}
     for reference in track(references, acoustic, console=CONSOLE, transient=True):
         samples = reference.read_audio()
         truth = [phone.symbol for phone in reference.phones]
-        theirs = [
+        server_symbols = [
             event.symbol
             for event in server_events(samples, acoustic)
             if isinstance(event, Phone) and event.is_spoken
         ]
-        ours = package_phones(package_output(models, samples, phones=_PHONES[acoustic]))
-        counts[SERVER] += count_errors(truth, theirs)
-        counts[PACKAGE] += count_errors(truth, ours)
-        counts[DIFFERENCE] += count_errors(theirs, ours)
+        package_symbols = package_phones(package_output(models, samples, phones=_PHONES[acoustic]))
+        counts[SERVER] += count_errors(truth, server_symbols)
+        counts[PACKAGE] += count_errors(truth, package_symbols)
+        counts[DIFFERENCE] += count_errors(server_symbols, package_symbols)
     return counts
 
 

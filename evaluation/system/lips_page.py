@@ -159,8 +159,8 @@ def measure(audio: Path, clips: Path | None = None) -> list[LipsPage]:
     held_out, training = read_parts(clips) if clips else ([], [])
     if has_rivals:
         names = [*_DOWNLOADS]
-        profile = _wlipsync_profile(_recordings(training) if clips else _samples())
-    with _site(profile) as folder:
+        profile = _wlipsync_profile(_recordings(training) if clips else _demo_samples())
+    with _build_site(profile) as folder:
         voice = folder / "voice.wav"
         write_microphone(audio, voice)
         try:
@@ -177,7 +177,7 @@ def measure(audio: Path, clips: Path | None = None) -> list[LipsPage]:
 
 
 @contextmanager
-def _site(profile: bytes | None) -> Iterator[Path]:
+def _build_site(profile: bytes | None) -> Iterator[Path]:
     """Write the page with all packages, and the profile of wLipSync, to a temporary folder."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
@@ -201,7 +201,7 @@ def _recordings(clips: Sequence[LipClip]) -> list[NDArray[np.float32]]:
     return [clip.samples for clip in clips[:: -(-len(clips) // _NUM_PROFILE_CLIPS)]]
 
 
-def _samples() -> list[NDArray[np.float32]]:
+def _demo_samples() -> list[NDArray[np.float32]]:
     files = sorted((_ROOT / "shared/demo").glob("*.wav"))
     return [read_audio(file)[0].reshape(-1) for file in files]
 
@@ -269,7 +269,7 @@ def _with_accuracy(
     """Add the figures of the clips."""
     if not clips:
         return list(pages)
-    takes = []
+    played_clips = []
     with _page(folder, voice, origin, [page.name for page in pages]) as browser:
         browser.wait_for("window.play !== undefined")
         for number, clip in enumerate(track(clips, description="clips", transient=True)):
@@ -277,21 +277,25 @@ def _with_accuracy(
             browser.evaluate(f"window.rows = null; window.play('{number}.wav'); 1")
             browser.wait_for("window.rows !== null", 60.0 * clip.minutes + _LIMIT_S)
             rows = np.array(browser.evaluate("window.rows"))
-            takes.append((rows, real_mouth(clip.time_s, real_faps(clip))))
-    return [_scored(page, column, takes) for column, page in enumerate(pages, 1)]
+            played_clips.append((rows, real_mouth(clip.time_s, real_faps(clip))))
+    return [_add_accuracy(page, column, played_clips) for column, page in enumerate(pages, 1)]
 
 
-def _scored(page: LipsPage, column: int, takes: Sequence[tuple[Array, Mouth]]) -> LipsPage:
+def _add_accuracy(
+    page: LipsPage, column: int, played_clips: Sequence[tuple[Array, Mouth]]
+) -> LipsPage:
     """Add the agreement with real mouths. A take has rows of a time and openings."""
 
     def agreement(lag_s: float) -> Agreement:
-        return agreement_of([(_shown_mouth(rows, column, lag_s), real) for rows, real in takes])
+        return agreement_of(
+            [(_shown_mouth(rows, column, lag_s), real) for rows, real in played_clips]
+        )
 
     lag_ms = agreement(0.0).lag_ms
     in_sync = agreement((lag_ms or 0.0) / 1e3)
     return replace(
         page,
-        num_clips=len(takes),
+        num_clips=len(played_clips),
         lag_ms=lag_ms,
         opening_correlation=in_sync.correlation["opening"],
         closure_f1=in_sync.closure_f1,
@@ -319,8 +323,8 @@ def show(pages: Sequence[LipsPage], console: Console) -> None:
             f"{100 * page.processor_share:.1f}",
             f"{100 * page.page_share:.1f}",
             *(
-                format_number(value, form)
-                for value, form in (
+                format_number(value, format_spec)
+                for value, format_spec in (
                     (page.lag_ms, ".0f"),
                     (page.opening_correlation, ".2f"),
                     (page.closure_f1, ".2f"),

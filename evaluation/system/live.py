@@ -14,7 +14,7 @@ from kouxing.shared.errors import UserError
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
 CHUNK_S = CHUNK / MEDIA_RATE_HZ
 END_LIMIT_S = 15.0  # limit from the last sample to the last frame
-MAX_UNPACED_FACTOR = 5.0  # longest time for unpaced audio, relative to its length
+MAX_UNPACED_FACTOR = 5.0  # maximum time for unpaced audio, relative to its duration
 NUM_TRIES = 3
 
 

@@ -41,7 +41,7 @@ DRAIN_S = 0.3  # time from the last chunk to the end of the sessions
 PAUSE_S = 1.0  # pause between steps
 MAX_LOST_S = 60.0
 VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, relative to the recording
-_OFFSET = 0.618  # from one speaker to the next, relative to the text: no two are close
+_OFFSET = 0.618  # from one speaker to the next, relative to the speech; no two are close
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def measure(
     language of the speech. If None, it is the recognizer's. Raises UserError if a file is not audio
     or the services cannot start.
     """
-    text = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
+    speech = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
     settings = {"KOUXING_CONTROL_MAX_SESSIONS": "2000"}  # so that only load causes refusals
     delay_s = read_settings().load(SynthesizerConfig).delay_ms / 1e3
@@ -123,7 +123,7 @@ def measure(
         LocalSystem(Path(folder), console, settings=settings) as system,
     ):
         for num in step_sizes(num_sessions):
-            steps.append(_step(system.control, text, num, step_s, delay_s, language))
+            steps.append(_step(system.control, speech, num, step_s, delay_s, language))
             time.sleep(PAUSE_S)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return Load(steps, cores or 1, machine_load, delay_s * 1e3)
@@ -136,33 +136,33 @@ def step_sizes(maximum: int) -> list[int]:
 
 def _step(
     control: str,
-    text: NDArray[np.float32],
+    speech: NDArray[np.float32],
     num_asked: int,
     step_s: float,
     delay_s: float,
     language: str | None,
 ) -> Step:
     with connect(control) as client:
-        crowd = Crowd(client, text, num_asked, language)
-        crowd.start()
+        generator = LoadGenerator(client, speech, num_asked, language)
+        generator.start()
         from_s = time.perf_counter() + SETTLE_S
-        crowd.speak_until(from_s)
-        crowd.lateness_s.clear()
+        generator.speak_until(from_s)
+        generator.lateness_s.clear()
         before, client_before_s = usage_of(client), time.process_time()
         until_s = from_s + step_s
-        crowd.speak_until(until_s)
+        generator.speak_until(until_s)
         after, client_after_s = usage_of(client), time.process_time()
         delays_ms = [
-            np.fromiter(spoken.delays_s(delay_s, from_s, until_s), float) * 1e3
-            for spoken in crowd.spoken
+            np.fromiter(speaker.delays_s(delay_s, from_s, until_s), float) * 1e3
+            for speaker in generator.speakers
         ]
-        num_rest = sum(spoken.num_rest for spoken in crowd.spoken)
+        num_rest = sum(speaker.num_rest for speaker in generator.speakers)
         time.sleep(DRAIN_S)
-        crowd.close()
+        generator.close()
     return Step(
         num_asked=num_asked,
-        num_sessions=len(crowd.spoken),
-        refusals=crowd.refusals,
+        num_sessions=len(generator.speakers),
+        refusals=generator.refusals,
         delay_ms=percentiles(np.concatenate(delays_ms)) if delays_ms else {},
         worst_p95_ms=max((percentiles(values)["p95"] for values in delays_ms), default=0.0),
         num_rest_frames=num_rest,
@@ -173,12 +173,12 @@ def _step(
         }
         | {CLIENT: (client_after_s - client_before_s) / step_s},
         memory_mb={name: usage.memory_mb for name, usage in after.items()},
-        client_late_ms=float(np.percentile(crowd.lateness_s or [0.0], 95)) * 1e3,
+        client_late_ms=float(np.percentile(generator.lateness_s or [0.0], 95)) * 1e3,
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Usage:
+class CumulativeUsage:
     """Resources that a service had used at its last heartbeat."""
 
     at_s: float
@@ -186,14 +186,14 @@ class Usage:
     memory_mb: float
 
 
-def usage_of(client: Client) -> dict[str, Usage]:
+def usage_of(client: Client) -> dict[str, CumulativeUsage]:
     """Return the resources used by each service; raises UserError if one stays lost."""
     end_s = time.monotonic() + MAX_LOST_S
     while True:
         states = client.status().services
         now_s = time.monotonic()
         usage = {
-            state.service: Usage(
+            state.service: CumulativeUsage(
                 now_s - state.age_s, state.metrics["cpu_s"], state.metrics["memory_mb"]
             )
             for state in states
@@ -283,15 +283,15 @@ def draw(load: Load) -> Any:
     return figure
 
 
-def voiced(text: NDArray[np.float32], number: int) -> NDArray[np.float32]:
-    """Return the audio of a speaker: the text from another position, in another voice."""
-    rotated = np.roll(text, -round(number * _OFFSET * len(text)) % len(text))
+def speaker_audio(speech: NDArray[np.float32], number: int) -> NDArray[np.float32]:
+    """Return the audio of a speaker: the speech from another position, in another voice."""
+    rotated = np.roll(speech, -round(number * _OFFSET * len(speech)) % len(speech))
     voice = VOICES[number % len(VOICES)]
     return rotated if voice == 1.0 else to_16_khz(rotated[:, None], round(MEDIA_RATE_HZ * voice))
 
 
 @dataclass(slots=True)
-class Spoken:
+class Speaker:
     """A speaker's session, and the arrival times of its frames."""
 
     session: Session
@@ -336,17 +336,17 @@ class Spoken:
                 yield min(self.arrived_s.get(media_time, until_s), until_s) - due_s
 
 
-class Crowd:
+class LoadGenerator:
     """Sessions of one client with audio in real time, whose chunks are spread evenly."""
 
     def __init__(
         self,
         client: Client,
-        text: NDArray[np.float32],
+        speech: NDArray[np.float32],
         num_speakers: int,
         language: str | None = None,
     ) -> None:
-        self.spoken: list[Spoken] = []  # admitted
+        self.speakers: list[Speaker] = []  # admitted
         self.refusals: dict[str, int] = {}  # number by code
         self.lateness_s: list[float] = []  # how late each chunk was sent
         self._turn = 0  # index of the next speaker
@@ -356,36 +356,36 @@ class Crowd:
             except Refused as refusal:
                 self.refusals[refusal.code] = self.refusals.get(refusal.code, 0) + 1
                 continue
-            sound = np.clip(voiced(text, number), -1.0, 1.0)
-            spoken = Spoken(session, np.round(sound * 32767).astype("<i2").tobytes())
-            session.results(FapFrame, on_result=spoken.record)
-            self.spoken.append(spoken)
+            sound = np.clip(speaker_audio(speech, number), -1.0, 1.0)
+            speaker = Speaker(session, np.round(sound * 32767).astype("<i2").tobytes())
+            session.results(FapFrame, on_result=speaker.record)
+            self.speakers.append(speaker)
 
     def start(self) -> None:
         """Start all speakers."""
         now_s = time.perf_counter()
-        for number, spoken in enumerate(self.spoken):
-            spoken.start_s = now_s + CHUNK_S * number / len(self.spoken)
+        for number, speaker in enumerate(self.speakers):
+            speaker.start_s = now_s + CHUNK_S * number / len(self.speakers)
 
     def speak_until(self, end_s: float) -> None:
         """Speak until a time of ``time.perf_counter``."""
         while (now_s := time.perf_counter()) < end_s:
-            if not self.spoken:
+            if not self.speakers:
                 time.sleep(end_s - now_s)
                 return
-            speaker = self.spoken[self._turn]  # all chunks are equally long
-            left_s = min(speaker.due_s, end_s) - now_s
-            if left_s > 0.0:
-                time.sleep(left_s)
+            speaker = self.speakers[self._turn]  # all chunks are equally long
+            remaining_s = min(speaker.due_s, end_s) - now_s
+            if remaining_s > 0.0:
+                time.sleep(remaining_s)
             else:
                 self.lateness_s.append(now_s - speaker.due_s)
                 speaker.send()
-                self._turn = (self._turn + 1) % len(self.spoken)
+                self._turn = (self._turn + 1) % len(self.speakers)
                 if self._turn == 0:
-                    for spoken in self.spoken:
-                        spoken.session.take_errors()  # refused audio shows as missing frames
+                    for speaker in self.speakers:
+                        speaker.session.take_errors()  # refused audio shows as missing frames
 
     def close(self) -> None:
         """End all sessions."""
-        for spoken in self.spoken:
-            spoken.session.close()
+        for speaker in self.speakers:
+            speaker.session.close()

@@ -1,8 +1,8 @@
 """Virtual hosts: network namespaces around a router that loses, delays and blocks packets.
 
 A veth pair connects each host to the router. nftables drops packets there. A TUN device sends them
-through ``evaluation.system.delay``, because not every kernel has netem. This needs Linux, root,
-iproute2 and nftables.
+through ``evaluation.system.packet_delay``, because not every kernel has netem. This needs Linux,
+root, iproute2 and nftables.
 """
 
 import contextlib
@@ -70,7 +70,7 @@ class Network:
             self._delayer.wait()
         for namespace in (self._router, *map(self._namespace, self._addresses)):
             with contextlib.suppress(UserError):  # the namespace does not exist
-                _call("ip", "netns", "delete", namespace)
+                _run_command("ip", "netns", "delete", namespace)
 
     def address(self, host: str) -> str:
         """Return the address of a host."""
@@ -82,7 +82,7 @@ class Network:
 
     def on(self, host: str) -> contextlib.AbstractContextManager[None]:
         """Open the sockets of this thread, and of threads that it starts, on a host."""
-        return _in(self._namespace(host))
+        return _in_namespace(self._namespace(host))
 
     def cut(self, host: str) -> None:
         """Drop all packets from and to a host, without closing connections."""
@@ -95,12 +95,12 @@ class Network:
         self._on_router("nft", "flush", "chain", "inet", "network", "cuts")
 
     def _build(self) -> None:
-        _call("ip", "netns", "add", self._router)
-        with _in(self._router):
+        _run_command("ip", "netns", "add", self._router)
+        with _in_namespace(self._router):
             Path("/proc/sys/net/ipv4/ip_forward").write_text("1")
         for host, address in self._addresses.items():
             namespace, router = self._namespace(host), address.removesuffix("2") + "1"
-            _call("ip", "netns", "add", namespace)
+            _run_command("ip", "netns", "add", namespace)
             ends = ("link", "add", "name", host, "type", "veth", "peer", "name", "uplink")
             self._on_router("ip", *ends, "netns", namespace)
             self._on_router("ip", "address", "add", f"{router}/24", "dev", host)
@@ -111,7 +111,7 @@ class Network:
                 ("link", "set", "lo", "up"),
                 ("route", "add", "default", "via", router),
             ):
-                _call(*self.command(host, "ip", *arguments))
+                _run_command(*self.command(host, "ip", *arguments))
         self._on_router("nft", "add table inet network")
         for chain in ("cuts", "loss"):
             form = "{ type filter hook forward priority 0; }"
@@ -123,11 +123,11 @@ class Network:
                 f"{not_delayed} numgen random mod 10000 < {lost_of_10000} drop", chain="loss"
             )
         if self._link.delay_ms:
-            self._delay()
+            self._start_delay()
 
-    def _delay(self) -> None:
+    def _start_delay(self) -> None:
         """Send all packets of hosts through a process that returns them later."""
-        module = [sys.executable, "-m", "kouxing.evaluation.system.delay", DELAY_DEVICE]
+        module = [sys.executable, "-m", "kouxing.evaluation.system.packet_delay", DELAY_DEVICE]
         delay_ms = str(self._link.delay_ms), str(self._link.jitter_ms)
         self._delayer = subprocess.Popen(  # noqa: S603 - our own module
             _command(self._router, *module, *delay_ms)
@@ -145,7 +145,7 @@ class Network:
         self._on_router("nft", f"add rule inet network {chain} {rule}")
 
     def _on_router(self, *command: str) -> str:
-        return _call(*_command(self._router, *command))
+        return _run_command(*_command(self._router, *command))
 
     def _namespace(self, host: str) -> str:
         return f"{self._name}-{host}"
@@ -156,7 +156,7 @@ def _command(namespace: str, *command: str) -> list[str]:
     return ["nsenter", f"--net=/run/netns/{namespace}", *command]
 
 
-def _call(*command: str) -> str:
+def _run_command(*command: str) -> str:
     """Run a command and return its output; raises UserError with its errors if it fails."""
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if result.returncode != 0:
@@ -165,7 +165,7 @@ def _call(*command: str) -> str:
 
 
 @contextlib.contextmanager
-def _in(namespace: str) -> Iterator[None]:
+def _in_namespace(namespace: str) -> Iterator[None]:
     with Path("/proc/thread-self/ns/net").open() as previous:
         with Path("/run/netns", namespace).open() as target:
             _enter(target.fileno())

@@ -79,13 +79,13 @@ def show(drawings: dict[str, Drawing], console: Console) -> None:
 def _measure(browser: Chromium, url: str) -> dict[str, Drawing]:
     browser.command("Page.navigate", url=url)
     browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    idle = _drawing(browser)
+    idle = _measure_drawing(browser)
     browser.click("microphone")
     browser.wait_for("window.kouxing.state.voiceToImageMs !== null")
-    return {"idle": idle, "microphone": _drawing(browser)}
+    return {"idle": idle, "microphone": _measure_drawing(browser)}
 
 
-def _drawing(browser: Chromium) -> Drawing:
+def _measure_drawing(browser: Chromium) -> Drawing:
     time.sleep(SETTLE_S)
     start_s, start_cpu_s = time.monotonic(), browser.cpu_s()
     states = [browser.evaluate("window.kouxing.state")]

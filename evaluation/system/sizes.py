@@ -19,7 +19,7 @@ from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.terminal import print_table
 
-_SIZE, _MEASURE_S = 512, 0.5
+_MATRIX_SIZE, _MEASURE_S = 512, 0.5
 _POSITIONS_PER_S = 50
 _INT8_SPEED_UP = 4
 _BLOCKS, _ENCODER = "block network", "audio encoder"
@@ -70,13 +70,13 @@ def _frame_message() -> list[bytes]:
 
 
 def _gemm_gflops() -> float:
-    matrix = np.ones((_SIZE, _SIZE), np.float32)
+    matrix = np.ones((_MATRIX_SIZE, _MATRIX_SIZE), np.float32)
     (matrix @ matrix).sum()  # warm up
     start_s, num = time.process_time(), 0
     while time.process_time() - start_s < _MEASURE_S:
         _ = matrix @ matrix
         num += 1
-    return _OPERATIONS * num * _SIZE**3 / (time.process_time() - start_s) / 1e9
+    return _OPERATIONS * num * _MATRIX_SIZE**3 / (time.process_time() - start_s) / 1e9
 
 
 def show(sizes: Sizes, console: Console) -> None:

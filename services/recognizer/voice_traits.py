@@ -16,7 +16,8 @@ m        mean of arousal and valence over the session's voice          (2,)
 
 Arousal and valence are averaged over two seconds of voice. Voices and microphones differ more than
 feelings do, so the reported values are relative to ``m``. Arousal and valence are the axes of
-Russell 1980, "A circumplex model of affect". :mod:`kouxing.training.traits` trains the readout.
+Russell 1980, "A circumplex model of affect". :mod:`kouxing.training.voice_traits` trains the
+readout.
 """
 
 from __future__ import annotations

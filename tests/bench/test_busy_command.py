@@ -7,18 +7,20 @@ import pytest
 from typer.testing import CliRunner
 
 from kouxing.evaluation.system import busy
-from kouxing.evaluation.system.busy import STEP_S, Run
+from kouxing.evaluation.system.busy import STEP_S, BusyRun
 from kouxing.evaluation.system.commands import app
 from tests.system import VOWELS_FILE
 
 
-def _run(lateness_s: list[tuple[float, float]], load_s: float) -> Run:
+def _run(lateness_s: list[tuple[float, float]], load_s: float) -> BusyRun:
     """Make a run from pairs of a duration and its lateness."""
     values = [late for lasts_s, late in lateness_s for _ in range(round(lasts_s / STEP_S))]
-    return Run(num_programs=1, quiet_median_s=0.1, lateness_s=values, load_s=load_s, missing=0.0)
+    return BusyRun(
+        num_programs=1, quiet_median_s=0.1, lateness_s=values, load_s=load_s, missing=0.0
+    )
 
 
-def test_summarizes_the_lateness() -> None:
+def test_the_summary_has_worst_lateness_and_recovery_time() -> None:
     run = _run([(1.0, 0.0), (0.5, 0.4), (0.1, 0.2), (0.7, 0.6), (0.7, 0.1), (2.0, 0.04)], 2.0)
     assert run.worst_s == 0.6
     assert run.longest_s == pytest.approx(0.7)
@@ -27,7 +29,7 @@ def test_summarizes_the_lateness() -> None:
     assert _run([(5.0, 0.1)], 2.0).recovery_s is None
 
 
-def test_prints_and_writes_the_same_figures(
+def test_the_command_prints_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(busy, "SETTLE_S", 1.0)

@@ -13,7 +13,7 @@ from tests.system import NOTHING_SKIPPED
 
 def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     service = "recognizer"
-    timing = Timing(length_s=6.0, fault_at_s=3.2, also_at_s=())
+    timing = Timing(length_s=6.0, fault_at_s=3.2, other_times_s=())
     monkeypatch.setattr("kouxing.evaluation.system.faults.TIMING", timing)
     monkeypatch.setattr(
         "kouxing.evaluation.system.live.END_LIMIT_S", 60.0
@@ -40,7 +40,7 @@ def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert face["largest_step"] > 0
 
 
-def test_rejects_an_unknown_fault() -> None:
+def test_an_unknown_fault_is_rejected() -> None:
     result = CliRunner().invoke(app, ["faults", "--fault", "flood"])
     assert result.exit_code != 0
     assert "no fault is named 'flood'" in str(result.exception)

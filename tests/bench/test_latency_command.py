@@ -10,7 +10,7 @@ from kouxing.evaluation.system.commands import app
 from tests.system import VOWELS_FILE
 
 
-def test_prints_and_writes_the_same_figures(
+def test_the_command_prints_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.latency.NUM_REPEATS", 1)

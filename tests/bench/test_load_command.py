@@ -11,7 +11,7 @@ from kouxing.services.kinds import KINDS
 from tests.system import VOWELS_FILE
 
 
-def test_prints_writes_and_plots_the_same_figures(
+def test_the_command_prints_writes_and_plots_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.load.SETTLE_S", 1.0)

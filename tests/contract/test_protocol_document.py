@@ -153,7 +153,7 @@ def expected_rows(cls: type[Any]) -> list[list[str]]:
     ]
 
 
-def test_documents_version_limits_errors_and_events() -> None:
+def test_the_document_has_version_limits_errors_and_events() -> None:
     assert PROTOCOL.startswith(f"# The kouxing protocol, version {VERSION}\n")
     assert f"at most {MAX_MESSAGE_BYTES // 2**20} MiB" in section("A message")
     assert f"{MAX_AUDIO_BYTES // 1024} KiB of audio" in section("A message")
@@ -173,13 +173,13 @@ def test_the_schema_the_samples_and_the_document_have_the_same_messages() -> Non
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
-def test_documents_every_field_with_type_range_and_default(name: str) -> None:
+def test_the_document_has_every_field_with_type_range_and_default(name: str) -> None:
     rows = table(section(f"`{name}`", MESSAGES_DOCUMENT))
     assert [row[:4] for row in rows] == expected_rows(STRUCTURES[name])
     assert all(row[4] for row in rows), "every field has its meaning"
 
 
-def test_documents_every_answer() -> None:
+def test_the_document_has_every_answer() -> None:
     rows = [
         [set(re.findall(r"`([a-z-]+)`", cell)) for cell in row] for row in table(section("Answers"))
     ]
@@ -194,7 +194,7 @@ def test_documents_every_answer() -> None:
     assert errors - {"request"} < {*ErrorCode}
 
 
-def test_documents_every_fap_and_shape() -> None:
+def test_the_document_has_every_fap_and_shape() -> None:
     points = {fap.number: ", ".join(fap.feature_points) for fap in FAPS}
     assert table(section("FAPs", VALUES), -1) == [
         [
@@ -214,7 +214,7 @@ def test_documents_every_fap_and_shape() -> None:
     assert list(LOW_LEVEL_FAPS) == list(range(2, 68)), "FAP 1 and 2 are never set"
 
 
-def test_documents_every_phone_with_a_correct_example() -> None:
+def test_the_document_has_every_phone_with_a_correct_example() -> None:
     inventory = load_inventory()
     rows = table(section("Phones", VALUES))
     assert [[row[0], row[1], row[4]] for row in rows] == [
@@ -229,7 +229,7 @@ def test_documents_every_phone_with_a_correct_example() -> None:
             assert symbol.strip("`") in syllable
 
 
-def test_documents_the_messages_of_each_publisher() -> None:
+def test_the_document_has_the_messages_of_each_publisher() -> None:
     published = {
         row[2].strip("`"): set(re.findall(r"`([a-z-]+)`", row[4]))
         for row in table(section("Sockets"))

@@ -12,7 +12,7 @@ from kouxing.shared.keys import user_key
 from tests.system import DEMO, System, samples_of_file, wait_until
 
 
-class Command:
+class CommandRunner:
     """Runs commands in this process."""
 
     def __init__(self, patch: pytest.MonkeyPatch, capture: pytest.CaptureFixture[str]) -> None:
@@ -22,35 +22,35 @@ class Command:
     def __call__(self, *arguments: object) -> tuple[int | str | None, str, str]:
         """Return the exit status and what the command prints on stdout and stderr."""
         self._patch.setattr(sys, "argv", ["kouxing", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as exit_info:
             main()
-        return ended.value.code, *self._capture.readouterr()
+        return exit_info.value.code, *self._capture.readouterr()
 
 
 @pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    return Command(monkeypatch, capsys)
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> CommandRunner:
+    return CommandRunner(monkeypatch, capsys)
 
 
 @pytest.fixture
 def client(system: System) -> Iterator[Client]:
-    with Client(system.control) as made:
-        yield made
+    with Client(system.control) as client:
+        yield client
 
 
 @pytest.fixture
 def bus() -> Iterator[Bus]:
     """Sockets with the client's key, for messages that no client sends."""
-    with Bus(user_key()) as made:
-        yield made
+    with Bus(user_key()) as client_bus:
+        yield client_bus
 
 
 @pytest.fixture
 def witness(system: System, client: Client) -> Iterator[Session]:
     """Another session, which must continue after the test."""
-    with client.open_session(encoding="f32le", paced=False) as opened:
-        output = opened.frames()
-        yield opened
-        opened.push(samples_of_file(DEMO / "hello-female.wav")[:16000])
+    with client.open_session(encoding="f32le", paced=False) as session:
+        output = session.frames()
+        yield session
+        session.push(samples_of_file(DEMO / "hello-female.wav")[:16000])
         wait_until(lambda: any(frame.media_time > 12000 for frame in output.available(0.1)))
     system.assert_all_alive()

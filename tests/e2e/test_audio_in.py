@@ -17,7 +17,7 @@ from aiortc.rtcdtlstransport import RTCDtlsTransport
 from kouxing.services.gateway.wire import FAP_TYPE, SHAPES_TYPE
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.inventory import load_inventory
-from tests.e2e.following import stream
+from tests.e2e.streaming import stream
 from tests.system import DEMO, LIMIT_S, System, samples_of_file
 
 SDP = "application/sdp"
@@ -27,7 +27,7 @@ Send = Callable[[RTCDtlsTransport, bytes], Coroutine[None, None, None]]
 
 
 @pytest.fixture(scope="module")
-def expected(system: System) -> list[str]:
+def expected_phones(system: System) -> list[str]:
     """The phones of the recording, without pauses."""
     return without_silence(stream(system.control, samples_of_file(SPEECH)).symbols)
 
@@ -36,22 +36,22 @@ def without_silence(symbols: list[str]) -> list[str]:
     return [symbol for symbol in symbols if symbol != load_inventory().silence]
 
 
-def with_loss(send: Send, share_lost: float) -> Send:
-    """Return a send function that drops a share of the packets, the same ones in every run."""
+def lossy_send(send: Send, loss_fraction: float) -> Send:
+    """Return a send function that drops a fraction of the packets, the same ones in every run."""
     random = Random(0)  # noqa: S311 - not for cryptography
 
-    async def send_most(transport: RTCDtlsTransport, packet: bytes) -> None:
-        if random.random() >= share_lost:
+    async def send_or_drop(transport: RTCDtlsTransport, packet: bytes) -> None:
+        if random.random() >= loss_fraction:
             await send(transport, packet)
 
-    return send_most
+    return send_or_drop
 
 
 def test_webrtc_streams_sound_and_returns_frames_despite_lost_packets(
-    system: System, expected: list[str], monkeypatch: pytest.MonkeyPatch
+    system: System, expected_phones: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
-    monkeypatch.setattr(RTCDtlsTransport, "_send_rtp", with_loss(RTCDtlsTransport._send_rtp, 0.05))
+    monkeypatch.setattr(RTCDtlsTransport, "_send_rtp", lossy_send(RTCDtlsTransport._send_rtp, 0.05))
     opening = {FAP_TYPE: 0.0, SHAPES_TYPE: 0.0}  # largest opening of the jaw, in both formats
     index = {FAP_TYPE: OPEN_JAW, SHAPES_TYPE: ARKIT.names.index("jawOpen")}
     phones: dict[int, str] = {}
@@ -83,7 +83,7 @@ def test_webrtc_streams_sound_and_returns_frames_despite_lost_packets(
             await peer.setRemoteDescription(RTCSessionDescription(sdp, "answer"))
             async with asyncio.timeout(LIMIT_S):
                 # On a busy machine, frames arrive later than their phones.
-                while len(phones) < len(expected) / 2 or opening[FAP_TYPE] < 200:
+                while len(phones) < len(expected_phones) / 2 or opening[FAP_TYPE] < 200:
                     await asyncio.sleep(0.05)
             resource = system.page.rstrip("/") + answer.headers["Location"]
             async with http.delete(resource) as deleted:
@@ -92,7 +92,7 @@ def test_webrtc_streams_sound_and_returns_frames_despite_lost_packets(
 
     asyncio.run(call())
     received = without_silence([phones[index] for index in sorted(phones)])
-    similarity = difflib.SequenceMatcher(None, received, expected[: len(received)]).ratio()
+    similarity = difflib.SequenceMatcher(None, received, expected_phones[: len(received)]).ratio()
     assert similarity > 0.4
     assert opening[SHAPES_TYPE] > 0.2
 

@@ -47,12 +47,12 @@ class Server:
 
 @pytest.fixture
 def server() -> Iterator[Server]:
-    made = Server()
-    yield made
-    made.bus.close()
+    server = Server()
+    yield server
+    server.bus.close()
 
 
-def hidden(message: Message, shift: int) -> bytes:
+def hide_in_request(message: Message, shift: int) -> bytes:
     """Return a browser's request whose body ZMTP 1 can read as a message.
 
     ZMTP 1 reads the request line, the headers and the filler as frames. Every 1 in the filler is
@@ -95,8 +95,8 @@ def test_rejects_a_key_of_another_system(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     router, endpoint = server.router("control.commands")
-    with monkeypatch.context() as there:
-        there.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+    with monkeypatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
         key, control = load_key("grant", ("client",)), load_key("control", ())
     with Bus(key) as bus:
         bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
@@ -132,8 +132,8 @@ def test_a_hung_control_does_not_answer() -> None:
     [
         b"\x01\x00" + b"\x03\x00hi",  # ZMTP 1
         b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00",  # ZMTP 2
-        hidden(StatusRequest(request="1"), 0),
-        hidden(StatusRequest(request="1"), 1),
+        hide_in_request(StatusRequest(request="1"), 0),
+        hide_in_request(StatusRequest(request="1"), 1),
     ],
 )
 def test_disconnects_old_zeromq_and_browsers(greeting: bytes, with_keys: bool) -> None:
@@ -172,7 +172,7 @@ def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> 
         assert received == [(Joined, "mine"), (FapFrame, "mine")]
 
 
-class Recognizer(Service):
+class KeyOnlyService(Service):
     """A service that only decides which keys may connect."""
 
     kind = KINDS["recognizer"]
@@ -190,7 +190,7 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
     for name in ("control.key", "allowed"):  # as on another machine, whose list is empty yet
         (key_folder() / name).unlink()
-    service = Recognizer(ServiceConfig())
+    service = KeyOnlyService(ServiceConfig())
     with service.bus, Bus(key) as bus:
         router = service.bus.bind_router(LOCAL, "recognizer.audio")
         endpoint = with_key(router.endpoint, service.key.public if service.key else "")
@@ -205,7 +205,7 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "is_plain", "said"),
+    ("endpoint", "is_plain", "error_text"),
     [
         ("tcp://127.0.0.1:1", False, "only the service at .* has insecure"),
         ("tcp://127.0.0.1:1 " + "a" * 40, True, "only this process has insecure"),
@@ -215,7 +215,7 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
     ],
 )
 def test_rejects_an_endpoint_that_cannot_be_connected_to(
-    server: Server, endpoint: str, is_plain: bool, said: str
+    server: Server, endpoint: str, is_plain: bool, error_text: str
 ) -> None:
-    with Bus(None if is_plain else server.key) as bus, pytest.raises(UserError, match=said):
+    with Bus(None if is_plain else server.key) as bus, pytest.raises(UserError, match=error_text):
         bus.connect_dealer(endpoint)

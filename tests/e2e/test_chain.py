@@ -1,4 +1,4 @@
-"""Sound through real processes: the frames of the chain, and the same phones by every way."""
+"""Sound through real processes: frames and phones equal those of the chain, for every client."""
 
 import asyncio
 import csv
@@ -26,8 +26,8 @@ from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import message_of
-from tests.e2e.conftest import Command
-from tests.e2e.following import Stream, stream
+from tests.e2e.conftest import CommandRunner
+from tests.e2e.streaming import Stream, stream
 from tests.lips import LIPS
 from tests.system import DEMO, LIMIT_S, VOWELS_FILE, System, samples_of_file, start_python
 
@@ -104,7 +104,7 @@ def test_services_send_the_frames_of_the_chain(
     assert sent.times == [to_samples(time_s) for time_s, _ in frames]
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
     assert sent.faps[:, MOUTH].any()
-    assert lips_of(sent) == [
+    assert lip_frames_of(sent) == [
         message_of(event) for event in chain.events if isinstance(event, LipPositions)
     ]
     assert sent.lips
@@ -125,7 +125,7 @@ def test_services_send_the_frames_of_the_chain(
     ]
 
 
-def lips_of(sent: Stream) -> list[speech.LipPositions]:
+def lip_frames_of(sent: Stream) -> list[speech.LipPositions]:
     """Lip frames without session, epoch and sequence."""
     return [
         speech.LipPositions(
@@ -146,8 +146,8 @@ def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     )
     frames = chain.accept_waveform(samples) + chain.input_finished()
     delay_s = SynthesizerConfig().delay_ms / 1e3
-    heard = live_events(load_model(), samples, None, [delay_s])
-    scored = live_frames(LIPS, heard[delay_s], delay_s)
+    live = live_events(load_model(), samples, None, [delay_s])
+    scored = live_frames(LIPS, live[delay_s], delay_s)
     np.testing.assert_array_equal(scored[:, MOUTH], np.array([faps[MOUTH] for _, faps in frames]))
     assert scored[:, MOUTH].any()
 
@@ -174,17 +174,17 @@ def expected(recordings: list[Path]) -> dict[str, list[events.Phone]]:
     return {path.name: recognize(model, *read_audio(path)) for path in recordings}
 
 
-def spoken(phones: list[events.Phone]) -> list[events.Phone]:
+def without_silence(phones: list[events.Phone]) -> list[events.Phone]:
     return [phone for phone in phones if phone.is_spoken]
 
 
-def line(phone: events.Phone) -> str:
+def listen_line(phone: events.Phone) -> str:
     """Return a phone as ``kouxing listen`` prints it."""
     return f"{phone.onset_s:9.3f} s  {phone.duration_s:6.3f} s  {phone.symbol}"
 
 
 def test_phones_and_render_return_the_phones_of_the_chain(
-    command: Command,
+    command: CommandRunner,
     recordings: list[Path],
     expected: dict[str, list[events.Phone]],
     tmp_path: Path,
@@ -197,21 +197,21 @@ def test_phones_and_render_return_the_phones_of_the_chain(
             assert row[1] == phone.symbol
             times = (phone.onset_s, phone.duration_s, phone.confidence)
             np.testing.assert_allclose([*map(float, row[2:5])], times, atol=5.1e-4)
-    _, _, said = command("render", recordings[0], tmp_path / "live.csv", "--live")
-    assert f", {len(spoken(expected[recordings[0].name]))} phones" in said
+    _, _, stderr = command("render", recordings[0], tmp_path / "live.csv", "--live")
+    assert f", {len(without_silence(expected[recordings[0].name]))} phones" in stderr
     options = ("--size", "64x64", "--rate", "1", "-o", tmp_path)
-    _, _, said = command("render", *recordings, *options)
+    _, _, stderr = command("render", *recordings, *options)
     for path in recordings:
-        count = len(spoken(expected[path.name]))
+        count = len(without_silence(expected[path.name]))
         assert any(
             f"{path.stem}.mp4:" in text and text.endswith(f", {count} phones")
-            for text in said.splitlines()
-        ), said
+            for text in stderr.splitlines()
+        ), stderr
 
 
 def test_speak_and_listen_return_the_phones_of_the_chain(
     system: System,
-    command: Command,
+    command: CommandRunner,
     recordings: list[Path],
     expected: dict[str, list[events.Phone]],
     monkeypatch: pytest.MonkeyPatch,
@@ -225,12 +225,12 @@ def test_speak_and_listen_return_the_phones_of_the_chain(
         assert listener.stderr is not None
         assert name in listener.stderr.readline()
         pace = ["--fast"] if number else []
-        phones = spoken(expected[path.name])
-        _, _, said = command("speak", path, "--session", name, *pace)
-        assert f"session {name}: {len(phones)} phones in" in said
+        phones = without_silence(expected[path.name])
+        _, _, stderr = command("speak", path, "--session", name, *pace)
+        assert f"session {name}: {len(phones)} phones in" in stderr
         output, log = listener.communicate(timeout=LIMIT_S)
         assert f"session {name} ended: {len(phones)} phones" in log
-        assert output.splitlines() == [line(phone) for phone in phones]
+        assert output.splitlines() == [listen_line(phone) for phone in phones]
 
 
 def test_the_asyncio_client_returns_the_phones_of_the_chain_bit_for_bit(

@@ -296,7 +296,7 @@ def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser
 
 
 @contextlib.contextmanager
-def speech(system: System) -> Iterator[None]:
+def speaking_session(system: System) -> Iterator[None]:
     """Speak in the session that the faces show."""
     samples = samples_of_file(SPEECH)[:24000]
     ended = threading.Event()
@@ -332,11 +332,11 @@ def test_the_web_component_shows_and_plays_a_session(faces: Browser, system: Sys
         "own.addEventListener('session', ({ detail }) => sessions.push(detail.session))"
     )
     faces.click("own")  # sound starts with a gesture
-    with speech(system):
+    with speaking_session(system):
         faces.wait_for("own.shown?.[2] > 100 && window.isHeard")
         faces.evaluate("sessions.length = 0; own.setAttribute('token', 'another')")
         faces.wait_for("sessions.includes('seen')")  # it has reconnected
         faces.evaluate("own.setAttribute('src', 'arkit.glb')")
         faces.wait_for("own.set === 'arkit' && own.shown?.jawOpen > 0.1")
     driver = "GL Driver Message"  # the processor draws
-    assert [text for text in faces.complaints if driver not in text] == []
+    assert [text for text in faces.page_errors if driver not in text] == []

@@ -7,7 +7,7 @@ import pytest
 from kouxing_client import Client, Status
 from ray.cluster_utils import Cluster
 
-from tests.e2e.following import stream
+from tests.e2e.streaming import stream
 from tests.system import VOWELS_FILE, System, kouxing, samples_of_file
 
 NODE = {"object_store_memory": 80 << 20, "include_dashboard": False}
@@ -71,7 +71,7 @@ def test_workers_are_placed_restarted_elsewhere_and_stopped(
     control.wait_until(lambda report: not workers(report))
 
 
-def test_reports_how_to_start_a_cluster() -> None:
+def test_the_error_says_how_to_start_a_cluster() -> None:
     refused = kouxing("cluster")
     assert refused.returncode == 2
     assert "start one with 'ray start --head'" in refused.stderr

@@ -20,8 +20,8 @@ from kouxing_client import Client, FapFrame, Refused
 from kouxing.services.kinds import KINDS
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
-from tests.e2e.conftest import Command
-from tests.e2e.following import Stream
+from tests.e2e.conftest import CommandRunner
+from tests.e2e.streaming import Stream
 from tests.receivers import read_osc
 from tests.system import (
     LIMIT_S,
@@ -38,14 +38,16 @@ SENTENCE = VOWELS_FILE
 
 
 @pytest.fixture
-def command(system: System, command: Command, monkeypatch: pytest.MonkeyPatch) -> Command:
+def command(
+    system: System, command: CommandRunner, monkeypatch: pytest.MonkeyPatch
+) -> CommandRunner:
     monkeypatch.setenv("KOUXING_CONTROL", system.control.partition(" ")[0])
     return command
 
 
 @pytest.mark.parametrize(("scale", "word"), [(0.0, "it is silent"), (30.0, "clipped")])
-def test_warns_of_silence_and_clipping(
-    command: Command, tmp_path: Path, scale: float, word: str
+def test_silence_and_clipping_give_warnings(
+    command: CommandRunner, tmp_path: Path, scale: float, word: str
 ) -> None:
     path = tmp_path / "sound.wav"
     soundfile.write(path, np.clip(samples_of_file(SENTENCE)[:16000] * scale, -1, 1), 16000)
@@ -53,7 +55,7 @@ def test_warns_of_silence_and_clipping(
     assert (status, word in log) == (0, True), log
 
 
-def test_speaks_raw_audio_from_standard_input_and_writes_the_video(system: System) -> None:
+def test_speak_sends_raw_audio_from_standard_input_and_saves_the_video(system: System) -> None:
     pcm = (samples_of_file(SENTENCE) * 32767).astype("<i2").tobytes()
     result = kouxing("speak", "-", "--fast", "--record", control=system.control, stdin=pcm)
     assert result.returncode == 0, result.stderr
@@ -61,11 +63,11 @@ def test_speaks_raw_audio_from_standard_input_and_writes_the_video(system: Syste
     assert "wrote" in result.stderr
 
 
-def listening(control: str, *arguments: object, says: str) -> subprocess.Popen[str]:
+def start_listening(control: str, *arguments: object, first_message: str) -> subprocess.Popen[str]:
     """Start ``kouxing listen``, and return after its first message."""
     listener = start_python("-m", "kouxing", "listen", *arguments, control=control)
     assert listener.stderr is not None
-    assert says in listener.stderr.readline()
+    assert first_message in listener.stderr.readline()
     return listener
 
 
@@ -79,8 +81,8 @@ def output_of(process: subprocess.Popen[str]) -> tuple[str, str]:
 def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_path: Path) -> None:
     recorded = tmp_path / "face.fap"
     waits = "waiting for session heard to open, as with kouxing speak my.wav --session heard"
-    recorder = listening(system.control, "heard", "--output", recorded, says=waits)
-    printer = listening(system.control, "heard", "--as", "syllables", says=waits)
+    recorder = start_listening(system.control, "heard", "--output", recorded, first_message=waits)
+    printer = start_listening(system.control, "heard", "--as", "syllables", first_message=waits)
     with (
         Client(system.control) as client,
         client.open_session("heard", encoding="f32le", paced=False) as session,
@@ -103,13 +105,15 @@ def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_
 def test_listen_without_a_name_follows_the_newest_session(system: System) -> None:
     with Client(system.control) as client, client.open_session("older"):
         newer = client.open_session("newer")
-        listener = listening(system.control, "--as", "phones", says="following session newer")
+        listener = start_listening(
+            system.control, "--as", "phones", first_message="following session newer"
+        )
         newer.close()
         assert output_of(listener)[1] == "session newer ended: 0 phones\n"
 
 
 def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
-    system: System, command: Command
+    system: System, command: CommandRunner
 ) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
         program.bind(("127.0.0.1", 0))
@@ -168,14 +172,16 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["express", "nobody", "joy=1"], "session 'nobody' does not exist"),
     ],
 )
-def test_rejects_wrong_arguments(command: Command, arguments: list[str], word: str) -> None:
+def test_wrong_arguments_are_rejected(
+    command: CommandRunner, arguments: list[str], word: str
+) -> None:
     status, _, message = command(*arguments)
     assert status == 2
     assert word in message
     assert len(message.splitlines()) == 1
 
 
-def test_express_changes_the_face(system: System, command: Command) -> None:
+def test_express_changes_the_face(system: System, command: CommandRunner) -> None:
     corner = FAP_NUMBER["raise_l_cornerlip"] - 1
     with Client(system.control) as client, client.open_session("smiling") as session:
         faces = session.results(FapFrame, keep_all=True)

@@ -1,4 +1,4 @@
-"""docker-compose.yml, run without an engine."""
+"""docker-compose.yml, run without a container engine."""
 
 import contextlib
 import shutil
@@ -31,8 +31,8 @@ HOSTS = {  # containers by name, and their services
 
 @pytest.fixture(scope="module")
 def network() -> Iterator[Network]:
-    with network_or_skip([*HOSTS], NetworkLink()) as made:
-        yield made
+    with network_or_skip([*HOSTS], NetworkLink()) as virtual_network:
+        yield virtual_network
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +40,13 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The folder of keys that the service ``keys`` creates; this process also uses them."""
     folder = tmp_path_factory.mktemp("keys")
     run_keys_service(folder, *COMPOSE["services"]["keys"]["command"])
-    made = folder / "kouxing"
-    assert (made / "control.key").stat().st_uid == USER
+    key_files = folder / "kouxing"
+    assert (key_files / "control.key").stat().st_uid == USER
     own = tmp_path_factory.mktemp("own-keys") / "kouxing"
-    shutil.copytree(made, own)  # owned by this user
+    shutil.copytree(key_files, own)  # owned by this user
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(own.parent))
-        yield made
+        yield key_files
 
 
 def run_keys_service(folder: Path, *command: str) -> None:
@@ -75,13 +75,13 @@ def run_keys_service(folder: Path, *command: str) -> None:
 def containers(
     network: Network, keys: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Containers]:
-    made = Containers(tmp_path_factory.mktemp("compose"), network, {"control": "control"})
+    new_containers = Containers(tmp_path_factory.mktemp("compose"), network, {"control": "control"})
     running = {
-        host: start(made, host, service, keys, *COMPOSE["services"][service]["command"])
+        host: start(new_containers, host, service, keys, *COMPOSE["services"][service]["command"])
         for host, service in HOSTS.items()
         if service != "client"
     }
-    yield made
+    yield new_containers
     for process in running.values():
         process.terminate()
     grace_s = {
@@ -124,24 +124,26 @@ def test_containers_are_healthy_private_and_speak(
         while len(services := client.status().services) < len(HOSTS) - 1:
             assert time.monotonic() < end_s, services
             time.sleep(0.2)
-        told = {item for state in services for item in state.endpoints.values()}
-        check_page(told, network.address("gateway-1"))
+        reported_endpoints = {item for state in services for item in state.endpoints.values()}
+        check_page(reported_endpoints, network.address("gateway-1"))
     for host, port in (("recognizer-1", 5560), ("synthesizer-1", 5571)):
-        assert any(item.startswith(f"tcp://{network.address(host)}:{port} ") for item in told), told
+        assert any(
+            item.startswith(f"tcp://{network.address(host)}:{port} ") for item in reported_endpoints
+        ), reported_endpoints
 
     speaker = start(containers, "client-1", "client", keys, "speak", str(VOWELS_FILE), "--fast")
     assert speaker.wait(60) == 0, containers.log("client-1").read_text("utf-8")
     assert " phones in " in containers.log("client-1").read_text("utf-8")
 
 
-def check_page(told: Collection[str], gateway: str) -> None:
+def check_page(reported_endpoints: Collection[str], gateway: str) -> None:
     """Check that compose publishes the page, and that it requires the token in its address."""
     (published,) = COMPOSE["services"]["gateway"]["ports"]
     host, port, own_port = published.split(":")
     (secret,) = [
         item.removeprefix(address)
         for address in [f"http://{host}:{port}/#"]
-        for item in told
+        for item in reported_endpoints
         if item.startswith(address)
     ]
     for query, status in (("", 403), (f"?{secret}", 200)):
@@ -150,7 +152,7 @@ def check_page(told: Collection[str], gateway: str) -> None:
             assert http.getresponse().status == status
 
 
-def test_every_service_is_locked_in() -> None:
+def test_every_container_is_isolated() -> None:
     for name, service in COMPOSE["services"].items():
         assert service["read_only"], name
         assert service["cap_drop"] == ["ALL"], name

@@ -16,7 +16,7 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.speech import Progress
-from tests.raw_bytes import connected, frame
+from tests.raw_bytes import connect_raw, frame
 from tests.system import LIMIT_S, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -24,15 +24,17 @@ LOCAL = "tcp://127.0.0.1:*"
 
 @pytest.fixture
 def bus() -> Iterator[Bus]:
-    with Bus() as made:
-        yield made
+    with Bus() as new_bus:
+        yield new_bus
 
 
 def port_of(bound: Socket) -> int:
     return int(bound.endpoint.rpartition(":")[2])
 
 
-def collect(bus: Bus, bound: Socket, is_enough: Callable[[list[Received]], bool]) -> list[Received]:
+def receive_until(
+    bus: Bus, bound: Socket, is_enough: Callable[[list[Received]], bool]
+) -> list[Received]:
     """Receive as a service's loop does, until it is enough."""
     received: list[Received] = []
     poller = Poller()
@@ -75,7 +77,7 @@ def test_fast_senders_wait_while_nothing_is_received(
             assert sender.send(chunk(number, session=str(name)))
     num_before = len(checks)
     wait_until(lambda: len(checks) > num_before + 20)  # a service may pause a socket
-    received = collect(bus, audio, lambda all_: len(all_) == len(senders) * num_chunks)
+    received = receive_until(bus, audio, lambda all_: len(all_) == len(senders) * num_chunks)
     numbers: dict[str, list[int]] = {}
     for item in received:
         assert isinstance(item.message, Message)
@@ -86,24 +88,24 @@ def test_fast_senders_wait_while_nothing_is_received(
 def test_a_message_may_arrive_in_pieces(bus: Bus) -> None:
     audio = bus.bind_router(LOCAL, "audio")
     data = wire_bytes(chunk(1))
-    taken: list[Received] = []
-    with connected(port_of(audio)) as slow:
+    handled: list[Received] = []
+    with connect_raw(port_of(audio)) as slow:
         other = bus.connect_dealer(audio.endpoint)
         for begin in range(0, len(data), len(data) // 4):
             slow.sendall(data[begin : begin + len(data) // 4])
             for number in range(20):  # other messages are delivered in between
                 other.send(Progress(sequence=number, level_db=0.0))
                 time.sleep(0.005)
-                taken += audio.receive()
+                handled += audio.receive()
         slow.sendall(wire_bytes(chunk(2, 10)))
-        taken += collect(bus, audio, lambda all_: chunk(2, 10) in [r.message for r in all_])
-    assert chunk(1) in [item.message for item in taken]
+        handled += receive_until(bus, audio, lambda all_: chunk(2, 10) in [r.message for r in all_])
+    assert chunk(1) in [item.message for item in handled]
 
 
 def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:
     faps = bus.bind_publisher(LOCAL, "faps")
     num_topics = MAX_TOPICS // MAX_TOPIC + 100
-    with connected(port_of(faps), "SUB") as subscriber:
+    with connect_raw(port_of(faps), "SUB") as subscriber:
         for number in range(num_topics):
             topic = str(number).rjust(MAX_TOPIC, "x").encode()
             subscriber.sendall(frame(b"\x01" + topic) + frame(b"\x00" + topic))
@@ -129,15 +131,15 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
     faps = bus.bind_publisher(LOCAL, "faps")
     honest = bus.connect_subscriber(faps.endpoint)
     honest.subscribe(FapFrame, "s")
-    with connected(port_of(faps), "SUB") as hostile:
+    with connect_raw(port_of(faps), "SUB") as hostile:
         for number in range(MAX_TOPICS // MAX_TOPIC):
             hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_TOPIC, "x").encode()))
-        assert not is_cut(hostile, faps, num_checks=20)
+        assert not is_soon_disconnected(hostile, faps, num_checks=20)
         hostile.sendall(frame(b"\x01x"))
-        assert is_cut(hostile, faps)
-    with connected(port_of(faps), "SUB") as hostile:
+        assert is_soon_disconnected(hostile, faps)
+    with connect_raw(port_of(faps), "SUB") as hostile:
         hostile.sendall(frame(b"\x01" + bytes(MAX_TOPIC + 1)))
-        assert is_cut(hostile, faps)
+        assert is_soon_disconnected(hostile, faps)
     frame_ = FapFrame(session="s", values=b"\0" * 272, mask=b"\0" * 9)
     faps.send(frame_)
     assert honest.wait(LIMIT_S)
@@ -150,13 +152,13 @@ def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch)
     with contextlib.ExitStack() as stack:
         with Bus() as bus:
             audio = bus.bind_router(LOCAL, "audio")
-            peers = [stack.enter_context(connected(port_of(audio))) for _ in range(6)]
+            peers = [stack.enter_context(connect_raw(port_of(audio))) for _ in range(6)]
             wait_until(lambda: len(bus._limiter) == 3)  # three quarters for one address
             assert not any(has_ended(peer) for peer in peers)
         wait_until(lambda: all(has_ended(peer) for peer in peers))
 
 
-def is_cut(connection: socket.socket, bound: Socket, num_checks: int = 500) -> bool:
+def is_soon_disconnected(connection: socket.socket, bound: Socket, num_checks: int = 500) -> bool:
     """Whether a connection ends soon, while its other end's messages are received."""
     for _ in range(num_checks):
         list(bound.receive())
@@ -176,12 +178,12 @@ def has_ended(connection: socket.socket) -> bool:
         return True
 
 
-def test_drops_a_message_of_very_many_parts_step_by_step(
+def test_a_message_of_very_many_parts_is_dropped_step_by_step(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connections, "CHECK_INTERVAL_S", 600.0)  # the limiter acts too late
     bound = bus.bind_router(LOCAL, "bound")
-    with connected(port_of(bound)) as hostile:
+    with connect_raw(port_of(bound)) as hostile:
         num_parts = 20 * MAX_DROPPED
         hostile.sendall(frame(b"", more=True) * num_parts + frame(b""))
         assert bound.wait(LIMIT_S)

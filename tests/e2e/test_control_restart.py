@@ -1,4 +1,4 @@
-"""A session does not notice that control was killed and started again."""
+"""A session continues while control is killed and started again."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 from kouxing_client import Client
 
 from kouxing.shared.face.shapes import ARKIT, VRM
-from tests.e2e.following import Stream
+from tests.e2e.streaming import Stream
 from tests.system import CHAIN, DEMO, System, samples_of_file
 
 

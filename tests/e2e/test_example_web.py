@@ -57,7 +57,7 @@ def test_the_assistant_can_be_interrupted(control: PageControl, gateway: str) ->
         session = assistant.stdout.readline().split()[-1]
         type_line("a very long question")
         wait_until(lambda: control.samples(session).any())
-        assert not control.of(FlushSession)
+        assert not control.messages_of(FlushSession)
         type_line("no")
         wait_until(lambda: control.sessions_of(FlushSession) == [session])
         output, log = assistant.communicate(timeout=60)
@@ -88,6 +88,6 @@ def test_the_avatar_shows_the_face_of_a_session(
                 return bool((moved[70:150, 90:150] > 60).sum() > 40)
 
             wait_until(is_open)
-        assert [text for text in browser.complaints if "exceptionDetails" in text] == []
+        assert [text for text in browser.page_errors if "exceptionDetails" in text] == []
     finally:
         browser.close()

@@ -10,7 +10,7 @@ import pytest
 from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, Sound, find_key
 
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
-from kouxing.evaluation.system.attacks import Memory
+from kouxing.evaluation.system.attacks import MemoryUsage
 from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.errors import UserError
@@ -22,7 +22,7 @@ from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, Sessio
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
-from tests.e2e.following import Stream
+from tests.e2e.streaming import Stream
 from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until
 
 M = TypeVar("M", bound=Message)
@@ -54,7 +54,7 @@ def instances(client: Client) -> set[str]:
         {"instance": "recognizer", "state": "draining"},
     ],
 )
-def test_nobody_speaks_for_a_service_of_another_key(
+def test_no_key_may_send_messages_of_another_service(
     system: System, client: Client, witness: Session, name: str, forged: dict[str, object]
 ) -> None:
     load_key("driver", ("service:driver",))
@@ -130,43 +130,47 @@ def test_only_the_sessions_recognizer_moves_its_face(
 
 
 @pytest.fixture
-def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
+def laptop_client(
+    tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Client]:
     """A client of another machine, whose key, ``laptop``, has the role of a subscriber."""
     add_key("laptop", ("subscriber:shown",), tmp_path / "laptop.key")
-    with monkeypatch.context() as there:
-        there.setenv("XDG_STATE_HOME", str(tmp_path))
+    with monkeypatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path))
         key_folder().mkdir(mode=0o700)
         (tmp_path / "laptop.key").rename(key_folder() / "client.key")
         key = find_key()
-    with Client(system.control, key=key, timeout_s=5.0) as made:
-        yield made
+    with Client(system.control, key=key, timeout_s=5.0) as subscriber:
+        yield subscriber
     with contextlib.suppress(UserError):  # revoked already
         revoke_key("laptop")
 
 
-def test_roles_limit_what_a_key_may_do(keyed: Client, client: Client, witness: Session) -> None:
-    assert witness.name in {item.session for item in keyed.status().sessions}
+def test_roles_limit_what_a_key_may_do(
+    laptop_client: Client, client: Client, witness: Session
+) -> None:
+    assert witness.name in {item.session for item in laptop_client.status().sessions}
     with pytest.raises(Refused, match=r"not-allowed: .* no role client"):
-        keyed.open_session()
+        laptop_client.open_session()
     with pytest.raises(Refused, match=r"not-allowed: .* no role client or operator"):
-        keyed.set_face(witness.name, expressions={"joy": 1.0})
+        laptop_client.set_face(witness.name, expressions={"joy": 1.0})
 
 
-def test_a_revoked_key_is_cut_while_it_follows(
-    system: System, keyed: Client, client: Client
+def test_revoking_a_key_disconnects_its_follower(
+    system: System, laptop_client: Client, client: Client
 ) -> None:
     shown = client.open_session(name="shown", encoding="f32le", paced=False)
-    followed = keyed.follow("shown").frames()
+    followed = laptop_client.follow("shown").frames()
     samples = samples_of_file(DEMO / "hello-female.wav")
     shown.push(samples[:16000])
     assert followed.get(LIMIT_S) is not None
     revoke_key("laptop")
     frames = shown.frames()
     with contextlib.suppress(KouxingError):
-        while keyed.status():  # until control has seen it
+        while laptop_client.status():  # until control has seen it
             pass
     with pytest.raises(KouxingError, match="does not accept"):
-        keyed.status()
+        laptop_client.status()
     shown.push(samples[16000:32000])
     assert frames.get(LIMIT_S) is not None
     received: list[FapFrame] = []
@@ -192,7 +196,7 @@ def test_rejects_nan_and_accepts_empty_chunks_silence_and_clipping(
     assert np.isfinite(sent.faps).all()
 
 
-def test_names_an_unknown_session(client: Client, bus: Bus, witness: Session) -> None:
+def test_the_error_names_an_unknown_session(client: Client, bus: Bus, witness: Session) -> None:
     audio = bus.connect_dealer(witness.info["audio"])
     audio.send(AudioChunk(session="nobody", token="t", sequence=1, pcm=b""))
     error = next(answers(audio, Error))
@@ -255,11 +259,11 @@ RUNS = [
 
 
 @pytest.mark.parametrize(("name", "target"), RUNS)
-def test_limits_the_damage_of_an_attack(
+def test_the_damage_of_an_attack_is_limited(
     system: System, witness: Session, name: str, target: str
 ) -> None:
     attack = ATTACKS[name]
-    memory = Memory(system.process(SERVICES[target]).pid)
+    memory = MemoryUsage(system.process(SERVICES[target]).pid)
     source = f"127.0.1.{2 + RUNS.index((name, target))}"
     attack.run(system.endpoints()[target], source, SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB[attack.has_key]

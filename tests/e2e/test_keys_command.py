@@ -9,15 +9,15 @@ import pytest
 
 from kouxing.services.kinds import KINDS
 from kouxing.shared.keys import key_folder, read_grants
-from tests.e2e.conftest import Command
-from tests.e2e.following import stream
+from tests.e2e.conftest import CommandRunner
+from tests.e2e.streaming import stream
 from tests.system import SERVICE, System, kouxing, own_addresses, start_python, wait_until
 
 WORKERS = ("recognizer", "synthesizer")
 pytestmark = pytest.mark.usefixtures("new_keys")
 
 
-def machine(command: Command, folder: Path, name: str, role: str, file: str) -> Path:
+def create_machine(command: CommandRunner, folder: Path, name: str, role: str, file: str) -> Path:
     """Create a key by the command, and the state folder of another machine with only this key."""
     status, _, log = command("keys", "add", name, "--role", role, "-o", folder / f"{name}.key")
     assert (status, f"/{file}.key on the other machine" in log) == (0, True), log
@@ -27,7 +27,7 @@ def machine(command: Command, folder: Path, name: str, role: str, file: str) -> 
     return folder / name
 
 
-def test_init_makes_the_keys_of_all_services(command: Command) -> None:
+def test_init_makes_the_keys_of_all_services(command: CommandRunner) -> None:
     assert command("keys", "init")[0] == 0
     roles = {grant.name: grant.roles for grant in read_grants().values()}
     assert roles.keys() == {*KINDS, "client"} - {"control"}
@@ -36,14 +36,14 @@ def test_init_makes_the_keys_of_all_services(command: Command) -> None:
 
 
 def test_machines_with_copied_keys_work_until_the_keys_are_revoked(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: CommandRunner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
     with System(["control"], tmp_path, settings) as system:
         for kind in WORKERS:
-            own = machine(command, tmp_path, f"{kind}-host", f"service:{kind}", kind)
+            own = create_machine(command, tmp_path, f"{kind}-host", f"service:{kind}", kind)
             system.add(kind, XDG_STATE_HOME=str(own))
-        laptop = machine(command, tmp_path, "laptop", "client", "client")
+        laptop = create_machine(command, tmp_path, "laptop", "client", "client")
         monkeypatch.setenv("XDG_STATE_HOME", str(laptop))
         assert stream(system.control, np.zeros(3200, np.float32)).frames
         checked = kouxing("doctor", control=system.control)
@@ -69,14 +69,14 @@ def test_machines_with_copied_keys_work_until_the_keys_are_revoked(
         system.assert_all_alive()
 
 
-def test_doctor_recognizes_another_program(command: Command) -> None:
+def test_doctor_recognizes_another_program(command: CommandRunner) -> None:
     assert command("keys", "init")[0] == 0
     with socket.create_server(("127.0.0.1", 0)) as other:
         checked = kouxing("doctor", control=f"tcp://127.0.0.1:{other.getsockname()[1]}")
     assert "another program answers there" in checked.stdout
 
 
-def test_a_service_waits_for_control_and_says_why(command: Command) -> None:
+def test_a_service_waits_for_control_and_says_why(command: CommandRunner) -> None:
     assert command("keys", "init")[0] == 0
     addresses = own_addresses(["control", "synthesizer"])
     started = [start_python(*SERVICE, "synthesizer", **addresses)]

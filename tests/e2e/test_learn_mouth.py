@@ -84,7 +84,7 @@ def read_aloud(browser: Browser) -> None:
     browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
 
 
-def longer(recording: bytes) -> bytes:
+def lengthen(recording: bytes) -> bytes:
     """Make a longer recording of the same face, whose lips open with the loudness."""
     size = 4 + int.from_bytes(recording[:4], "little")
     num_frames = json.loads(recording[4:size])["times"]
@@ -102,7 +102,9 @@ def longer(recording: bytes) -> bytes:
 
 
 @pytest.mark.timeout(400)  # on a busy machine
-def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Browser) -> None:
+def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
+    control: FakeControl, browser: Browser
+) -> None:
     browser.evaluate(
         "window.realFetch = fetch; window.fetch = (url, options) => realFetch(url,"
         " { ...options, body: (window.recording = window.longer ?? options.body) });"
@@ -120,7 +122,7 @@ def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Br
         "recording.bytes().then((bytes) =>"
         " Array.from(bytes, (byte) => String.fromCharCode(byte)).join(''))"
     )
-    content = base64.b64encode(longer(recording.encode("latin-1"))).decode()
+    content = base64.b64encode(lengthen(recording.encode("latin-1"))).decode()
     browser.evaluate(f"window.longer = Uint8Array.from(atob('{content}'), (c) => c.charCodeAt(0))")
     browser.click("lesson-resend")
     browser.wait_for("window.kouxing.state.lesson === 'result'", 180)
@@ -139,8 +141,8 @@ def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Br
     browser.wait_for("window.kouxing.state.microphone")
     ((session, opening),) = control.openings.items()
     assert opening.mouth_profile == profile
-    wait_until(lambda: control.of(SetFace))
-    assert [(change.session, change.face) for change in control.of(SetFace)] == [
+    wait_until(lambda: control.messages_of(SetFace))
+    assert [(change.session, change.face) for change in control.messages_of(SetFace)] == [
         (session, FaceSettings(lip_model="learned"))
     ]
     browser.click("microphone")
@@ -150,7 +152,7 @@ def test_learns_keeps_uses_and_forgets_a_mouth(control: FakeControl, browser: Br
     assert "opening" in text_of(browser, "lesson-profile")
     browser.click("lesson-forget")
     assert browser.evaluate("window.kouxing.state.mouthProfile + localStorage.length") == "0"
-    wrong = [text for text in browser.complaints if '"error"' in text or "exception" in text]
+    wrong = [text for text in browser.page_errors if '"error"' in text or "exception" in text]
     assert ["learn-mouth" in text for text in wrong] == [True]  # the refusal
 
 
@@ -205,7 +207,7 @@ def test_the_page_records_the_same_landmarks(browser: Browser) -> None:
     assert tuple(kept) == LANDMARKS
 
 
-def test_reports_a_missing_camera(browser: Browser) -> None:
+def test_the_page_reports_a_missing_camera(browser: Browser) -> None:
     browser.evaluate(
         "navigator.mediaDevices.getUserMedia ="
         " () => Promise.reject(new DOMException('none', 'NotFoundError'))"
@@ -217,7 +219,7 @@ def test_reports_a_missing_camera(browser: Browser) -> None:
     browser.evaluate("document.getElementById('learn-mouth').close()")
 
 
-def test_explains_that_cameras_need_https(browser: Browser) -> None:
+def test_the_page_explains_that_cameras_need_https(browser: Browser) -> None:
     browser.evaluate("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
     browser.click("learn")
     browser.wait_for("window.kouxing.state.lesson === 'intro'")

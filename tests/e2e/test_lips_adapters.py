@@ -68,7 +68,7 @@ def site(tmp_path: Path) -> Path:
     return folder
 
 
-def recipe(word: str) -> str:
+def find_recipe(word: str) -> str:
     """Return the recipe with a word."""
     document = ROOT / "docs" / "clients" / "local.md"
     (block,) = [block for block in code_blocks(document, "js") if word in block]
@@ -82,13 +82,13 @@ def run(browser: Browser, site: Path, body: str, done: str) -> None:
         browser.wait_for("window.isReady")
         browser.click("start")
         browser.wait_for(done)
-    assert not [text for text in browser.complaints if '"level": "warning"' not in text]
+    assert not [text for text in browser.page_errors if '"level": "warning"' not in text]
 
 
-def test_three_vrm_in_five_lines(browser: Browser, site: Path) -> None:
+def test_five_lines_move_a_three_vrm_avatar(browser: Browser, site: Path) -> None:
     avatar = site / "avatar.vrm"
     subprocess.run([NODE.with_name("kouxing"), "head", "export", "--force", avatar], check=True)
-    before, loop = recipe("expressionManager").split("// in your render loop")
+    before, loop = find_recipe("expressionManager").split("// in your render loop")
     body = f"""
 import {{ VRMLoaderPlugin }} from "@pixiv/three-vrm";
 import {{ GLTFLoader }} from "three/addons/loaders/GLTFLoader.js";
@@ -125,9 +125,9 @@ FINGERS = "Thumb Index Middle Ring Pinky".split()
 VISEMES = "aa PP SS TH DD FF kk nn RR CH sil".split()
 
 
-def test_moves_the_mouth_of_talking_head(browser: Browser, site: Path) -> None:
+def test_talking_head_moves_its_mouth(browser: Browser, site: Path) -> None:
     talking_head_avatar(site / "avatar.glb")
-    imported, *lines = recipe("mtAvatar").splitlines()
+    imported, *lines = find_recipe("mtAvatar").splitlines()
     body = """
 import { TalkingHead } from "@met4citizen/talkinghead";
 const head = new TalkingHead(node, { lipsyncModules: [] });
@@ -144,7 +144,7 @@ setInterval(() => {
     run(browser, site, body, "window.largest.viseme_aa > 0.2 && window.largest.viseme_PP > 0.2")
 
 
-def test_in_place_of_head_audio(browser: Browser, site: Path) -> None:
+def test_the_node_replaces_head_audio(browser: Browser, site: Path) -> None:
     """Both nodes run in the same way, and report the same names."""
     body = """
 import { HeadAudio as Original } from "@met4citizen/headaudio";
@@ -176,7 +176,7 @@ button.onclick = async () => {
     assert set(original) <= set(ours)
 
 
-def test_in_place_of_wlipsync(browser: Browser, site: Path) -> None:
+def test_the_node_replaces_wlipsync(browser: Browser, site: Path) -> None:
     """Both nodes have the same interface: airi reads ``volume`` and ``weights`` by vowel."""
     body = """
 import * as original from "./packages/wlipsync/dist/wlipsync-single.js";

@@ -59,7 +59,7 @@ def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
         browser.click("microphone")
         assert browser.evaluate("document.getElementById('microphone').ariaPressed") == "false"
         browser.wait_for(f"Math.abs({FACE}.shown[2]) < 1")  # the face returns to rest
-    assert not [text for text in browser.complaints if "GL Driver" not in text]
+    assert not [text for text in browser.page_errors if "GL Driver" not in text]
 
 
 def test_the_page_fits_on_a_phone(browser: Browser, site: Path) -> None:
@@ -129,7 +129,7 @@ def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path)
         browser.wait_for("window.jaws.every((jaw) => jaw > 10)")
         browser.click("compare")
         browser.wait_for(f"{faces}.length === 1")
-    assert not [text for text in browser.complaints if "GL Driver" not in text]
+    assert not [text for text in browser.page_errors if "GL Driver" not in text]
 
 
 def test_each_problem_gives_a_sentence(browser: Browser, site: Path) -> None:

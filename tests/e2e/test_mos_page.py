@@ -22,7 +22,7 @@ CONDITIONS = ("reference", "anchor")
 SENTENCES = ("one", "two")
 
 
-class Served:
+class MosServer:
     """``kouxing mos serve`` in a process that can be killed and started again."""
 
     def __init__(self, folder: Path, *options: str) -> None:
@@ -85,28 +85,28 @@ def folder(tmp_path: Path, video: Path) -> Path:
 
 
 @pytest.fixture
-def served(folder: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
-    served = Served(folder, *getattr(request, "param", ()))
-    yield served
-    assert served.stop() == 0
+def server(folder: Path, request: pytest.FixtureRequest) -> Iterator[MosServer]:
+    server = MosServer(folder, *getattr(request, "param", ()))
+    yield server
+    assert server.stop() == 0
 
 
-def test_answers_survive_a_crash_and_count_once(served: Served, video: Path) -> None:
-    token = served.add_judge()
+def test_answers_survive_a_crash_and_count_once(server: MosServer, video: Path) -> None:
+    token = server.add_judge()
     for place in range(-2, 2):
-        assert served.ask(f"/stimulus/{place}?judge={token}") == (200, video.read_bytes())
+        assert server.ask(f"/stimulus/{place}?judge={token}") == (200, video.read_bytes())
         answer = {"place": place, "sync": 4, "realism": 3 + place, "language": "en"}
-        assert served.state(f"/answers?judge={token}", answer)["place"] == place + 1
+        assert server.state(f"/answers?judge={token}", answer)["place"] == place + 1
         if place == 0:
-            served.kill()
-            served.start()
-    assert served.state(f"/state?judge={token}")["place"] == 2
+            server.kill()
+            server.start()
+    assert server.state(f"/state?judge={token}")["place"] == 2
     again = {"place": 0, "sync": 1, "realism": 1, "language": "zh"}
-    assert served.state(f"/answers?judge={token}", again)["place"] == 2
-    places = places_of_judge(0, load_study(served.folder))
+    assert server.state(f"/answers?judge={token}", again)["place"] == 2
+    places = places_of_judge(0, load_study(server.folder))
     assert [
         (answer.place, answer.sentence, answer.condition, answer.scale, answer.score)
-        for answer in read_answers(served.folder)
+        for answer in read_answers(server.folder)
     ] == [
         (place, *places[place], scale, score)
         for place in range(-2, 2)
@@ -114,40 +114,40 @@ def test_answers_survive_a_crash_and_count_once(served: Served, video: Path) -> 
     ]
 
 
-def test_sends_only_the_next_video_and_rejects_invalid_answers(served: Served) -> None:
-    good = {"place": -2, "sync": 3, "realism": 3, "language": "zh"}
-    token = served.add_judge()
+def test_sends_only_the_next_video_and_rejects_invalid_answers(server: MosServer) -> None:
+    valid_answer = {"place": -2, "sync": 3, "realism": 3, "language": "zh"}
+    token = server.add_judge()
     files = ("study.json", "answers.jsonl", "..%2f..%2fserver.py", "server.py", "good/one.mp4")
     videos = (f"stimulus/{name}?judge={token}" for name in ("-1", "0", "..%2fstudy.json"))
     for path in (*files, *videos, "stimulus/-2?judge=nobody"):
-        assert served.ask(f"/{path}")[0] in (403, 404), path
+        assert server.ask(f"/{path}")[0] in (403, 404), path
     answers = f"/answers?judge={token}"
-    assert served.ask(f"/stimulus/-2?judge={token}")[0] == 200
+    assert server.ask(f"/stimulus/-2?judge={token}")[0] == 200
     changes: list[dict[str, object]] = [{"sync": value} for value in (6, True, "3")]
     changes += [{"realism": 0}, {"language": "fr"}, {"language": ["zh"]}]
     incomplete = {"place": -2, "sync": 3, "realism": 3}
-    for body in (*({**good, **change} for change in changes), incomplete, [], 3):
-        assert served.ask(answers, body)[0] == 400, body
+    for body in (*({**valid_answer, **change} for change in changes), incomplete, [], 3):
+        assert server.ask(answers, body)[0] == 400, body
     for place in (-1, 0, 1, 10**30):
-        assert served.ask(answers, {**good, "place": place})[0] == 409
-    assert served.ask(answers, raw=b"[" * 1000)[0] == 400
-    assert served.ask(answers, raw=b"x" * 5000)[0] == 413
-    assert served.ask(answers, good, Origin="http://evil.example")[0] == 403
-    assert served.ask(answers, good, Host="evil.example")[0] == 403
-    assert read_answers(served.folder) == []
-    assert served.state(answers, good)["place"] == -1
+        assert server.ask(answers, {**valid_answer, "place": place})[0] == 409
+    assert server.ask(answers, raw=b"[" * 1000)[0] == 400
+    assert server.ask(answers, raw=b"x" * 5000)[0] == 413
+    assert server.ask(answers, valid_answer, Origin="http://evil.example")[0] == 403
+    assert server.ask(answers, valid_answer, Host="evil.example")[0] == 403
+    assert read_answers(server.folder) == []
+    assert server.state(answers, valid_answer)["place"] == -1
 
 
-@pytest.mark.parametrize("served", [("--set", "gateway.token=secret")], indirect=True)
-def test_the_gateways_token_protects_everything_but_the_page(served: Served) -> None:
-    assert served.line.endswith("/#token=secret\n")
-    assert served.ask("/")[0] == served.ask("/main.js")[0] == 200
+@pytest.mark.parametrize("server", [("--set", "gateway.token=secret")], indirect=True)
+def test_the_gateways_token_protects_everything_but_the_page(server: MosServer) -> None:
+    assert server.line.endswith("/#token=secret\n")
+    assert server.ask("/")[0] == server.ask("/main.js")[0] == 200
     for path in ("/state", "/stimulus/-2"):
-        assert served.ask(path)[0] == 403
+        assert server.ask(path)[0] == 403
     for path in ("/judges", "/answers", "/judges?token=wrong"):
-        assert served.ask(path, {})[0] == 403
-    assert served.state("/state?token=secret") == {"title": "study", "videos": 4}
-    assert served.ask("/judges?token=secret", {})[0] == 200
+        assert server.ask(path, {})[0] == 403
+    assert server.state("/state?token=secret") == {"title": "study", "videos": 4}
+    assert server.ask("/judges?token=secret", {})[0] == 200
 
 
 @pytest.fixture(scope="module")
@@ -160,11 +160,11 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
     browser.close()
 
 
-def test_judges_score_every_video_in_a_browser(browser: Chromium, served: Served) -> None:
-    Page(browser, served).judge_everything({"reference": 5, "anchor": 2})
-    assert browser.complaints == []
-    study = load_study(served.folder)
-    answers = [answer for answer in read_answers(served.folder) if answer.place >= 0]
+def test_judges_score_every_video_in_a_browser(browser: Chromium, server: MosServer) -> None:
+    Page(browser, server).judge_everything({"reference": 5, "anchor": 2})
+    assert browser.page_errors == []
+    study = load_study(server.folder)
+    answers = [answer for answer in read_answers(server.folder) if answer.place >= 0]
     assert {(answer.sentence, answer.condition) for answer in answers} == set(study.files)
     assert len(answers) == 2 * len(study.files)
     assert {answer.language for answer in answers} == {"zh", "en"}  # a reload resets it
@@ -177,10 +177,10 @@ VIDEO = "document.getElementById('video')"
 class Page:
     """The page in a browser."""
 
-    def __init__(self, browser: Chromium, served: Served) -> None:
+    def __init__(self, browser: Chromium, server: MosServer) -> None:
         self._browser = browser
-        self._served = served
-        self._address = f"http://127.0.0.1:{served.port}/"
+        self._served = server
+        self._address = f"http://127.0.0.1:{server.port}/"
         browser.command("Emulation.setUserAgentOverride", userAgent="test", acceptLanguage="en-GB")
 
     def open(self) -> None:

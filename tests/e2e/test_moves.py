@@ -14,7 +14,7 @@ from kouxing_client import Client
 from kouxing.shared.bus import Bus
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.speech import Phone
-from tests.e2e.following import Stream, stream
+from tests.e2e.streaming import Stream, stream
 from tests.system import CHAIN, DEMO, LIMIT_S, System, samples_of_file
 
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
@@ -32,7 +32,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(system: System) -> Stream:
+def uninterrupted(system: System) -> Stream:
     return stream(system.control, SAMPLES)
 
 
@@ -56,7 +56,7 @@ def test_a_recognizer_that_was_suspended_keeps_its_session(system: System) -> No
 @pytest.mark.parametrize("blow", [signal.SIGSTOP, signal.SIGTERM])
 @pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
 def test_a_session_continues_without_its_worker(
-    system: System, undisturbed: Stream, bus: Bus, service: str, blow: signal.Signals
+    system: System, uninterrupted: Stream, bus: Bus, service: str, blow: signal.Signals
 ) -> None:
     if sum(name.startswith(service) for name in system.running) < 2:
         system.add(f"{service}-2")
@@ -95,14 +95,14 @@ def test_a_session_continues_without_its_worker(
     )
     assert num_missing_samples(sent, len(SAMPLES)) == 0, "the lost audio was not resent"
     phones, expected = (
-        [phone for phone in one.phones if phone.is_spoken] for one in (sent, undisturbed)
+        [phone for phone in one.phones if phone.is_spoken] for one in (sent, uninterrupted)
     )
     assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
     for phone, other in zip(phones, expected, strict=True):
         assert abs(phone.media_time - other.media_time) <= ONSET_TOLERANCE
     epochs = [frame.epoch for frame in sent.frames]
     assert epochs == sorted(epochs)
-    assert {*undisturbed.times} <= {*sent.times}
+    assert {*uninterrupted.times} <= {*sent.times}
 
 
 def instances_of(client: Client) -> set[str]:

@@ -63,7 +63,7 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
 
 
-def live(
+def stream_live(
     client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 120.0
 ) -> ReceivedResults:
     """Stream in real time, and cut off a host: that of a service, or the client's."""
@@ -98,17 +98,17 @@ def assert_same(received: ReceivedResults, expected: ReceivedResults, since: int
     assert {time for time in times[1] if time >= since} <= times[0]
 
 
-def test_shows_the_same_over_a_bad_network(
+def test_results_are_equal_over_a_bad_network(
     system: HostsSystem, client: Client, expected: ReceivedResults
 ) -> None:
-    assert_same(live(client, system), expected)
+    assert_same(stream_live(client, system), expected)
 
 
 def test_a_client_that_was_cut_off_catches_up(
     system: HostsSystem, client: Client, expected: ReceivedResults
 ) -> None:
     """Frames from before the cut may be lost, but none of the client's audio is."""
-    received = live(client, system, CLIENT, cut_s=2.0)
+    received = stream_live(client, system, CLIENT, cut_s=2.0)
     assert_same(received, expected, since=round(CUT_AT_S * 16000))
     assert {frame.epoch for _, frame in received.frames} == {1}
 
@@ -117,7 +117,7 @@ def test_a_session_continues_when_a_host_falls_silent(
     system: HostsSystem, client: Client, expected: ReceivedResults
 ) -> None:
     """No service is notified that the connections are gone."""
-    received = live(client, system, "recognizer")
+    received = stream_live(client, system, "recognizer")
     epoch = max(frame.epoch for _, frame in received.frames)
     assert epoch > 1
     alike = difflib.SequenceMatcher(None, symbols(received), symbols(expected)).ratio()

@@ -108,7 +108,7 @@ def session(control: PageControl, gateway: Gateway) -> Iterator[Session]:
 
 
 @pytest.fixture
-def audible(control: PageControl, session: Session, page: Browser) -> Browser:
+def talking_page(control: PageControl, session: Session, page: Browser) -> Browser:
     """The page with a talking face and its sound."""
     control.talk(session.name, A_FACE, "a")
     page.wait_for(f"{STATE}.faps[2] > 440")  # the face does not wait for a click
@@ -183,7 +183,7 @@ def test_the_mouth_in_the_image_follows_the_faps(
     assert teeth(closed)[mouth].mean() < 0.02
     assert teeth(closed_again)[mouth].mean() < 0.02
     wrong = ('"level": "error"', "exceptionDetails")
-    assert not [text for text in page.complaints if any(mark in text for mark in wrong)]
+    assert not [text for text in page.page_errors if any(mark in text for mark in wrong)]
 
 
 @pytest.mark.parametrize(
@@ -250,16 +250,16 @@ def test_the_caption_shows_syllables_or_phones(
         assert page.evaluate("document.getElementById('spoken').offsetHeight > 0") is is_shown
 
 
-def test_sound_starts_with_a_click_and_waits_for_its_image(audible: Browser) -> None:
-    played = audible.evaluate(f"{STATE}.soundSamplesPlayed")
-    audible.wait_for(f"{STATE}.soundSamplesPlayed > {played + 16000}")
+def test_sound_starts_with_a_click_and_waits_for_its_image(talking_page: Browser) -> None:
+    played = talking_page.evaluate(f"{STATE}.soundSamplesPlayed")
+    talking_page.wait_for(f"{STATE}.soundSamplesPlayed > {played + 16000}")
     text = "document.getElementById('delay').textContent"
-    audible.wait_for(f"{text}.startsWith('sound delay') || {IS_BEHIND}")  # a busy machine
-    audible.wait_for(f"{STATE}.playoutDelayMs > {LOOK_AHEAD_MS - 20}")
+    talking_page.wait_for(f"{text}.startsWith('sound delay') || {IS_BEHIND}")  # a busy machine
+    talking_page.wait_for(f"{STATE}.playoutDelayMs > {LOOK_AHEAD_MS - 20}")
 
 
-def test_senders_are_started_delayed_to_match_the_sound_and_stopped(audible: Browser) -> None:
-    page = audible
+def test_senders_are_started_delayed_to_match_the_sound_and_stopped(talking_page: Browser) -> None:
+    page = talking_page
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
         program.bind(("127.0.0.1", 0))
         url = f"osc://127.0.0.1:{program.getsockname()[1]}"
@@ -278,9 +278,9 @@ def test_senders_are_started_delayed_to_match_the_sound_and_stopped(audible: Bro
 
 
 def test_sound_keeps_to_its_picture_while_the_page_is_hidden(
-    control: PageControl, audible: Browser
+    control: PageControl, talking_page: Browser
 ) -> None:
-    page = audible
+    page = talking_page
     page.wait_for(f"{STATE}.soundMinusImageMs !== null")
     before_ms = page.evaluate(f"{STATE}.playoutDelayMs")  # a busy page waits for longer
     page.evaluate(
@@ -295,9 +295,9 @@ def test_sound_keeps_to_its_picture_while_the_page_is_hidden(
 
 
 def test_reports_a_face_that_is_behind_and_draws_fewer_pictures(
-    control: PageControl, audible: Browser
+    control: PageControl, talking_page: Browser
 ) -> None:
-    page = audible
+    page = talking_page
     control.look_ahead_ms = LOOK_AHEAD_MS + 2010
     page.wait_for(f"{IS_BEHIND} && {STATE}.lateMs > 1500")
     status = page.evaluate("document.getElementById('status').textContent")
@@ -329,12 +329,12 @@ def test_the_microphone_reaches_the_recognizer(
 def test_a_microphone_can_be_turned_off_while_it_starts(
     control: PageControl, session: Session, page: Browser
 ) -> None:
-    page.complaints.clear()
+    page.page_errors.clear()
     page.evaluate("for (let i = 0; i < 2; i++) document.getElementById('microphone').click()")
     name = turn_on_microphone(control, page)
     turn_off_microphone(page)
     wait_until(lambda: control.has_ended(name))
-    assert not [text for text in page.complaints if "exceptionDetails" in text]
+    assert not [text for text in page.page_errors if "exceptionDetails" in text]
 
 
 def choose(page: Browser, name: str, value: object) -> None:
@@ -345,12 +345,14 @@ def choose(page: Browser, name: str, value: object) -> None:
     )
 
 
-def changes(control: PageControl) -> list[tuple[str, FaceSettings]]:
-    return [(message.session, message.face) for message in control.of(SetFace)]
+def face_changes(control: PageControl) -> list[tuple[str, FaceSettings]]:
+    return [(message.session, message.face) for message in control.messages_of(SetFace)]
 
 
-def amounts(control: PageControl) -> list[tuple[str, float]]:
-    return [(name, face.expressiveness) for name, face in changes(control) if face.expressiveness]
+def slider_amounts(control: PageControl) -> list[tuple[str, float]]:
+    return [
+        (name, face.expressiveness) for name, face in face_changes(control) if face.expressiveness
+    ]
 
 
 def test_settings_apply_at_once_and_to_later_sessions(
@@ -361,12 +363,12 @@ def test_settings_apply_at_once_and_to_later_sessions(
     page.wait_for(f"{STATE}.lips === 'dynamic-visemes'")
     choose(page, "lips", "ferguson")
     page.wait_for(f"{STATE}.lips === 'ferguson'")
-    assert control.of(OpenSession)[-1].language == "zh"
+    assert control.messages_of(OpenSession)[-1].language == "zh"
     choose(page, "expressiveness", 0.7)
-    wait_until(lambda: len(amounts(control)) == 1)
+    wait_until(lambda: len(slider_amounts(control)) == 1)
     page.click("open-settings")
     page.click("expressions [value=surprise]")
-    wait_until(lambda: changes(control)[-1][1].expressions == {"surprise": 0.8})
+    wait_until(lambda: face_changes(control)[-1][1].expressions == {"surprise": 0.8})
     page.evaluate("document.getElementById('settings').hidePopover()")
     turn_off_microphone(page)
 
@@ -374,16 +376,16 @@ def test_settings_apply_at_once_and_to_later_sessions(
     assert page.evaluate("document.getElementById('lips').value") == "ferguson"
     second = turn_on_microphone(control, page)
     page.wait_for(f"{STATE}.lips === 'ferguson'")
-    wait_until(lambda: len(amounts(control)) == 2)
+    wait_until(lambda: len(slider_amounts(control)) == 2)
     choose(page, "lips", "learned")
     page.wait_for(f"{STATE}.lips === 'learned'")
     turn_off_microphone(page)
-    assert [(name, face.lip_model) for name, face in changes(control) if face.lip_model] == [
+    assert [(name, face.lip_model) for name, face in face_changes(control) if face.lip_model] == [
         (first, "ferguson"),
         (second, "ferguson"),
         (second, "learned"),
     ]
-    assert amounts(control) == [(first, 0.7), (second, 0.7)]
+    assert slider_amounts(control) == [(first, 0.7), (second, 0.7)]
 
 
 def test_another_head_is_shown(control: PageControl, session: Session, page: Browser) -> None:

@@ -14,7 +14,7 @@ from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
 from tests.browser import Browser
 from tests.documents import code_blocks
-from tests.e2e.following import Stream, stream
+from tests.e2e.streaming import Stream, stream
 from tests.system import CHEAP, DEMO, ROOT, System, samples_of_file, wait_until
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import av
 import pytest
 
-from tests.e2e.conftest import Command
+from tests.e2e.conftest import CommandRunner
 from tests.system import (
     CHEAP,
     LIMIT_S,
@@ -61,7 +61,7 @@ def test_the_demo_writes_a_video_and_stops(tmp_path: Path) -> None:
 
 
 def test_runs_on_free_ports_until_it_is_interrupted(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: CommandRunner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     environment = {"XDG_RUNTIME_DIR": str(tmp_path), **CHEAP}
     options = ["--set", "driver.view=none", "--set", f"driver.out={tmp_path}", "--no-browser"]
@@ -83,8 +83,8 @@ def test_runs_on_free_ports_until_it_is_interrupted(
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert "kouxing" in answer.read().decode()
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-        status, _, said = command("speak", SENTENCE)
-        assert status == 0, said
+        status, _, stderr = command("speak", SENTENCE)
+        assert status == 0, stderr
         _, shown, _ = command("status")
         assert (len(re.findall("recognizer-", shown)), len(re.findall("driver-", shown))) == (2, 1)
         running.send_signal(signal.SIGINT)
@@ -114,7 +114,7 @@ def test_reports_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     ],
 )
 def test_reports_a_mistake_before_anything_starts(
-    command: Command, arguments: list[str], word: str
+    command: CommandRunner, arguments: list[str], word: str
 ) -> None:
     status, _, log = command("run", *arguments)
     assert (status, log.startswith("kouxing: ")) == (2, True), log

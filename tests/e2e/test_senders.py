@@ -44,16 +44,16 @@ def reports() -> list[tuple[str, str]]:
 
 @pytest.fixture
 def senders(reports: list[tuple[str, str]]) -> Iterator[Senders]:
-    with contextlib.closing(Senders(0, lambda *report: reports.append(report))) as made:
-        yield made
+    with contextlib.closing(Senders(0, lambda *report: reports.append(report))) as new_senders:
+        yield new_senders
 
 
 @pytest.fixture
 def receiver() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
-        made.bind(("127.0.0.1", 0))
-        made.settimeout(LIMIT_S)
-        yield made
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp_socket:
+        udp_socket.bind(("127.0.0.1", 0))
+        udp_socket.settimeout(LIMIT_S)
+        yield udp_socket
 
 
 def free_port() -> int:
@@ -62,7 +62,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def problem(senders: Senders, url: str) -> str:
+def problem_of(senders: Senders, url: str) -> str:
     return next(state.problem for state in senders.states() if state.target == url)
 
 
@@ -94,15 +94,15 @@ def test_reports_a_missing_receiver_and_finds_it_later(
 ) -> None:
     port = free_port()
     missing = f"osc://127.0.0.1:{port}"
-    there = f"osc://127.0.0.1:{receiver.getsockname()[1]}"
+    receiver_url = f"osc://127.0.0.1:{receiver.getsockname()[1]}"
     senders.start(parse_target(missing))
-    senders.start(parse_target(there))
-    wait_until(lambda: "no program listens" in problem(senders, missing))
+    senders.start(parse_target(receiver_url))
+    wait_until(lambda: "no program listens" in problem_of(senders, missing))
     assert receiver.recv(2000)  # other targets are not affected
-    assert problem(senders, there) == ""
+    assert problem_of(senders, receiver_url) == ""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:
         late.bind(("127.0.0.1", port))
-        wait_until(lambda: not problem(senders, missing))
+        wait_until(lambda: not problem_of(senders, missing))
         late.settimeout(LIMIT_S)
         assert late.recv(2000)
     wait_until(lambda: len(reports) >= 2)
@@ -117,7 +117,7 @@ def test_an_unknown_host_does_not_delay_other_targets(
     senders.start(parse_target(lost))
     senders.start(parse_target(f"livelink://127.0.0.1:{receiver.getsockname()[1]}"))
     assert receiver.recv(2000)
-    wait_until(lambda: "cannot reach nowhere.invalid" in problem(senders, lost))
+    wait_until(lambda: "cannot reach nowhere.invalid" in problem_of(senders, lost))
 
 
 def test_starts_and_stops_senders(senders: Senders, receiver: socket.socket) -> None:
@@ -153,7 +153,7 @@ def test_media_time_continues_at_rest(senders: Senders, receiver: socket.socket)
     assert all(0 < step_s < LIMIT_S for step_s in np.diff(rest_s))
 
 
-def test_vtube_studio_asks_once(senders: Senders) -> None:
+def test_the_permission_of_vtube_studio_is_requested_once(senders: Senders) -> None:
     with VTubeStudioStub() as stub:
         url = f"vts://127.0.0.1:{stub.port}"
         senders.start(parse_target(url))
@@ -165,11 +165,11 @@ def test_vtube_studio_asks_once(senders: Senders) -> None:
         senders.show(0.0, OPEN_MOUTH)
         wait_until(lambda: stub.frames[-1]["MouthOpen"] > 0.9)
         port = stub.port
-    wait_until(lambda: "start it" in problem(senders, url))
+    wait_until(lambda: "start it" in problem_of(senders, url))
     with VTubeStudioStub(port, token="a-token") as stub:  # restarted; it accepts the token
         wait_until(lambda: bool(stub.frames))
         assert stub.requests == ["AuthenticationRequest", "InputParameterListRequest"]
-        assert problem(senders, url) == ""
+        assert problem_of(senders, url) == ""
 
 
 def test_a_sender_can_be_stopped_while_its_connection_ends(
@@ -193,7 +193,9 @@ def test_a_sender_can_be_stopped_while_its_connection_ends(
     senders.close()
 
 
-def test_does_not_ask_again_after_denial(senders: Senders, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vtube_studio_is_not_asked_again_after_a_denial(
+    senders: Senders, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run, has_ended = VTubeStudioConnection.run, threading.Event()
 
     async def run_to_its_end(self: VTubeStudioConnection) -> None:
@@ -205,7 +207,7 @@ def test_does_not_ask_again_after_denial(senders: Senders, monkeypatch: pytest.M
         url = f"vts://127.0.0.1:{stub.port}"
         senders.start(parse_target(url))
         assert has_ended.wait(LIMIT_S)
-        assert "denied" in problem(senders, url)
+        assert "denied" in problem_of(senders, url)
         assert stub.requests == ["AuthenticationTokenRequest"]
 
 

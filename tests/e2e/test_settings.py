@@ -20,7 +20,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.config import variable
-from tests.e2e.following import Stream, stream
+from tests.e2e.streaming import Stream, stream
 from tests.system import LIMIT_S, VOWELS_FILE, System, samples_of_file, wait_until
 
 FACE = SynthesizerConfig(

@@ -1,6 +1,6 @@
 """Software GL draws the stored pictures, up to a tolerance.
 
-A change of looks that is meant: run with ``WRITE_GOLDEN=1`` and look at the pictures.
+After an intended change of looks, run with ``WRITE_GOLDEN=1`` and look at the pictures.
 """
 
 import os

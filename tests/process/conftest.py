@@ -6,26 +6,26 @@ import pytest
 
 from kouxing.shared.bus import Bus
 from kouxing.shared.sockets import Socket
-from tests.control_stage import Stage
+from tests.control_harness import ControlHarness
 from tests.fake_control import FakeControl
 
 
 @pytest.fixture
 def control() -> Iterator[FakeControl]:
-    with FakeControl() as made:
-        yield made
+    with FakeControl() as new_control:
+        yield new_control
 
 
 @pytest.fixture
-def stage() -> Iterator[Stage]:
+def harness() -> Iterator[ControlHarness]:
     """Control without keys."""
-    made = Stage(insecure=True)
-    yield made
-    made.close()
+    new_harness = ControlHarness(insecure=True)
+    yield new_harness
+    new_harness.close()
 
 
 @pytest.fixture
-def client(stage: Stage) -> Iterator[Socket]:
+def client(harness: ControlHarness) -> Iterator[Socket]:
     """Provide a socket at that control."""
     with Bus() as bus:
-        yield bus.connect_dealer(stage.control.endpoints["commands"])
+        yield bus.connect_dealer(harness.control.endpoints["commands"])

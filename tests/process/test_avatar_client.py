@@ -16,7 +16,7 @@ CLIENT = ROOT / "clients" / "javascript"
 ARKIT = ["jawOpen", "mouthPucker", "eyeBlinkLeft", "eyeBlinkRight"]
 VRCHAT = [f"vrc.v_{viseme}" for viseme in ("sil", "pp", "aa", "ih", "oh", "ou")]
 VOWELS = ["A", "I", "U", "E", "O"]
-TURNS: dict[str, dict[str, list[float]]] = {
+ROTATIONS: dict[str, dict[str, list[float]]] = {
     "z up": {"rotation": [2**-0.5, 0, 0, 2**-0.5]},
     "upside down": {"rotation": [0, 0, 1, 0]},
     "oblique": {"rotation": [0, np.sin(0.3), 0, np.cos(0.3)]},
@@ -113,8 +113,10 @@ def change(path: Path, kind: str) -> None:
         kind = "turned"
     document, binary = read_chunks(path)
     nodes = document["scenes"][0]["nodes"]
-    if kind in TURNS:
-        turn = TURNS[kind] | {"scale": [100 * x for x in TURNS[kind].get("scale", (1, 1, 1))]}
+    if kind in ROTATIONS:
+        turn = ROTATIONS[kind] | {
+            "scale": [100 * x for x in ROTATIONS[kind].get("scale", (1, 1, 1))]
+        }
         document["nodes"].append(turn | {"children": nodes})
         document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
     elif kind == "no effect":
@@ -177,7 +179,7 @@ FILES: dict[str, tuple[list[Mesh], str]] = {
     "primitives": (face(ARKIT), "primitives"),
     "vrchat": (face(VRCHAT), ""),
     "vowels": (face(VOWELS), ""),
-    **{kind: (face(ARKIT), kind) for kind in TURNS},
+    **{kind: (face(ARKIT), kind) for kind in ROTATIONS},
     "vrm": (face(VOWELS), "empty expressions"),
     "large head": ([box("Head", (0, 0.7, 0), 0.6, VOWELS)], "expressions"),
     "chibi": ([chibi()], ""),
@@ -197,7 +199,7 @@ FILES: dict[str, tuple[list[Mesh], str]] = {
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("client")
     for file in CLIENT.glob("*.js"):
         shutil.copy(file, folder)
@@ -226,16 +228,18 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]
         ("vowels", "vrm"),
     ],
 )
-def test_frames_the_head_and_not_an_eye(
-    found: dict[str, dict[str, Any]], name: str, shapes: str
+def test_the_camera_frames_the_head_and_not_an_eye(
+    results: dict[str, dict[str, Any]], name: str, shapes: str
 ) -> None:
-    assert found[name]["set"] == shapes
-    assert found[name]["target"] == pytest.approx([0, 1.65, 0], abs=0.01)
-    assert found[name]["height"] == pytest.approx(0.48, abs=0.05)
+    assert results[name]["set"] == shapes
+    assert results[name]["target"] == pytest.approx([0, 1.65, 0], abs=0.01)
+    assert results[name]["height"] == pytest.approx(0.48, abs=0.05)
 
 
-def test_frames_the_large_head_of_a_small_figure(found: dict[str, dict[str, Any]]) -> None:
-    vrm, chibi = found["large head"], found["chibi"]
+def test_the_camera_frames_the_large_head_of_a_small_figure(
+    results: dict[str, dict[str, Any]],
+) -> None:
+    vrm, chibi = results["large head"], results["chibi"]
     assert vrm["set"] == "vrm"
     assert vrm["target"] == pytest.approx([0, 70, 0], abs=1)  # it is in centimeters
     assert vrm["height"] == pytest.approx(1.6 * 90, abs=1)  # with the moved chin
@@ -244,36 +248,36 @@ def test_frames_the_large_head_of_a_small_figure(found: dict[str, dict[str, Any]
 
 
 def test_the_jaw_bone_turns_only_for_parts_without_shapes(
-    found: dict[str, dict[str, Any]],
+    results: dict[str, dict[str, Any]],
 ) -> None:
-    assert found["teeth"]["jaw"] == pytest.approx(0.3, abs=0.01)
-    assert found["chin"]["jaw"] == 0
+    assert results["teeth"]["jaw"] == pytest.approx(0.3, abs=0.01)
+    assert results["chin"]["jaw"] == 0
     for name in ("teeth", "turned teeth"):  # far above the bone, so they move forward
-        assert found[name]["forward"] > 0.1
+        assert results[name]["forward"] > 0.1
 
 
-def test_frames_the_head_if_only_the_mouth_of_a_body_moves(
-    found: dict[str, dict[str, Any]],
+def test_the_camera_frames_the_head_if_only_the_mouth_of_a_body_moves(
+    results: dict[str, dict[str, Any]],
 ) -> None:
-    assert found["body"]["target"][:2] == pytest.approx([0, 1.65], abs=0.01)
-    assert found["body"]["height"] == pytest.approx(0.35, abs=0.01)  # above 1.55 m
+    assert results["body"]["target"][:2] == pytest.approx([0, 1.65], abs=0.01)
+    assert results["body"]["height"] == pytest.approx(0.35, abs=0.01)  # above 1.55 m
 
 
-@pytest.mark.parametrize("kind", TURNS)
-def test_turns_a_face_upright(found: dict[str, dict[str, Any]], kind: str) -> None:
-    assert found[kind]["eyes"] == pytest.approx([0, 5, 9], abs=1)
+@pytest.mark.parametrize("kind", ROTATIONS)
+def test_a_face_is_turned_upright(results: dict[str, dict[str, Any]], kind: str) -> None:
+    assert results[kind]["eyes"] == pytest.approx([0, 5, 9], abs=1)
 
 
 def test_a_vrm_speaks_by_morph_targets_if_its_expressions_move_nothing(
-    found: dict[str, dict[str, Any]],
+    results: dict[str, dict[str, Any]],
 ) -> None:
-    assert found["vrm"]["set"] == "vrm"
-    assert found["vrm"]["opening"] == 1
-    assert found["vrm"]["height"] == pytest.approx(48.0)  # in centimeters
+    assert results["vrm"]["set"] == "vrm"
+    assert results["vrm"]["opening"] == 1
+    assert results["vrm"]["height"] == pytest.approx(48.0)  # in centimeters
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "error_text"),
     [
         ("unnamed", CANNOT),
         ("no face", CANNOT),
@@ -285,7 +289,7 @@ def test_a_vrm_speaks_by_morph_targets_if_its_expressions_move_nothing(
         ("draco", "it needs KHR_draco_mesh_compression, which kouxing does not support"),
     ],
 )
-def test_says_why_an_avatar_cannot_be_shown(
-    found: dict[str, dict[str, Any]], name: str, said: str
+def test_the_error_says_why_an_avatar_cannot_be_shown(
+    results: dict[str, dict[str, Any]], name: str, error_text: str
 ) -> None:
-    assert said in found[name]["error"]
+    assert error_text in results[name]["error"]

@@ -70,7 +70,7 @@ def ask(gateway: Gateway, request: bytes) -> str:
         (b"\xff\x00" * 5000, b"", 400),
     ],
 )
-def test_answers_bad_requests_without_a_version(
+def test_answers_to_bad_requests_have_no_version(
     gateway: Gateway, start: bytes, rest: bytes, status: int
 ) -> None:
     head = ask(gateway, start + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n" + rest)
@@ -81,7 +81,7 @@ def test_answers_bad_requests_without_a_version(
 
 
 @pytest.mark.parametrize("length", [b"Content-Length: 99999999", b"Transfer-Encoding: chunked"])
-def test_closes_without_reading_a_refused_body(gateway: Gateway, length: bytes) -> None:
+def test_a_refused_body_is_not_read(gateway: Gateway, length: bytes) -> None:
     request = b"POST /sound HTTP/1.1\r\nHost: 127.0.0.1\r\n" + length + b"\r\n\r\n"
     with socket.create_connection(("127.0.0.1", port_of(gateway.page)), LIMIT_S) as client:
         client.sendall(request)

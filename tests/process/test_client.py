@@ -36,8 +36,8 @@ CHUNK = bytes(3200)  # 100 ms
 
 @pytest.fixture
 def client(control: FakeControl) -> Iterator[Client]:
-    with Client(control.address, insecure=True) as made:
-        yield made
+    with Client(control.address, insecure=True) as new_client:
+        yield new_client
 
 
 def frame(sequence: int) -> face.FapFrame:
@@ -58,7 +58,9 @@ PHONE = speech.Phone(
 END = face.EndOfFaps(session="s", epoch=1, sequence=9)
 
 
-def test_finds_the_key_that_commands_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_client_finds_the_key_that_commands_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     key = user_key()
     assert find_key() == type(find_key())(key.public, key.secret, key.control)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
@@ -76,7 +78,7 @@ def test_finds_the_key_that_commands_use(tmp_path: Path, monkeypatch: pytest.Mon
         Client()
 
 
-def test_streams_audio_and_receives_results(control: FakeControl, client: Client) -> None:
+def test_a_session_streams_audio_and_receives_results(control: FakeControl, client: Client) -> None:
     with client.open_session("s", sample_rate_hz=48000, num_channels=2) as session:
         results = session.results(FapFrame, Phone, Shapes, shapes="vrm")
         session.push(bytes(1))
@@ -103,12 +105,14 @@ def test_streams_audio_and_receives_results(control: FakeControl, client: Client
         session.push(CHUNK)
 
 
-def test_reports_refusals_of_requests_and_of_audio(control: FakeControl, client: Client) -> None:
+def test_refusals_of_requests_and_of_audio_are_reported(
+    control: FakeControl, client: Client
+) -> None:
     session = client.open_session("s")
     session.push(CHUNK)
     wait_until(lambda: control.audio_messages)
     error = Error(session="s", code="bad-audio", text="x")
-    control.do(lambda: control.audio.send(error, to=control.audio_sender))
+    control.run_job(lambda: control.audio.send(error, to=control.audio_sender))
     wait_until(lambda: session._core.errors)
     with pytest.raises(Refused, match="bad-audio: x"):
         session.push(CHUNK)

@@ -12,37 +12,37 @@ from kouxing.shared.keys import load_key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import Error, StatusReport, StatusRequest
-from tests.control_stage import Stage
+from tests.control_harness import ControlHarness
 
 
-def ask(stage: Stage, client: Socket, **fields: object) -> StatusReport | Error:
+def ask(harness: ControlHarness, client: Socket, **fields: object) -> StatusReport | Error:
     """Return the answer to a status request."""
     request = secrets.token_hex(4)  # control repeats the answer to a known request
     client.send(StatusRequest(request=request, **fields))  # type: ignore[arg-type]
-    while not isinstance(answer := stage.receive(client)[-1], StatusReport | Error):
+    while not isinstance(answer := harness.receive(client)[-1], StatusReport | Error):
         pass
     return answer
 
 
-def open_sessions(stage: Stage, number: int) -> list[str]:
+def open_sessions(harness: ControlHarness, number: int) -> list[str]:
     names = [f"s{item}" for item in range(number)]
-    raw = stage.connect_client(None)
+    raw = harness.connect_client(None)
     for name in names:
-        stage.open(raw, name, request=name)
+        harness.open(raw, name, request=name)
     return names
 
 
 def test_pages_contain_everything_once(
-    stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
+    harness: ControlHarness, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = open_sessions(stage, 5)
-    whole = ask(stage, client)
+    names = open_sessions(harness, 5)
+    whole = ask(harness, client)
     assert isinstance(whole, StatusReport)
     assert whole.next is None
     monkeypatch.setattr(control_status, "PAGE_BYTES", 700)
     services, sessions, after, num_pages = [], [], 0, 0
     while True:
-        page = ask(stage, client, after=after)
+        page = ask(harness, client, after=after)
         assert isinstance(page, StatusReport)
         services += [state.instance for state in page.services]
         sessions += [state.session for state in page.sessions]
@@ -56,20 +56,20 @@ def test_pages_contain_everything_once(
     assert sessions == names == [state.session for state in whole.sessions]
 
 
-def test_reports_one_session_and_its_services(stage: Stage, client: Socket) -> None:
-    open_sessions(stage, 3)
-    report = ask(stage, client, session="s1")
+def test_reports_one_session_and_its_services(harness: ControlHarness, client: Socket) -> None:
+    open_sessions(harness, 3)
+    report = ask(harness, client, session="s1")
     assert isinstance(report, StatusReport)
     assert [state.session for state in report.sessions] == ["s1"]
     assert {state.instance for state in report.services} == {"recognizer", "synthesizer"}
-    stage.control._requests.defers = False
-    assert getattr(ask(stage, client, session="none"), "code", "") == "unknown-session"
+    harness.control._requests.defers = False
+    assert getattr(ask(harness, client, session="none"), "code", "") == "unknown-session"
 
 
 @pytest.mark.usefixtures("new_keys")
 def test_only_clients_and_services_see_the_token_of_the_web_page() -> None:
     page = "https://face.example:8080/"
-    beat = Heartbeat(
+    make_heartbeat = Heartbeat(
         service="gateway",
         instance="gateway",
         role="observer",
@@ -78,13 +78,16 @@ def test_only_clients_and_services_see_the_token_of_the_web_page() -> None:
         endpoints={"page": f"{page}#token=secret"},
     )
     told: dict[str, str] = {}
-    with contextlib.closing(Stage(insecure=False)) as stage, contextlib.ExitStack() as buses:
+    with (
+        contextlib.closing(ControlHarness(insecure=False)) as harness,
+        contextlib.ExitStack() as buses,
+    ):
         for role in ("service:gateway", "client", "subscriber:*", "subscriber:s", "operator"):
             bus = buses.enter_context(Bus(load_key(f"key-{len(told)}", (role,))))
-            asker = bus.connect_dealer(stage.control.endpoints["commands"])
+            asker = bus.connect_dealer(harness.control.endpoints["commands"])
             if role.startswith("service"):
-                asker.send(beat)
-            report = ask(stage, asker)
+                asker.send(make_heartbeat)
+            report = ask(harness, asker)
             assert isinstance(report, StatusReport)
             endpoints = {state.service: state.endpoints for state in report.services}
             told[role] = endpoints["gateway"]["page"].removeprefix(page)

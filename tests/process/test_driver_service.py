@@ -22,7 +22,7 @@ from tests.samples import fap_frame
 from tests.system import wait_until
 
 
-class Stage:
+class DriverHarness:
     """A driver without a window, which this thread runs."""
 
     def __init__(self, folder: Path, control: FakeControl) -> None:
@@ -52,9 +52,9 @@ class Stage:
         wait_until(condition, step=lambda: self.driver.step(0.005))
 
     def start(self, session: str, *, epoch: int = 1, record: bool = False) -> None:
-        num_started = len(self.control.of(SessionStarted))
+        num_started = len(self.control.messages_of(SessionStarted))
         self.control.send_start(session, epoch=epoch, record=record)
-        self.step_until(lambda: len(self.control.of(SessionStarted)) > num_started)
+        self.step_until(lambda: len(self.control.messages_of(SessionStarted)) > num_started)
 
     def unfinished(self) -> list[Path]:
         return list(self.folder.glob(".*.part"))
@@ -69,7 +69,7 @@ class Stage:
         self.control.publish(self.control.faps, EndOfFaps(session=session, epoch=epoch))
 
     def events(self, name: str) -> list[Event]:
-        return [event for event in self.control.of(Event) if event.name == name]
+        return [event for event in self.control.messages_of(Event) if event.name == name]
 
     def has_recorded(self, num_videos: int) -> bool:
         return len(self.events("recorded")) == num_videos
@@ -90,98 +90,98 @@ class Stage:
 
 
 @pytest.fixture
-def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
+def harness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DriverHarness]:
     monkeypatch.setattr(follower, "CATCH_UP_S", 0.0)  # no frame is too old on a busy machine
     with FakeControl() as control:
-        stage = Stage(tmp_path, control)
-        yield stage
-        stage.driver.on_shutdown()
-        stage.driver.bus.close()
+        harness = DriverHarness(tmp_path, control)
+        yield harness
+        harness.driver.on_shutdown()
+        harness.driver.bus.close()
     for recorder in multiprocessing.active_children():  # it may still be ending
         recorder.join()
 
 
 def test_shows_one_session_while_recording_another(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
+    harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(poses, "FADE_S", 1e-9)  # on a quick machine, the face would fade in
     monkeypatch.setattr(poses, "STALL_S", 60.0)  # on a busy one, it would fade out
-    stage.start("filmed", record=True)
-    stage.start("other")
-    seen = set()
+    harness.start("filmed", record=True)
+    harness.start("other")
+    values = set()
     for number in range(51):  # simultaneous frames
-        stage.publish("filmed", number, 100.0)
-        stage.publish("other", number, 200.0)
+        harness.publish("filmed", number, 100.0)
+        harness.publish("other", number, 200.0)
         if number % 10 == 9:
-            stage.wait_for_frames(2 * (number + 1))
-            seen.add(stage.shown())
-    assert seen == {200.0}
+            harness.wait_for_frames(2 * (number + 1))
+            values.add(harness.shown())
+    assert values == {200.0}
 
-    stage.driver.poses.switch(1)
-    assert stage.shown() == 100.0
-    stage.driver.poses.switch(1)
-    stage.end("filmed")
-    stage.control.stop_session("filmed")
-    stage.step_until(lambda: stage.events("recorded"))
-    (recorded,) = stage.events("recorded")
+    harness.driver.poses.switch(1)
+    assert harness.shown() == 100.0
+    harness.driver.poses.switch(1)
+    harness.end("filmed")
+    harness.control.stop_session("filmed")
+    harness.step_until(lambda: harness.events("recorded"))
+    (recorded,) = harness.events("recorded")
     assert recorded.session == "filmed"
-    assert stage.num_images() == 26  # of 0 to 1 s at 25 Hz
+    assert harness.num_images() == 26  # of 0 to 1 s at 25 Hz
     assert Path(recorded.detail).is_file()
-    stage.step_until(lambda: stage.driver.session_inputs() == {"other": SessionInput()})
-    assert stage.events("error") == []
+    harness.step_until(lambda: harness.driver.session_inputs() == {"other": SessionInput()})
+    assert harness.events("error") == []
 
 
-def test_a_video_continues_after_a_restart(stage: Stage) -> None:
+def test_a_video_continues_after_a_restart(harness: DriverHarness) -> None:
     for epoch, numbers in ((1, range(26)), (2, range(26, 51))):
-        stage.start("film", epoch=epoch, record=True)
+        harness.start("film", epoch=epoch, record=True)
         for number in numbers:
-            stage.publish("film", number, 100.0, epoch)
-        stage.wait_for_frames(numbers.stop)
-    stage.end("film", epoch=2)
-    stage.step_until(lambda: stage.events("recorded"))
-    assert stage.num_images() == 26
+            harness.publish("film", number, 100.0, epoch)
+        harness.wait_for_frames(numbers.stop)
+    harness.end("film", epoch=2)
+    harness.step_until(lambda: harness.events("recorded"))
+    assert harness.num_images() == 26
 
 
-def test_a_reused_session_name_does_not_overwrite_a_video(stage: Stage) -> None:
+def test_a_reused_session_name_does_not_overwrite_a_video(harness: DriverHarness) -> None:
     for epoch in (1, 2, 3):
-        stage.start("film", epoch=epoch, record=True)
-        stage.publish("film", 0, 100.0, epoch)
-        stage.wait_for_frames(epoch)
-        stage.end("film", epoch)
-        stage.control.stop_session("film")
-        stage.step_until(partial(stage.has_recorded, epoch))
-    paths = [Path(recorded.detail) for recorded in stage.events("recorded")]
+        harness.start("film", epoch=epoch, record=True)
+        harness.publish("film", 0, 100.0, epoch)
+        harness.wait_for_frames(epoch)
+        harness.end("film", epoch)
+        harness.control.stop_session("film")
+        harness.step_until(partial(harness.has_recorded, epoch))
+    paths = [Path(recorded.detail) for recorded in harness.events("recorded")]
     assert [path.name for path in paths] == ["film.mp4", "film-2.mp4", "film-3.mp4"]
     assert all(path.stat().st_size > 0 for path in paths)
 
 
-def test_reports_an_unwritable_video_to_control(tmp_path: Path, stage: Stage) -> None:
+def test_reports_an_unwritable_video_to_control(tmp_path: Path, harness: DriverHarness) -> None:
     (tmp_path / "film.mp4").mkdir()
-    stage.start("film", record=True)
-    stage.publish("film", 0, 100.0)
-    stage.wait_for_frames(1)
-    stage.end("film")
-    stage.step_until(lambda: stage.events("error"))
-    assert stage.events("error")[0].detail.startswith("no-video: ")
+    harness.start("film", record=True)
+    harness.publish("film", 0, 100.0)
+    harness.wait_for_frames(1)
+    harness.end("film")
+    harness.step_until(lambda: harness.events("error"))
+    assert harness.events("error")[0].detail.startswith("no-video: ")
 
 
-def test_refuses_more_videos_than_the_limit(stage: Stage) -> None:
+def test_refuses_more_videos_than_the_limit(harness: DriverHarness) -> None:
     for number in range(4):
-        stage.start(f"film-{number}", record=True)
-    stage.control.send_start("one-more", record=True)
-    stage.step_until(lambda: stage.control.of(Error))
-    (refusal,) = stage.control.of(Error)
+        harness.start(f"film-{number}", record=True)
+    harness.control.send_start("one-more", record=True)
+    harness.step_until(lambda: harness.control.messages_of(Error))
+    (refusal,) = harness.control.messages_of(Error)
     assert (refusal.session, refusal.request) == ("one-more", "start-one-more-1")
     assert refusal.code == "busy"
     assert "max_videos" in refusal.text
-    stage.start("unrecorded")
-    stage.end("film-0")
-    stage.step_until(lambda: len(stage.events("recorded")) == 1)
-    stage.start("one-more", record=True)
+    harness.start("unrecorded")
+    harness.end("film-0")
+    harness.step_until(lambda: len(harness.events("recorded")) == 1)
+    harness.start("one-more", record=True)
 
 
-def test_limits_the_videos_of_one_key(stage: Stage) -> None:
-    videos = stage.driver.recordings
+def test_limits_the_videos_of_one_key(harness: DriverHarness) -> None:
+    videos = harness.driver.recordings
     for number in range(3):
         assert videos.rejection_reason("greedy") == ""
         videos.begin(f"film-{number}", "greedy")
@@ -189,48 +189,48 @@ def test_limits_the_videos_of_one_key(stage: Stage) -> None:
     assert videos.rejection_reason("other") == ""
 
 
-def test_a_killed_recorder_fails_its_videos_and_leaves_no_file(stage: Stage) -> None:
-    stage.start("film", record=True)
-    stage.publish("film", 0, 100.0)
-    stage.step_until(stage.unfinished)
-    recorder = stage.driver.recordings._recorder
+def test_a_killed_recorder_fails_its_videos_and_leaves_no_file(harness: DriverHarness) -> None:
+    harness.start("film", record=True)
+    harness.publish("film", 0, 100.0)
+    harness.step_until(harness.unfinished)
+    recorder = harness.driver.recordings._recorder
     assert recorder is not None
     recorder.process.kill()
-    stage.step_until(lambda: stage.events("error"))
-    assert stage.events("error")[0].detail.startswith("no-video: ")
-    assert stage.unfinished() == []
-    stage.start("next", record=True)
-    stage.publish("next", 0, 100.0)
-    stage.end("next")
-    stage.step_until(partial(stage.has_recorded, 1))
+    harness.step_until(lambda: harness.events("error"))
+    assert harness.events("error")[0].detail.startswith("no-video: ")
+    assert harness.unfinished() == []
+    harness.start("next", record=True)
+    harness.publish("next", 0, 100.0)
+    harness.end("next")
+    harness.step_until(partial(harness.has_recorded, 1))
 
 
 def test_the_recorder_ends_when_there_is_no_video(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
+    harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recordings, "IDLE_S", 0.0)
-    stage.start("film", record=True)
-    stage.publish("film", 0, 100.0)
-    stage.end("film")
-    stage.step_until(partial(stage.has_recorded, 1))
-    stage.step_until(lambda: not multiprocessing.active_children())
+    harness.start("film", record=True)
+    harness.publish("film", 0, 100.0)
+    harness.end("film")
+    harness.step_until(partial(harness.has_recorded, 1))
+    harness.step_until(lambda: not multiprocessing.active_children())
 
 
 def test_a_stopping_driver_saves_the_finished_part_of_a_video(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
+    harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recordings, "CLOSE_LIMIT_S", 60.0)
-    stage.start("film", record=True)
+    harness.start("film", record=True)
     for number in range(26):
-        stage.publish("film", number, 100.0)
-    stage.step_until(lambda: stage.driver.metrics.counts["video_ms"])
-    stage.driver.on_shutdown()
-    assert [path.name for path in stage.folder.iterdir()] == ["film.mp4"]
+        harness.publish("film", number, 100.0)
+    harness.step_until(lambda: harness.driver.metrics.counts["video_ms"])
+    harness.driver.on_shutdown()
+    assert [path.name for path in harness.folder.iterdir()] == ["film.mp4"]
 
 
-def test_follows_only_sessions_that_it_shows_or_records(stage: Stage) -> None:
-    stage.is_live = False
-    stage.start("heard")
-    assert not stage.driver.session_inputs()
-    stage.start("filmed", record=True)
-    assert [*stage.driver.session_inputs()] == ["filmed"]
+def test_follows_only_sessions_that_it_shows_or_records(harness: DriverHarness) -> None:
+    harness.is_live = False
+    harness.start("heard")
+    assert not harness.driver.session_inputs()
+    harness.start("filmed", record=True)
+    assert [*harness.driver.session_inputs()] == ["filmed"]

@@ -26,15 +26,15 @@ from tests.fake_control import EPOCH, FakeControl
 from tests.process.web_clients import (
     FACE,
     async_test,
-    connected,
+    open_websockets,
     publish_all,
     publish_phone,
     receive_binary,
     receive_json,
-    receive_of_session,
-    until,
+    receive_session_message,
+    wait_until_async,
 )
-from tests.raw_bytes import pour
+from tests.raw_bytes import flood
 from tests.samples import fap_frame
 from tests.system import LIMIT_S, Gateway, free_port, port_of
 
@@ -107,12 +107,12 @@ def connect_with_small_buffer(page: str, path: str) -> socket.socket:
 
 @async_test
 async def test_viewers_receive_their_session(control: FakeControl, gateway: Gateway) -> None:
-    async with connected(gateway.page, "viewer", "viewer?session=other") as (newest, other):
+    async with open_websockets(gateway.page, "viewer", "viewer?session=other") as (newest, other):
         await receive_json(newest, "status", missing=[])
         control.start("one")
         publish_all(control, "one")
         await receive_json(newest, "session", session="one", lips="dynamic-visemes", sample=False)
-        messages = [await receive_of_session(newest) for _ in range(5)]
+        messages = [await receive_session_message(newest) for _ in range(5)]
         binary = {m.data[0]: m.data for m in messages if m.type is aiohttp.WSMsgType.BINARY}
         texts = [json.loads(m.data) for m in messages if m.type is aiohttp.WSMsgType.TEXT]
         assert struct.unpack_from("<B3xId", binary[1]) == (1, EPOCH, 320.0)
@@ -123,8 +123,8 @@ async def test_viewers_receive_their_session(control: FakeControl, gateway: Gate
         control.publish(control.phones, Acoustic(session="one", epoch=EPOCH, model="light"))
         await receive_json(newest, "acoustic", acoustic="light")
         await newest.send_json({"acoustic": "full"})
-        await until(lambda: control.of(SetFace))
-        assert control.of(SetFace)[-1].face.acoustic == "full"
+        await wait_until_async(lambda: control.messages_of(SetFace))
+        assert control.messages_of(SetFace)[-1].face.acoustic == "full"
 
         await other.send_json({"follow": "one"})
         await receive_json(other, "session", session="one")
@@ -145,7 +145,7 @@ async def test_viewers_receive_shapes_in_the_requested_format(
     query = "viewer?session=shaped&shapes=vrm"
     weights = VRM.weights(np.frombuffer(FACE, "<f4"))
     paths = (query, f"{query}&format=json", f"{query}&format=msgpack")
-    async with connected(gateway.page, *paths) as viewers:
+    async with open_websockets(gateway.page, *paths) as viewers:
         binary, text, packed = viewers
         for viewer in viewers:
             await receive_json(viewer, "shapes", set="vrm", names=[*VRM.names])
@@ -175,7 +175,7 @@ async def test_viewers_receive_shapes_in_the_requested_format(
 async def test_a_viewer_sets_the_expressions_of_its_face(
     control: FakeControl, gateway: Gateway
 ) -> None:
-    async with connected(gateway.page, "viewer?session=seen") as (viewer,):
+    async with open_websockets(gateway.page, "viewer?session=seen") as (viewer,):
         await viewer.send_json({"expressiveness": 2})
         assert "no session is shown" in (await receive_json(viewer, "error"))["text"]
         control.start("seen")
@@ -185,8 +185,8 @@ async def test_a_viewer_sets_the_expressions_of_its_face(
         await viewer.send_json({"express": {"joy": 0.5, "squint": 1}, "hold_s": 7})
         await viewer.send_json({"express": {}})
         await viewer.send_json({"expressiveness": 2})
-        await until(lambda: len(control.of(SetFace)) == 3)
-    faces = [message.face for message in control.of(SetFace)]
+        await wait_until_async(lambda: len(control.messages_of(SetFace)) == 3)
+    faces = [message.face for message in control.messages_of(SetFace)]
     assert [face.expressions for face in faces] == [{"joy": 0.5, "squint": 1.0}, {}, None]
     assert (faces[0].hold_s, faces[2].expressiveness) == (7, 2.0)
     assert {*control.sessions_of(SetFace)} == {"seen"}
@@ -203,7 +203,7 @@ async def test_an_expression_shows_on_the_face_at_rest(
         message = await receive_binary(viewer, REST_TYPE)
         return float(np.frombuffer(message, "<f4", offset=16)[corner])
 
-    async with connected(gateway.page, "viewer?session=none") as (viewer,):
+    async with open_websockets(gateway.page, "viewer?session=none") as (viewer,):
         assert await watch(viewer) == 0
         await viewer.send_json({"express": {"smile": 1}, "hold_s": 600})
         while await watch(viewer) < 30:
@@ -219,7 +219,7 @@ async def test_a_slow_viewer_gets_the_newest_frames(control: FakeControl, gatewa
     times = [320 * number for number in range(1, 1001)]  # 20 s
     path = "viewer?session=long"
     with connect_with_small_buffer(gateway.page, path) as slow:
-        async with connected(gateway.page, path) as (viewer,):
+        async with open_websockets(gateway.page, path) as (viewer,):
             control.start("long")
             await receive_json(viewer, "session", session="long")
             for media_time in times:
@@ -244,16 +244,16 @@ async def test_a_slow_viewer_gets_the_newest_frames(control: FakeControl, gatewa
 async def test_a_microphone_session_closes_after_its_last_frame(own_control: FakeControl) -> None:
     control, gateway = own_control, Gateway(own_control.address, "-c", LONG_TIMEOUT)
     assert control.page == gateway.page
-    async with connected(gateway.page, "microphone") as (microphone,):
+    async with open_websockets(gateway.page, "microphone") as (microphone,):
         await microphone.send_json({"sample_rate_hz": 48000, "num_channels": 1})
         session = (await receive_json(microphone, "opened"))["session"]
         for _ in range(5):
             await microphone.send_bytes(b"\x01\x00" * 960)
-        await until(lambda: len(control.audio_messages) == 5)
-    await until(lambda: len(control.audio_messages) == 6)
-    assert not control.of(CloseSession)  # before the last frame has arrived
+        await wait_until_async(lambda: len(control.audio_messages) == 5)
+    await wait_until_async(lambda: len(control.audio_messages) == 6)
+    assert not control.messages_of(CloseSession)  # before the last frame has arrived
     control.publish(control.faps, EndOfFaps(session=session, epoch=EPOCH))
-    await until(lambda: control.sessions_of(CloseSession) == [session])
+    await wait_until_async(lambda: control.sessions_of(CloseSession) == [session])
     gateway.stop()
     *chunks, last = control.audio_messages
     assert [chunk.media_time for chunk in chunks] == [0, 320, 640, 960, 1280]
@@ -270,18 +270,20 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
     control.audio_endpoint = f"tcp://127.0.0.1:{free_port()}"  # not bound yet
     num_chunks = MAX_UNACKNOWLEDGED + 100
     last_pcm = b"\x02\x00" * 320
-    async with connected(own_gateway.page, "microphone") as (microphone,):
+    async with open_websockets(own_gateway.page, "microphone") as (microphone,):
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
         for _ in range(num_chunks):
             await microphone.send_bytes(b"\x01\x00" * 320)
         await microphone.send_json({"flush": True})
-        await until(lambda: control.of(FlushSession))  # the gateway has read all chunks
-        control.do(control.bind_audio)
-        await until(lambda: len(control.audio_messages) == MAX_UNACKNOWLEDGED)
+        await wait_until_async(
+            lambda: control.messages_of(FlushSession)
+        )  # the gateway has read all chunks
+        control.run_job(control.bind_audio)
+        await wait_until_async(lambda: len(control.audio_messages) == MAX_UNACKNOWLEDGED)
         await microphone.send_json({"skip": 320})
         await microphone.send_bytes(last_pcm)
-        await until(lambda: len(control.audio_messages) > MAX_UNACKNOWLEDGED)
+        await wait_until_async(lambda: len(control.audio_messages) > MAX_UNACKNOWLEDGED)
     *queued, last = control.audio_messages[: MAX_UNACKNOWLEDGED + 1]
     assert [chunk.media_time for chunk in queued] == [320 * n for n in range(MAX_UNACKNOWLEDGED)]
     assert isinstance(last, AudioChunk)
@@ -298,14 +300,14 @@ async def test_bad_audio_is_refused_with_a_reason(control: FakeControl, gateway:
         ([b"\x00\x00"], "describes the audio"),
         ([hello, b"RIFF" + bytes(40)], "WAV file"),
     ):
-        async with connected(gateway.page, "microphone") as (microphone,):
+        async with open_websockets(gateway.page, "microphone") as (microphone,):
             for message in messages:
                 send = microphone.send_str if isinstance(message, str) else microphone.send_bytes
                 await send(message)  # type: ignore[arg-type]
             text = (await receive_json(microphone, "error"))["text"]
             assert reason in text
             assert (await microphone.receive(LIMIT_S)).extra == text[:123]  # of the close
-    async with connected(gateway.page, "microphone") as (microphone,):
+    async with open_websockets(gateway.page, "microphone") as (microphone,):
         await microphone.send_str(hello)
         await receive_json(microphone, "opened")
         await microphone.send_bytes(bytes(MAX_MESSAGE_BYTES + 1))
@@ -313,7 +315,7 @@ async def test_bad_audio_is_refused_with_a_reason(control: FakeControl, gateway:
         assert closing.data == aiohttp.WSCloseCode.MESSAGE_TOO_BIG
         assert closing.extra == "a message is larger than 4096 KiB; send it in smaller messages"
     control.refuse = True
-    async with connected(gateway.page, "microphone") as (microphone,):
+    async with open_websockets(gateway.page, "microphone") as (microphone,):
         await microphone.send_str(hello)
         assert (await receive_json(microphone, "error"))["text"] == "start one"
 
@@ -330,17 +332,17 @@ MALFORMED: list[str | bytes] = [
 async def test_malformed_messages_do_not_disturb_other_clients(
     control: FakeControl, gateway: Gateway
 ) -> None:
-    pour(port_of(gateway.page), 0.5)
+    flood(port_of(gateway.page), 0.5)
     for path in ("viewer", "microphone"):
         for malformed in MALFORMED:
-            async with connected(gateway.page, path) as (client,):
+            async with open_websockets(gateway.page, path) as (client,):
                 send = client.send_str if isinstance(malformed, str) else client.send_bytes
                 await send(malformed)  # type: ignore[arg-type]
-    async with connected(gateway.page, "microphone") as (microphone,):
+    async with open_websockets(gateway.page, "microphone") as (microphone,):
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
         await microphone.send_bytes(bytes(640))
-        await until(lambda: control.audio_messages)
+        await wait_until_async(lambda: control.audio_messages)
 
 
 @async_test
@@ -348,12 +350,12 @@ async def test_the_sample_sentence_plays_once_and_sigterm_closes_viewers(
     own_control: FakeControl, own_gateway: Gateway
 ) -> None:
     control = own_control
-    async with connected(own_gateway.page, "viewer", "viewer") as viewers:
+    async with open_websockets(own_gateway.page, "viewer", "viewer") as viewers:
         for viewer in viewers:
             await viewer.send_json({"play": "sample"})
         shown = [await receive_json(viewer, "session", sample=True) for viewer in viewers]
         names = {message["session"] for message in shown}
-        await until(lambda: len(control.audio_messages) > 10)
+        await wait_until_async(lambda: len(control.audio_messages) > 10)
         assert names == {*control.sessions_of(SessionStarted)}
         publish_phone(control, names.pop(), "n")
         await receive_json(viewers[0], "syllable", symbol="你")
@@ -369,7 +371,7 @@ async def test_the_sample_sentence_plays_once_and_sigterm_closes_viewers(
 async def test_microphone_and_sample_choose_their_lips(
     control: FakeControl, gateway: Gateway
 ) -> None:
-    async with connected(gateway.page, "viewer", "microphone") as (viewer, microphone):
+    async with open_websockets(gateway.page, "viewer", "microphone") as (viewer, microphone):
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
         for lips in ("learned", "dynamic-visemes"):
@@ -382,14 +384,14 @@ async def test_microphone_and_sample_choose_their_lips(
         await viewer.send_json({"lips": "learned"})
         assert "only for the sample sentence" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"play": "sample", "lips": "learned"})
-        await until(lambda: len(control.of(SetFace)) == 3)
+        await wait_until_async(lambda: len(control.messages_of(SetFace)) == 3)
         await receive_json(viewer, "session", sample=True)
         await viewer.send_json({"lips": "dynamic-visemes"})
-        await until(lambda: len(control.of(SetFace)) == 4)
+        await wait_until_async(lambda: len(control.messages_of(SetFace)) == 4)
         control.stop_session(control.sessions_of(SetFace)[3])
         await receive_json(viewer, "session", sample=False)
     sessions = control.sessions_of(SetFace)
-    lips_chosen = tuple(message.face.lip_model for message in control.of(SetFace))
+    lips_chosen = tuple(message.face.lip_model for message in control.messages_of(SetFace))
     assert sessions[0] == sessions[1] != sessions[2] == sessions[3]
     assert lips_chosen == ("learned", "dynamic-visemes") * 2
 
@@ -412,12 +414,12 @@ async def test_the_newest_face_is_sent_to_another_program(
                     assert (await answer.json())["error"]
             async with http.post(senders, json={"start": url}) as answer:
                 assert [sender["target"] for sender in (await answer.json())["senders"]] == [url]
-            await until(lambda: time_sent(program) > 1.0)  # a face at rest
+            await wait_until_async(lambda: time_sent(program) > 1.0)  # a face at rest
             for session in ("older", "newer"):
                 control.start(session)
             for session in ("older", "newer"):
                 publish_all(control, session)
-            await until(lambda: time_sent(program) == 320 / 16000)
+            await wait_until_async(lambda: time_sent(program) == 320 / 16000)
             async with http.get(senders) as answer:
                 (state,) = (await answer.json())["senders"]
             assert state["rate_hz"] > 0
@@ -442,7 +444,7 @@ def time_sent(program: socket.socket) -> float:
 @async_test
 async def test_without_control_browsers_are_told_to_start_it() -> None:
     gateway = Gateway("tcp://127.0.0.1:9")
-    async with connected(gateway.page, "viewer", "microphone") as (viewer, microphone):
+    async with open_websockets(gateway.page, "viewer", "microphone") as (viewer, microphone):
         await receive_json(viewer, "status", missing=["control"])
         await microphone.send_json({"sample_rate_hz": 16000})
         text = (await receive_json(microphone, "error"))["text"]

@@ -33,7 +33,7 @@ UPGRADE = {
 }
 
 
-class Site:
+class HttpGateway:
     """A gateway that is asked over http, or over https with a certificate."""
 
     def __init__(self, certificate: Path | None = None, **settings: str) -> None:
@@ -59,17 +59,17 @@ class Site:
 
 
 @pytest.fixture(scope="module")
-def local() -> Iterator[Site]:
+def local_gateway() -> Iterator[HttpGateway]:
     """A gateway on loopback without a token."""
-    site = Site()
+    site = HttpGateway()
     yield site
     assert site.gateway.stop() == 0
 
 
 @pytest.fixture(scope="module")
-def public(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+def public_gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HttpGateway]:
     """A gateway on all addresses, with https and a token."""
-    site = Site(
+    site = HttpGateway(
         tmp_path_factory.mktemp("https") / "kouxing.pem",
         host="0.0.0.0",  # noqa: S104 - with https and a token
         token="secret",
@@ -98,16 +98,18 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     ],
 )
 def test_rejects_foreign_pages_and_other_files(
-    local: Site, path: str, headers: dict[str, str], status: int
+    local_gateway: HttpGateway, path: str, headers: dict[str, str], status: int
 ) -> None:
-    assert local.ask(path, **headers).status == status
+    assert local_gateway.ask(path, **headers).status == status
 
 
-def test_the_policies_allow_functions_from_text_only_to_the_face_mesh(local: Site) -> None:
-    page = local.ask("").headers["Content-Security-Policy"]
+def test_the_policies_allow_functions_from_text_only_to_the_face_mesh(
+    local_gateway: HttpGateway,
+) -> None:
+    page = local_gateway.ask("").headers["Content-Security-Policy"]
     assert "default-src 'self'" in page
     assert "unsafe" not in page
-    frame = local.ask("face-mesh.html").headers
+    frame = local_gateway.ask("face-mesh.html").headers
     assert "script-src 'self' 'unsafe-eval'" in frame["Content-Security-Policy"]
     assert "frame-ancestors 'self'" in frame["Content-Security-Policy"]
     assert frame["Permissions-Policy"] == "camera=(), microphone=()"
@@ -122,8 +124,10 @@ def test_the_policies_allow_functions_from_text_only_to_the_face_mesh(local: Sit
         ("three/build/three.module.js", "javascript"),
     ],
 )
-def test_serves_the_modules_of_the_page(local: Site, name: str, content_type: str) -> None:
-    answer = local.ask(f"modules/{name}")
+def test_serves_the_modules_of_the_page(
+    local_gateway: HttpGateway, name: str, content_type: str
+) -> None:
+    answer = local_gateway.ask(f"modules/{name}")
     assert answer.status == 200
     assert answer.headers["Content-Type"].partition(";")[0].endswith(content_type)
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
@@ -132,34 +136,36 @@ def test_serves_the_modules_of_the_page(local: Site, name: str, content_type: st
 @pytest.mark.parametrize(
     "path", ["viewer", "microphone", "whip", "learn-mouth", "sound", "senders"]
 )
-def test_sessions_and_uploads_require_the_token(public: Site, path: str) -> None:
+def test_sessions_and_uploads_require_the_token(public_gateway: HttpGateway, path: str) -> None:
     for query in ("", "?token=wrong"):
-        assert public.ask(path + query, **UPGRADE).status == 403
+        assert public_gateway.ask(path + query, **UPGRADE).status == 403
 
 
-def test_the_token_opens_sessions_and_the_page_requires_none(public: Site) -> None:
-    assert public.ask("viewer?token=secret", **UPGRADE).status == 101
-    page = public.ask("")
+def test_the_token_opens_sessions_and_the_page_requires_none(public_gateway: HttpGateway) -> None:
+    assert public_gateway.ask("viewer?token=secret", **UPGRADE).status == 101
+    page = public_gateway.ask("")
     assert page.status == 200
     ancestors = "frame-ancestors https://tool.example https://other.example:8443"
     assert page.headers["Content-Security-Policy"].endswith(ancestors)
 
 
-def test_whip_accepts_bearer_tokens_from_trusted_origins(public: Site) -> None:
-    preflight = public.ask("whip", "OPTIONS", Origin="https://tool.example")
+def test_whip_accepts_bearer_tokens_from_trusted_origins(public_gateway: HttpGateway) -> None:
+    preflight = public_gateway.ask("whip", "OPTIONS", Origin="https://tool.example")
     assert preflight.status == 204
     assert "Authorization" in preflight.headers["Access-Control-Allow-Headers"]
-    assert public.ask("whip", "OPTIONS", Origin="https://evil.example").status == 403
+    assert public_gateway.ask("whip", "OPTIONS", Origin="https://evil.example").status == 403
     for token, status in (("wrong", 403), ("secret", 404)):
         headers = {"Origin": "https://tool.example", "Authorization": f"Bearer {token}"}
-        assert public.ask("whip/unknown", "DELETE", **headers).status == status
+        assert public_gateway.ask("whip/unknown", "DELETE", **headers).status == status
 
 
 @pytest.mark.parametrize(
     ("origin", "status"), [("https://tool.example", 101), ("https://evil.example", 403)]
 )
-def test_only_trusted_origins_may_connect(public: Site, origin: str, status: int) -> None:
-    assert public.ask("viewer?token=secret", Origin=origin, **UPGRADE).status == status
+def test_only_trusted_origins_may_connect(
+    public_gateway: HttpGateway, origin: str, status: int
+) -> None:
+    assert public_gateway.ask("viewer?token=secret", Origin=origin, **UPGRADE).status == status
 
 
 @pytest.mark.parametrize(
@@ -172,10 +178,10 @@ def test_only_trusted_origins_may_connect(public: Site, origin: str, status: int
     ],
 )
 def test_a_page_sends_only_to_this_machine_and_to_configured_addresses(
-    public: Site, url: str, headers: dict[str, str], status: int
+    public_gateway: HttpGateway, url: str, headers: dict[str, str], status: int
 ) -> None:
     body = json.dumps({"start": url})
-    assert public.ask("senders?token=secret", "POST", body, **headers).status == status
+    assert public_gateway.ask("senders?token=secret", "POST", body, **headers).status == status
 
 
 @pytest.mark.parametrize(
@@ -188,8 +194,10 @@ def test_a_page_sends_only_to_this_machine_and_to_configured_addresses(
         ("localhost", 200),
     ],
 )
-def test_answers_only_under_its_own_names(public: Site, host: str, status: int) -> None:
-    page = public.ask("", Host=host)
+def test_answers_only_under_its_own_names(
+    public_gateway: HttpGateway, host: str, status: int
+) -> None:
+    page = public_gateway.ask("", Host=host)
     assert page.status == status
     assert page.headers["X-Content-Type-Options"] == "nosniff"
     assert page.headers["Referrer-Policy"] == "no-referrer"
@@ -197,10 +205,10 @@ def test_answers_only_under_its_own_names(public: Site, host: str, status: int) 
     assert "Set-Cookie" not in page.headers
 
 
-def test_only_the_owner_can_read_the_certificate(public: Site) -> None:
-    assert public.ask("").status == 200
-    assert public.certificate is not None
-    assert stat.S_IMODE(public.certificate.stat().st_mode) == 0o600
+def test_only_the_owner_can_read_the_certificate(public_gateway: HttpGateway) -> None:
+    assert public_gateway.ask("").status == 200
+    assert public_gateway.certificate is not None
+    assert stat.S_IMODE(public_gateway.certificate.stat().st_mode) == 0o600
 
 
 def gateway_process(control: str = NO_CONTROL, **settings: str) -> subprocess.Popen[str]:

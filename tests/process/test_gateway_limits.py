@@ -35,7 +35,7 @@ UNUSED: Any = None
 
 
 @dataclass
-class Served:
+class LimitedServer:
     """A server with short and endless answers, whose time a test lets pass."""
 
     address: tuple[str, int]
@@ -88,30 +88,30 @@ async def never_end(request: web.Request) -> web.StreamResponse:
 
 
 @asynccontextmanager
-async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[Served]:
+async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[LimitedServer]:
     """Serve with other limits; ``/long`` has no time limit."""
     for name, limit in {"_CHECK_S": CHECK_S, "_SHUTDOWN_S": 0.01, **limits}.items():
         monkeypatch.setattr(web_server, name, limit)
     bound = web_server.bind_port("127.0.0.1", 0)
-    served = Served(bound.getsockname())
-    monkeypatch.setattr(web_server, "time", SimpleNamespace(monotonic=lambda: served.now_s))
-    server = WebServer(bound, None)
+    limited = LimitedServer(bound.getsockname())
+    monkeypatch.setattr(web_server, "time", SimpleNamespace(monotonic=lambda: limited.now_s))
+    http_server = WebServer(bound, None)
     application = web.Application()
     application.add_routes(
         [
             web.get("/", answer),
             web.get("/fail", fail),
             web.get("/slow", never_end),
-            web.get("/endless", served.write_endlessly),
+            web.get("/endless", limited.write_endlessly),
             web.route("*", "/long", never_end),
         ]
     )
-    await server.start(application, {"/long"})
+    await http_server.start(application, {"/long"})
     try:
-        yield served
+        yield limited
     finally:
-        await server.stop()
-        for writer in served.writers:
+        await http_server.stop()
+        for writer in limited.writers:
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
@@ -137,11 +137,11 @@ async def check_open(*readers: asyncio.StreamReader) -> None:
         task.cancel()
 
 
-async def pass_time(served: Served, ended: Awaitable[Any], timeout_s: float) -> None:
+async def pass_time(server: LimitedServer, ended: Awaitable[Any], timeout_s: float) -> None:
     """Let time pass in steps until just after a timeout, and wait until something has ended."""
     waiting = asyncio.ensure_future(ended)
     for _ in range(11):
-        served.now_s += timeout_s / 10
+        server.now_s += timeout_s / 10
         await asyncio.wait([waiting], timeout=3 * CHECK_S)
     await asyncio.wait_for(waiting, LIMIT_S)
 
@@ -152,10 +152,10 @@ async def test_closes_connections_with_long_heads_or_many_requests(
 ) -> None:
     request = b"GET / HTTP/1.1\r\nHost: a\r\n"
     headers = b"".join(b"X%d: %s\r\n" % (number, b"x" * 8000) for number in range(100))
-    async with serve(monkeypatch) as served:
+    async with serve(monkeypatch) as server:
         for part in (request + headers, SLOW + 50 * (request + b"\r\n")):
-            await read_to_end(await served.connect(part))
-        assert await served.answers()
+            await read_to_end(await server.connect(part))
+        assert await server.answers()
 
 
 @pytest.mark.parametrize("part", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: a\r\nX: "])
@@ -163,19 +163,19 @@ async def test_closes_connections_with_long_heads_or_many_requests(
 async def test_closes_connections_without_a_request(
     monkeypatch: pytest.MonkeyPatch, part: bytes
 ) -> None:
-    async with serve(monkeypatch) as served:
-        reader = await served.connect(part)
-        assert await served.answers(), "it was accepted after the other one"
-        await pass_time(served, reader.read(), web_server.IDLE_TIMEOUT_S)
-        assert await served.answers()
+    async with serve(monkeypatch) as server:
+        reader = await server.connect(part)
+        assert await server.answers(), "it was accepted after the other one"
+        await pass_time(server, reader.read(), web_server.IDLE_TIMEOUT_S)
+        assert await server.answers()
 
 
 @async_test
 async def test_ends_slow_answers_except_on_unlimited_paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serve(monkeypatch) as served:
-        long, slow = await served.connect(LONG), await served.connect(SLOW)
+    async with serve(monkeypatch) as server:
+        long, slow = await server.connect(LONG), await server.connect(SLOW)
         await wait_for_answers(long, slow)
-        await pass_time(served, slow.read(), web_server.ANSWER_TIMEOUT_S)
+        await pass_time(server, slow.read(), web_server.ANSWER_TIMEOUT_S)
         await check_open(long)
 
 
@@ -194,14 +194,14 @@ INCOMPLETE = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1"
 async def test_a_body_has_a_deadline_and_its_answer_has_none(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: bytes
 ) -> None:
-    async with serve(monkeypatch) as served:
+    async with serve(monkeypatch) as server:
         post = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 2\r\n\r\n"
-        complete = [await served.connect(post), await served.connect(UPGRADE)]
-        served.writers[0].write(b"12")
+        complete = [await server.connect(post), await server.connect(UPGRADE)]
+        server.writers[0].write(b"12")
         await wait_for_answers(*complete)
-        incomplete = await served.connect(part)
-        assert await served.answers()
-        await pass_time(served, read_to_end(incomplete), web_server.BODY_TIMEOUT_S)
+        incomplete = await server.connect(part)
+        assert await server.answers()
+        await pass_time(server, read_to_end(incomplete), web_server.BODY_TIMEOUT_S)
         await check_open(*complete)
     assert not caplog.records
 
@@ -223,13 +223,13 @@ MANY = [f"127.0.1.{number}" for number in range(9)]
 async def test_a_client_takes_the_place_of_one_without_a_complete_request(
     monkeypatch: pytest.MonkeyPatch, part: bytes, sources: list[str]
 ) -> None:
-    async with serve(monkeypatch, MAX_CONNECTIONS=6) as served:
-        clients = [await served.connect(LONG)]
+    async with serve(monkeypatch, MAX_CONNECTIONS=6) as server:
+        clients = [await server.connect(LONG)]
         await wait_for_answers(*clients)
         for n in range(9):
-            await served.connect(part, sources[n % len(sources)])
-            served.now_s += 1.0
-        late = [await served.connect(LONG, source) for source in ("127.0.0.1", "127.0.0.3")]
+            await server.connect(part, sources[n % len(sources)])
+            server.now_s += 1.0
+        late = [await server.connect(LONG, source) for source in ("127.0.0.1", "127.0.0.3")]
         await wait_for_answers(*late)
         await check_open(*clients, *late)
 
@@ -238,14 +238,14 @@ async def test_a_client_takes_the_place_of_one_without_a_complete_request(
 async def test_refuses_connections_while_all_places_have_complete_requests(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with serve(monkeypatch, MAX_CONNECTIONS=6) as served:
-        clients = [await served.connect(LONG) for _ in range(5)]
+    async with serve(monkeypatch, MAX_CONNECTIONS=6) as server:
+        clients = [await server.connect(LONG) for _ in range(5)]
         await wait_for_answers(*clients)
         for _ in range(2):
-            assert await read_to_end(await served.connect()) == b""
-        served.writers[0].close()
+            assert await read_to_end(await server.connect()) == b""
+        server.writers[0].close()
         async with asyncio.timeout(LIMIT_S):
-            while not await served.answers():
+            while not await server.answers():
                 await asyncio.sleep(0.02)
     assert [record.getMessage() for record in caplog.records] == [
         "rejected a connection from 127.0.0.1: too many connections are open"
@@ -254,10 +254,10 @@ async def test_refuses_connections_while_all_places_have_complete_requests(
 
 @async_test
 async def test_ends_answers_that_are_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serve(monkeypatch) as served:
-        await served.connect(b"GET /endless HTTP/1.1\r\nHost: a\r\n\r\n")
-        assert await served.answers()
-        await pass_time(served, served.has_ended.wait(), web_server.ANSWER_TIMEOUT_S)
+    async with serve(monkeypatch) as server:
+        await server.connect(b"GET /endless HTTP/1.1\r\nHost: a\r\n\r\n")
+        assert await server.answers()
+        await pass_time(server, server.has_ended.wait(), web_server.ANSWER_TIMEOUT_S)
 
 
 CLIENTS: dict[str, Callable[[float], Handler]] = {
@@ -350,9 +350,9 @@ async def test_whip_without_aiortc_says_what_to_install(monkeypatch: pytest.Monk
 async def test_logs_an_unexpected_error_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: str, status: int
 ) -> None:
-    async with serve(monkeypatch) as served, aiohttp.ClientSession() as http:
+    async with serve(monkeypatch) as server, aiohttp.ClientSession() as http:
         for _ in range(3):
-            url = "http://{}:{}/fail?error=".format(*served.address)
+            url = "http://{}:{}/fail?error=".format(*server.address)
             async with http.get(url + error) as response:
                 assert response.status == status
                 assert "Server" not in response.headers
@@ -372,10 +372,10 @@ async def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPat
     failures = ["Too many open files"]
     monkeypatch.setattr(web_server, "_RETRY_S", 0.05)
     exhausted = Exhausted(fileno=web_server.bind_port("127.0.0.1", 0).detach())
-    server = WebServer(exhausted, None)
+    http_server = WebServer(exhausted, None)
     application = web.Application()
     application.add_routes([web.get("/", answer)])
-    await server.start(application, set())
-    assert await Served(exhausted.getsockname()).answers()
+    await http_server.start(application, set())
+    assert await LimitedServer(exhausted.getsockname()).answers()
     assert not failures
-    await server.stop()
+    await http_server.stop()

@@ -1,4 +1,4 @@
-"""The package ``kouxing-lips`` makes the faces and finds the phones of the server's models."""
+"""The package ``kouxing-lips`` has the same faces and phones as the server."""
 
 import difflib
 import json
@@ -122,7 +122,7 @@ def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [8_000, 48_000])
-def test_resamples_like_the_server(models: Path, rate_hz: int) -> None:
+def test_resampling_equals_the_servers(models: Path, rate_hz: int) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")
     resampled = soxr.resample(samples, RATE_HZ, rate_hz)
     ours = faps_of(models, resampled, sampleRateHz=rate_hz)

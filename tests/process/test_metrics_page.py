@@ -18,7 +18,7 @@ from kouxing.shared.config import variable
 from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.prometheus import MAX_REQUESTS, MetricsServer
-from tests.raw_bytes import pour
+from tests.raw_bytes import flood
 from tests.system import CHAIN, LIMIT_S, ROOT, VOWELS_FILE, System, free_port
 
 
@@ -40,7 +40,7 @@ def get(port: int, path: str) -> str:
         return text
 
 
-def test_serves_metrics_and_health(server: MetricsServer) -> None:
+def test_the_server_has_metrics_and_health(server: MetricsServer) -> None:
     assert 'kouxing_resent_total{service="tester"} 5.0' in get(server.server_port, "/metrics")
     assert get(server.server_port, "/healthz") == "alive\n"
     server.is_alive = lambda: False
@@ -60,7 +60,7 @@ def test_answers_while_too_many_connections_send_no_request(server: MetricsServe
 
 
 @pytest.mark.parametrize("request_line", [b"GET /healthz HTTP/1.1", b"\xff\xff / HTTP/9"])
-def test_sends_no_version(server: MetricsServer, request_line: bytes) -> None:
+def test_answers_have_no_version(server: MetricsServer, request_line: bytes) -> None:
     with closing(socket.create_connection(("127.0.0.1", server.server_port), 30)) as client:
         client.sendall(request_line + b"\r\n\r\n")
         answer = client.makefile("rb").read()
@@ -105,7 +105,7 @@ def families(system: System) -> dict[str, list[Metric]]:
         before = _heartbeats(client)
         system.wait_until(lambda _: _heartbeats(client) > before + 5)  # they set the gauges
         for port in ports:
-            pour(port, 0.2)  # which the pages outlast
+            flood(port, 0.2)  # which the pages outlast
         pages = [[*text_string_to_metric_families(get(port, "/metrics"))] for port in ports]
     return dict(zip(CHAIN, pages, strict=True))
 

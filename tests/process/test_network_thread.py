@@ -58,7 +58,7 @@ def decoded(thread: NetworkThread) -> list[RecognizerSession]:
     return thread.take_decoded()
 
 
-def test_decodes_waiting_sessions_once_and_in_order(
+def test_the_thread_decodes_waiting_sessions_once_and_in_order(
     thread: NetworkThread, recognizer: FakeRecognizer
 ) -> None:
     sessions = make_sessions(MAX_SESSIONS + 1)

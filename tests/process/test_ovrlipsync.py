@@ -1,4 +1,4 @@
-"""The C library with OVRLipSync's interface has the server's visemes."""
+"""The C library with OVRLipSync's interface has the same visemes as the server."""
 
 import ctypes
 import shutil

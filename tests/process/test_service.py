@@ -33,7 +33,7 @@ from tests.samples import START
 from tests.system import LIMIT_S, wait_until
 
 
-class Slow(Service):
+class SlowService(Service):
     """Takes 5 ms for a message; counts ticks, heartbeats and messages."""
 
     kind = ServiceKind(name="slow", role="worker")
@@ -57,22 +57,22 @@ class Slow(Service):
         time.sleep(0.005)
 
 
-class Keyed(Service):
+class ServiceWithKey(Service):
     kind = ServiceKind(name="keyed", role="worker")
 
 
 @pytest.fixture
-def slow() -> Iterator[Slow]:
-    service = Slow()
+def slow() -> Iterator[SlowService]:
+    service = SlowService()
     yield service
     service.bus.close()
 
 
-def handle(service: Slow, num_messages: int) -> None:
+def handle(service: SlowService, num_messages: int) -> None:
     wait_until(lambda: service.num_handled >= num_messages, step=lambda: service.step(0.01))
 
 
-def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: Slow) -> None:
+def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: SlowService) -> None:
     with Bus() as bus:
         sender = bus.connect_dealer(slow.input.endpoint)
         for _ in range(300):
@@ -82,7 +82,7 @@ def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: Slow) -> N
     assert slow.num_beats >= 2
 
 
-def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: Slow) -> None:
+def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: SlowService) -> None:
     waits: list[float] = []
 
     def wait(timeout_s: float) -> list[Socket]:
@@ -104,7 +104,7 @@ def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: Slow
     assert 10.0 < waits[-1] <= 20.0
 
 
-def test_answers_counts_and_drops_unexpected_messages(slow: Slow) -> None:
+def test_answers_counts_and_drops_unexpected_messages(slow: SlowService) -> None:
     with Bus() as bus:
         sender = bus.connect_dealer(slow.input.endpoint)
         sender.send(Speech(session="s", active=True))
@@ -116,7 +116,7 @@ def test_answers_counts_and_drops_unexpected_messages(slow: Slow) -> None:
     assert slow.metrics.snapshot(0.0)["dropped_unexpected"] == 1
 
 
-def test_drops_a_message_when_no_file_can_be_opened(slow: Slow) -> None:
+def test_drops_a_message_when_no_file_can_be_opened(slow: SlowService) -> None:
     handle_progress = slow._on_progress
 
     def open_nothing(progress: Progress, sender: Peer) -> None:
@@ -134,7 +134,7 @@ def test_drops_a_message_when_no_file_can_be_opened(slow: Slow) -> None:
 
 @pytest.mark.parametrize(("address", "warns"), [("10.0.0.1", True), ("127.0.0.1", False)])
 def test_warns_if_an_insecure_service_is_reachable_from_other_hosts(
-    slow: Slow, caplog: pytest.LogCaptureFixture, address: str, warns: bool
+    slow: SlowService, caplog: pytest.LogCaptureFixture, address: str, warns: bool
 ) -> None:
     slow.endpoints = {"input": f"tcp://{address}:5570"}
     slow.startup()
@@ -163,9 +163,9 @@ class Worker(SessionService):
 
 @pytest.fixture
 def worker(control: FakeControl) -> Iterator[Worker]:
-    made = Worker(control.address)
-    yield made
-    made.bus.close()
+    new_worker = Worker(control.address)
+    yield new_worker
+    new_worker.bus.close()
 
 
 def run_until(worker: Worker, condition: Callable[[], object]) -> None:
@@ -220,10 +220,10 @@ def test_a_restarted_control_learns_the_sessions(
     start = replace(START, session="s0", epoch=3)
     monkeypatch.setattr(worker, "served_sessions", lambda: [start])
     run_until(worker, lambda: control.heartbeats)
-    assert not control.of(SessionStarted)
+    assert not control.messages_of(SessionStarted)
     control.name = "control-2"
-    run_until(worker, lambda: control.of(SessionStarted))
-    assert [started.start for started in control.of(SessionStarted)] == [start]
+    run_until(worker, lambda: control.messages_of(SessionStarted))
+    assert [started.start for started in control.messages_of(SessionStarted)] == [start]
 
 
 @pytest.mark.parametrize(
@@ -256,7 +256,7 @@ def test_starts_again_when_a_rejected_key_was_replaced() -> None:
     local = "tcp://127.0.0.1:*"
     control = ControlService(ControlConfig(control=local, events=local))
     address, _, _ = control.endpoints["commands"].partition(" ")
-    service = Keyed(ServiceConfig(control=address))
+    service = ServiceWithKey(ServiceConfig(control=address))
     revoke_key("keyed")
     service._warn_about_control()
     assert not service.should_exit
@@ -296,7 +296,7 @@ def test_heartbeats_report_many_sessions_in_turn(control: FakeControl) -> None:
 
 
 def test_a_health_check_ends_a_process_whose_loop_hangs(
-    slow: Slow, monkeypatch: pytest.MonkeyPatch
+    slow: SlowService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[int] = []
     monkeypatch.setattr("kouxing.shared.service.os._exit", ends.append)

@@ -20,7 +20,7 @@ from tests.system import (
 )
 
 
-def ended(*arguments: str, **environment: str) -> tuple[int, str]:
+def run_to_end(*arguments: str, **environment: str) -> tuple[int, str]:
     """Return the exit status of a program, and what it prints on standard error."""
     process = start_python(*arguments, **environment)
     _, log = process.communicate(timeout=LIMIT_S)
@@ -48,7 +48,7 @@ def test_ctrl_c_in_imports_prints_nothing(
     ctrl_c = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / f"{slow_import}.py").write_text(ctrl_c)
     path = f"{tmp_path}{os.pathsep}{ROOT}"
-    assert ended(*arguments, PYTHONPATH=path) == (-signal.SIGINT, "")
+    assert run_to_end(*arguments, PYTHONPATH=path) == (-signal.SIGINT, "")
 
 
 @pytest.mark.parametrize(("service", "key"), [("recognizer", "audio"), ("gateway", "port")])
@@ -59,7 +59,7 @@ def test_reports_a_port_in_use(service: str, key: str) -> None:
         port = taken.getsockname()[1]
         value = str(port) if key.endswith("port") else f"tcp://127.0.0.1:{port}"
         environment = {**own_addresses([service]), variable(service, key): value}
-        status, log = ended(*SERVICE, service, **environment)
+        status, log = run_to_end(*SERVICE, service, **environment)
     assert status == 2
     assert key in log
     assert "Traceback" not in log
@@ -67,7 +67,7 @@ def test_reports_a_port_in_use(service: str, key: str) -> None:
 
 @pytest.mark.parametrize("key", ["log_level", "driver.log_level"])
 def test_reports_a_wrong_setting_before_it_binds_anything(key: str) -> None:
-    status, log = ended(*SERVICE, "driver", "--set", f"{key}=loud")
+    status, log = run_to_end(*SERVICE, "driver", "--set", f"{key}=loud")
     assert status == 2
     assert "'loud' (from --set) is not one of" in log
     assert "driver.log_level" in log

@@ -42,7 +42,7 @@ def num_recordings() -> int:
 
 
 @pytest.mark.parametrize("name", ["", "player"])
-def test_records_until_the_reader_stops(name: str) -> None:
+def test_a_recording_continues_until_the_reader_stops(name: str) -> None:
     blocks = monitor(name).blocks
     assert num_recordings() == 0
     num_tones = 0

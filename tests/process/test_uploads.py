@@ -67,7 +67,7 @@ async def serve(uploads: Uploads) -> AsyncIterator[Post]:
             await runner.cleanup()
 
 
-def learner(program: str) -> MouthLearner:
+def fake_learner(program: str) -> MouthLearner:
     return MouthLearner((sys.executable, "-c", program))
 
 
@@ -89,7 +89,7 @@ async def wait_until_ended(process: int) -> None:
 
 @async_test
 async def test_answers_with_the_result_of_the_process() -> None:
-    async with serve(learner(REVERSE)) as post:
+    async with serve(fake_learner(REVERSE)) as post:
         assert await post() == (200, b"cba", "")
 
 
@@ -103,14 +103,14 @@ async def test_answers_with_the_result_of_the_process() -> None:
 )
 @async_test
 async def test_answers_with_the_error_of_the_learner(program: str, text: str) -> None:
-    async with serve(learner(program)) as post:
+    async with serve(fake_learner(program)) as post:
         assert await post() == error(422, text)
         assert await post() == error(422, text)  # and accepts the next one
 
 
 @async_test
-async def test_rejects_a_recording_that_is_too_large() -> None:
-    async with serve(learner(REVERSE)) as post:
+async def test_a_recording_that_is_too_large_is_rejected() -> None:
+    async with serve(fake_learner(REVERSE)) as post:
         assert await post(bytes(MAX_BYTES + 1)) == error(413, "the recording is larger than 8 MiB")
         assert (await post(bytes(MAX_BYTES)))[0] == 200
 
@@ -119,7 +119,7 @@ async def test_rejects_a_recording_that_is_too_large() -> None:
 async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
     tmp_path: Path,
 ) -> None:
-    hanging = learner(HANG)
+    hanging = fake_learner(HANG)
     async with serve(hanging) as post:
         path = tmp_path / "process"
         first = asyncio.ensure_future(post(str(path).encode()))
@@ -136,7 +136,7 @@ async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
 
 @async_test
 async def test_stops_learning_when_the_browser_disconnects(tmp_path: Path) -> None:
-    async with serve(learner(HANG)) as post:
+    async with serve(fake_learner(HANG)) as post:
         path = tmp_path / "process"
         request = asyncio.ensure_future(post(str(path).encode()))
         process = await process_in(path)
@@ -147,7 +147,7 @@ async def test_stops_learning_when_the_browser_disconnects(tmp_path: Path) -> No
 # --- sound files
 
 
-def written(suffix: str, channels: np.ndarray) -> bytes:
+def media_bytes(suffix: str, channels: np.ndarray) -> bytes:
     file = io.BytesIO()
     soundfile.write(file, channels, 16_000, format=suffix)
     return file.getvalue()
@@ -158,7 +158,7 @@ async def test_answers_a_file_with_its_sound() -> None:
     six = np.zeros((len(SINE), 6))
     six[:, 2] = SINE  # which browsers would mix into another sound than FFmpeg
     async with serve(SoundUpload()) as post:
-        status, data, warnings = await post(written("FLAC", six), "a film.flac")
+        status, data, warnings = await post(media_bytes("FLAC", six), "a film.flac")
     assert (status, warnings) == (200, "")
     samples, rate_hz = soundfile.read(io.BytesIO(data))
     assert rate_hz == 16_000
@@ -169,7 +169,7 @@ async def test_answers_a_file_with_its_sound() -> None:
 async def test_a_file_cannot_name_itself_like_a_module_or_a_path() -> None:
     async with serve(SoundUpload()) as post:
         for name in ("wave.py", "../../x", "-", "口型.wav"):
-            status, _, warnings = await post(written("WAV", SINE)[:40_000], name)
+            status, _, warnings = await post(media_bytes("WAV", SINE)[:40_000], name)
             assert status == 200
             assert "the file is cut off after 1.2 s of 2.0 s" in warnings
             assert "/" not in warnings.partition(":")[0]
@@ -182,6 +182,6 @@ async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch
         assert status == 422
         assert b"a.mp3: cannot read audio: this is text, not sound" in data
         monkeypatch.setattr(sound_upload, "MAX_BYTES", 1000)
-        status, data, _ = await post(written("WAV", SINE), "a.wav")
+        status, data, _ = await post(media_bytes("WAV", SINE), "a.wav")
         assert status == 413
         assert b"larger than" in data

@@ -40,7 +40,7 @@ def publish_all(control: FakeControl, session: str) -> None:
     control.publish(control.faps, FapFrame(**stamp, values=FACE, mask=bytes(MASK_BYTES)))
 
 
-async def until(condition: Callable[[], object]) -> None:
+async def wait_until_async(condition: Callable[[], object]) -> None:
     await asyncio.to_thread(wait_until, condition)
 
 
@@ -55,14 +55,14 @@ def async_test(test: Callable[..., Coroutine[None, None, None]]) -> Callable[...
 
 
 @asynccontextmanager
-async def connected(page: str, *paths: str) -> AsyncIterator[list[Socket]]:
+async def open_websockets(page: str, *paths: str) -> AsyncIterator[list[Socket]]:
     """Open a WebSocket for each path."""
     async with contextlib.AsyncExitStack() as stack:
         http = await stack.enter_async_context(aiohttp.ClientSession())
         yield [await stack.enter_async_context(http.ws_connect(page + path)) for path in paths]
 
 
-async def receive_of_session(viewer: Socket) -> aiohttp.WSMessage:
+async def receive_session_message(viewer: Socket) -> aiohttp.WSMessage:
     """Return the next message that is not the face at rest."""
     while True:
         message = await viewer.receive(LIMIT_S)

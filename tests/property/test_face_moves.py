@@ -54,7 +54,7 @@ def process_all(face: FaceAnimator, received: Sequence[SoundEvent]) -> list[Fram
 
 
 @lru_cache
-def undisturbed(lips: str) -> list[Frame]:
+def uninterrupted(lips: str) -> list[Frame]:
     return process_all(make_face(lips), events())
 
 
@@ -62,7 +62,7 @@ def time_of(event: SoundEvent) -> float:
     return event.onset_s if isinstance(event, Phone) else event.time_s
 
 
-def with_another_synthesizer(lips: str, cut: int) -> list[Frame]:
+def move_to_another_synthesizer(lips: str, cut: int) -> list[Frame]:
     """Resume on a new face: last frame, recent events, then new events."""
     before, after = events()[:cut], events()[cut:]
     frames = process_all(make_face(lips), before)
@@ -75,7 +75,7 @@ def with_another_synthesizer(lips: str, cut: int) -> list[Frame]:
     return frames + process_all(face, [*older, *kept, *after])
 
 
-def with_another_recognizer(lips: str, cut: int) -> list[Frame]:
+def move_to_another_recognizer(lips: str, cut: int) -> list[Frame]:
     """Continue with another recognizer that repeats events that may not be final."""
     before = events()[:cut]
     face = make_face(lips)
@@ -117,7 +117,7 @@ def steps(frames: Sequence[Frame]) -> NDArray[np.float32]:
 
 def assert_unseen(frames: Sequence[Frame], lips: str) -> None:
     """Check that every media time occurs once, and that steps are not larger than before."""
-    plain = undisturbed(lips)
+    plain = uninterrupted(lips)
     assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in plain]
     largest = steps(frames).max(axis=0) / np.maximum(steps(plain).max(axis=0), UNSEEN)
     too_large = {fap + 1: float(largest[fap]) for fap in np.flatnonzero(largest > LARGEST_STEP)}
@@ -131,7 +131,7 @@ def gaps(frames: Sequence[Frame]) -> NDArray[np.float32]:
 
 
 def assert_closed_in_time(frames: Sequence[Frame], lips: str) -> None:
-    plain, moved = gaps(undisturbed(lips)), gaps(frames)
+    plain, moved = gaps(uninterrupted(lips)), gaps(frames)
     for number in np.flatnonzero(plain < CLOSED):
         assert moved[max(0, number - 1) : number + 2].min() < NEARLY_CLOSED
 
@@ -140,7 +140,7 @@ cuts = st.integers(0, 10_000).map(lambda number: number % (len(events()) - 60) +
 lip_models = st.sampled_from(["learned", "dynamic-visemes", "ferguson"])
 
 
-MOVES = [with_another_synthesizer, with_another_recognizer]
+MOVES = [move_to_another_synthesizer, move_to_another_recognizer]
 
 
 @settings(max_examples=16)
@@ -154,7 +154,7 @@ def test_another_process_continues_anywhere(
 
 
 def test_stress_before_a_move_causes_no_brow_movement_after_it() -> None:
-    assert_unseen(with_another_synthesizer("learned", 143), "learned")
+    assert_unseen(move_to_another_synthesizer("learned", 143), "learned")
 
 
 @pytest.mark.parametrize("fap", [JAW, LOWER_LIP, EYELID, HEAD_PITCH])
@@ -162,7 +162,7 @@ def test_stress_before_a_move_causes_no_brow_movement_after_it() -> None:
 def test_continues_during_the_largest_movement(
     move: Callable[[str, int], list[Frame]], fap: int
 ) -> None:
-    plain = undisturbed("learned")
+    plain = uninterrupted("learned")
     shown_s = plain[int(steps(plain)[20:, fap - 1].argmax()) + 20][0]
     known_s = shown_s + lip_model_info("learned").delay_ms / 1e3
     cut = next(

@@ -29,13 +29,13 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
-from tests.control_stage import LOCAL, PROVIDED, beat
+from tests.control_harness import ENDPOINTS_BY_SERVICE, LOCAL, make_heartbeat
 from tests.samples import SAMPLES
 from tests.system import free_port
 
 NO_CONTROL = f"tcp://127.0.0.1:{free_port()}"
 MAX_SESSIONS = 4
-WORKERS = [replace(beat(kind), instance=f"{kind}-1") for kind in PROVIDED]
+WORKERS = [replace(make_heartbeat(kind), instance=f"{kind}-1") for kind in ENDPOINTS_BY_SERVICE]
 START = replace(
     cast(StartSession, SAMPLES["start-session"]),
     paced=False,
@@ -164,7 +164,7 @@ class Peers:
 
 @settings(max_examples=40)
 @given(ACTIONS, st.booleans())
-def test_control_answers_after_anything(actions: list[tuple[str, Any]], as_worker: bool) -> None:
+def test_control_answers_after_any_attack(actions: list[tuple[str, Any]], as_worker: bool) -> None:
     config = ControlConfig(control=LOCAL, events=LOCAL, insecure=True, max_sessions=MAX_SESSIONS)
     service = ControlService(config)
     peers = Peers(service, service._commands, service._events)
@@ -202,7 +202,7 @@ def synthesizer() -> tuple[SessionService, Socket, Socket]:
 @pytest.mark.parametrize("worker", [recognizer, synthesizer])
 @settings(max_examples=25)
 @given(actions=ACTIONS)
-def test_a_worker_answers_after_anything(
+def test_a_worker_answers_after_any_attack(
     worker: Callable[[], tuple[SessionService, Socket, Socket]], actions: list[tuple[str, Any]]
 ) -> None:
     service, router, publisher = worker()

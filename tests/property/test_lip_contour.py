@@ -51,12 +51,12 @@ def assert_no_sick_shape(openings: Sequence[float] | NDArray[np.float64]) -> Non
 
 
 @given(openings=OPENINGS)
-def test_has_no_sick_shape_at_any_opening(openings: list[float]) -> None:
+def test_no_opening_has_a_sick_shape(openings: list[float]) -> None:
     assert_no_sick_shape(openings)
 
 
 @given(steps=KEY_FRAMES)
-def test_moves_without_jumps(steps: list[tuple[float, float]]) -> None:
+def test_the_contour_moves_without_jumps(steps: list[tuple[float, float]]) -> None:
     times_s = np.cumsum([length_s for length_s, _ in steps])
     motion = KeyFrames(times_s, np.array([opening for _, opening in steps]))
     moments_s = np.arange(-0.1, times_s[-1] + 0.1, 0.005)

@@ -28,7 +28,7 @@ def pieces(samples: np.ndarray, cuts: list[int]) -> list[np.ndarray]:
 
 
 @cache
-def the_model(name: str = "blocks") -> AcousticModel:
+def cached_model(name: str = "blocks") -> AcousticModel:
     return load_model(name)
 
 
@@ -49,7 +49,7 @@ def test_chunks_do_not_affect_resampling(cuts: list[int], rate_hz: int) -> None:
 @settings(max_examples=30)
 @given(cuts=CUTS, name=st.sampled_from(["gmm", "blocks"]))
 def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
-    model = the_model(name)
+    model = cached_model(name)
     front_end = model.create_front_end()
     parts = [front_end.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
     whole = model.create_front_end().accept_waveform(NOISE)
@@ -80,7 +80,7 @@ def test_frames_with_low_confidence_do_not_count() -> None:
 def test_a_search_continues_from_the_state_of_another(
     seed: int, num_frames: int, data: st.DataObject
 ) -> None:
-    topology = the_model().topology
+    topology = cached_model().topology
     rng = np.random.default_rng(seed)
     rows = rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32)
     at = data.draw(st.integers(0, num_frames - 1))
@@ -108,8 +108,8 @@ def scores_of(topology: Topology, phones: list[str], frames_per_state: int) -> n
     return rows.repeat(frames_per_state, axis=0)
 
 
-def test_withdraws_surplus_phones() -> None:
-    topology = the_model().topology
+def test_surplus_phones_are_withdrawn() -> None:
+    topology = cached_model().topology
     rows = scores_of(topology, ["h", "ao", "m", "a"], 10)
     other = scores_of(topology, ["b", "a", "d", "e", "g", "u"], 1)
     decoder = LiveDecoder(topology, OutputRuleConfig(1, 0.0))

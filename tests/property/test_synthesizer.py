@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.full_model import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import CLOSURE_FAPS, VISEME_INDEX
@@ -63,7 +63,7 @@ levels = st.lists(st.floats(-90.0, 0.0), max_size=40)
 
 @examples
 @given(phones=utterances(), levels_db=levels)
-def test_full_model_closes_lips_at_every_rate_and_level(
+def test_the_full_model_closes_lips_at_every_rate_and_level(
     phones: list[Phone], levels_db: list[float]
 ) -> None:
     rate_hz = 200.0
@@ -82,7 +82,7 @@ def test_full_model_closes_lips_at_every_rate_and_level(
     delay_s=st.floats(0.0, 0.3),
     notice_s=st.floats(0.02, 0.3),
 )
-def test_live_closes_lips_recognized_before_the_apex(
+def test_live_lips_close_for_phones_recognized_before_the_apex(
     phones: list[Phone], levels_db: list[float], delay_s: float, notice_s: float
 ) -> None:
     apexes_s = [phone.onset_s + min(0.5 * phone.duration_s, EDGE_S) for phone in phones]

@@ -1,4 +1,4 @@
-"""A made-up language of seven phones and silence, spelt as it is spoken: a letter is a phone.
+"""A made-up language of seven phones and silence, spelled as it is spoken: a letter is a phone.
 
 The tests install it as a distribution would be (see ``tests.languages.install_language``).
 """

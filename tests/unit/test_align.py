@@ -46,7 +46,7 @@ PHONES = [
 ]
 
 
-def test_csv_json_table_and_textgrid() -> None:
+def test_alignments_are_written_as_csv_json_table_and_textgrid() -> None:
     rows = list(csv.DictReader(io.StringIO(format_phones(PHONES, "csv", 1.0))))
     assert [(row["phone"], row["onset_s"]) for row in rows][:2] == [("n", "0.25"), ("i", "0.35")]
     read = json.loads(format_phones(PHONES, "json", 1.0))

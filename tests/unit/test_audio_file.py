@@ -107,7 +107,7 @@ def test_reads_a_wav_file_whose_header_states_no_length(
         ("WAV", 32, 31, 1.0),
     ],
 )
-def test_loses_no_channel(
+def test_every_channel_is_heard_in_the_mix(
     tmp_path: Path, file_format: str, num_channels: int, channel: int, gain: float
 ) -> None:
     channels = np.zeros((8000, num_channels))
@@ -127,7 +127,7 @@ def test_uses_one_channel_of_two_that_cancel_each_other(tmp_path: Path) -> None:
     assert "only channel 1 is used" in warning
 
 
-def test_keeps_two_channels_unchanged(tmp_path: Path) -> None:
+def test_two_channels_stay_unchanged(tmp_path: Path) -> None:
     samples = np.random.default_rng(2).uniform(-0.5, 0.5, (5000, 2)).astype(np.float32)
     samples[1000:2000, 1] = -samples[1000:2000, 0]  # cancels, but only for a while
     soundfile.write(tmp_path / "a.wav", samples, 16000, subtype="FLOAT")
@@ -160,7 +160,7 @@ def test_reads_the_formats_of_phones_and_browsers(
 
 
 @pytest.mark.parametrize("suffix", ["ul", "al", "sw"])
-def test_does_not_guess_the_rate_of_samples_without_a_header(tmp_path: Path, suffix: str) -> None:
+def test_samples_without_a_header_are_rejected(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"call.{suffix}"
     path.write_bytes(bytes(range(1, 200)) * 50)
     with pytest.raises(UserError, match="samples without a header; convert them to wav"):

@@ -101,7 +101,7 @@ def test_finds_a_format_after_padding_and_within_an_mp3_frame(
 
 
 @pytest.mark.parametrize("subtype", ["G721_32", "NMS_ADPCM_32"])
-def test_rejects_wav_codecs_that_ffmpeg_takes_for_others(
+def test_wav_codecs_that_ffmpeg_misidentifies_are_rejected(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, subtype: str
 ) -> None:
     path = tmp_path / "a.wav"
@@ -199,7 +199,7 @@ def test_reports_the_length_of_a_cut_wav_pipe_with_a_high_rate(
 
 
 @pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])
-def test_sound_is_there_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
+def test_samples_arrive_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     if path.suffix == ".webm":
         write_media(path, "libopus", SPEECH.repeat(3), 48_000)
@@ -223,7 +223,9 @@ def test_reports_a_cut_flv_pipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
         assert len([*source.blocks]) > 0
 
 
-def test_reads_raw_samples_if_no_format_fits_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_raw_samples_are_read_with_a_notice_if_no_format_fits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     values = np.arange(-1000, 1000, dtype="<i2")
     source = _open(monkeypatch, values.tobytes() + b"\x01")
     np.testing.assert_allclose(np.concatenate([*source.blocks]).ravel() * 32768, values)

@@ -311,7 +311,7 @@ def test_eye_bones_of_a_vrm_turn_the_eyes(tmp_path: Path, version: int, fap: str
     ],
     ids=["no mouth", "no shapes", "two avatars"],
 )
-def test_says_why_an_avatar_cannot_speak(
+def test_the_error_says_why_an_avatar_cannot_speak(
     tmp_path: Path, kept: list[str], shift: float, said: str
 ) -> None:
     parts = meshes({name: SHAPES[name] for name in kept})

@@ -22,12 +22,12 @@ JAW = MOUTH_FAPS.index(3)
 
 def phones(text: str, start_s: float = 0.5) -> list[Phone]:
     """Return consecutive phones from text such as "b:0.08 a:0.2"."""
-    made: list[Phone] = []
+    new_phones: list[Phone] = []
     for word in text.split():
         symbol, duration = word.split(":")
-        made.append(phone(len(made), symbol, start_s, float(duration)))
+        new_phones.append(phone(len(new_phones), symbol, start_s, float(duration)))
         start_s += float(duration)
-    return made
+    return new_phones
 
 
 def curve(text: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,5 +70,7 @@ def array(*values: float) -> NDArray[np.float64]:
 
 def test_closure_has_the_ends_of_wang_and_cai_eq_7() -> None:
     viseme, others = array(-1.0, -1.0, -1.0), array(2.0, 2.0, 2.0)
-    got = log_closure(viseme, others, array(0.07, 0.0, -0.2), reach_s=0.07, closure_ratio=25.0)
-    np.testing.assert_allclose(got, [-1.0, math.log(25.0) + 2.0, -1.0])
+    log_weight = log_closure(
+        viseme, others, array(0.07, 0.0, -0.2), reach_s=0.07, closure_ratio=25.0
+    )
+    np.testing.assert_allclose(log_weight, [-1.0, math.log(25.0) + 2.0, -1.0])

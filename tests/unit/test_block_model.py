@@ -15,9 +15,9 @@ from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
-from kouxing.training.blocks.export import onnx_of
-from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout, layout
-from kouxing.training.networks.network import Shape
+from kouxing.training.blocks.export import export_onnx
+from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout, block_layout
+from kouxing.training.networks.network import EncoderShape
 from tests.system import DEMO
 
 pytestmark = [pytest.mark.usefixtures("one_thread")]
@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.usefixtures("one_thread")]
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 FRAMES = np.resize(WhisperMel().accept_waveform(HELLO), (330, 80))  # more than a past
 FRAMES[40, 7] = FRAMES[:40].max() - 3.0  # below the floor
-SMALL = partial(Shape, width=32, heads=2, layers=4, inner=48)
+SMALL = partial(EncoderShape, width=32, heads=2, layers=4, inner=48)
 BLOCK, RIGHT = 5, 10
 LENGTH = BLOCK + RIGHT
 SCALE = np.float32(0.5)
@@ -50,7 +50,7 @@ def blocks() -> BlockModel:
     assert isinstance(shipped, BlockModel)
     return BlockModel(
         topology=shipped.topology,
-        network=onnx_of(*networks(shipped.topology.num_states), BLOCK),
+        network=export_onnx(*networks(shipped.topology.num_states), BLOCK),
         log_prior=shipped.log_prior,
         acoustic_scale=float(SCALE),
     )
@@ -65,13 +65,13 @@ def torch_scores(frames: np.ndarray, block_length: int, right_context: int = RIG
     """Return the scores of a recording's blocks, (blocks, 2 (B + R), states)."""
     encoder, readout = networks()
     num_positions = (len(frames) + 1) // 2
-    laid = layout(num_positions, block_length, right_context)
+    layout = block_layout(num_positions, block_length, right_context)
     repeated = np.repeat(frames[-1:], 2 * num_positions + 1 - len(frames), axis=0)
     with torch.no_grad():
-        features = encoder(torch.from_numpy(np.concatenate([frames, repeated]))[None], laid)
-        rows = readout.read(features, laid)[0].numpy()
+        features = encoder(torch.from_numpy(np.concatenate([frames, repeated]))[None], layout)
+        rows = readout.read(features, layout)[0].numpy()
     scores = SCALE * (rows - blocks().log_prior)
-    by_block: np.ndarray = scores[laid.blocks.numpy()].reshape(len(laid.blocks), -1, 180)
+    by_block: np.ndarray = scores[layout.blocks.numpy()].reshape(len(layout.blocks), -1, 180)
     return by_block
 
 
@@ -141,9 +141,9 @@ def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
     changes: list[tuple[dict[str, np.ndarray], str]] = [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
         ({"network": read_archive(ENCODER_PATH).array("network", None)}, "has the inputs"),
-        ({"network": onnx_of(*networks(), BLOCK, past=6000)}, "has the sizes"),  # much memory
+        ({"network": export_onnx(*networks(), BLOCK, past=6000)}, "has the sizes"),  # much memory
         (
-            {"network": onnx_of(*networks(178), BLOCK)},
+            {"network": export_onnx(*networks(178), BLOCK)},
             r"its network outputs the shape \(1, 30, 178\)",
         ),
         ({"log_prior": np.zeros(7, np.float32)}, "log_prior has shape"),

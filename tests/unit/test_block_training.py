@@ -41,7 +41,7 @@ def test_trains_resumes_and_writes_model_and_card(
     start: str,
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("kouxing.training.networks.whisper.Shape", SMALL)
+    monkeypatch.setattr("kouxing.training.networks.whisper.EncoderShape", SMALL)
     corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
     output = tmp_path / "blocks.npz"
     train = partial(
@@ -55,7 +55,7 @@ def test_trains_resumes_and_writes_model_and_card(
         seed=1,
     )
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "onnx_of", interrupt)
+        patch.setattr(recipe, "export_onnx", interrupt)
         with pytest.raises(KeyboardInterrupt):
             train(num_steps=2)
     train(num_steps=3)

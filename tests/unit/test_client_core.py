@@ -41,7 +41,7 @@ CONTROL_STATE = {
 }
 
 
-class Scene:
+class CoreHarness:
     """A core with one session."""
 
     def __init__(self, *, paced: bool = True) -> None:
@@ -94,123 +94,125 @@ def test_client_and_product_have_the_same_shape_names() -> None:
 
 
 def test_repeats_a_request_until_the_time_limit() -> None:
-    scene = Scene()
-    answer = scene.core.request("flush-session", "s")
+    harness = CoreHarness()
+    answer = harness.core.request("flush-session", "s")
     for _ in range(3):
-        scene.pass_time(RETRY_S)
-    requests = [fields["request"] for kind, fields in scene.commands.sent if kind.startswith("flu")]
+        harness.pass_time(RETRY_S)
+    requests = [
+        fields["request"] for kind, fields in harness.commands.sent if kind.startswith("flu")
+    ]
     assert len(requests) == 4
     assert len(set(requests)) == 1
-    scene.pass_time(10.0)
+    harness.pass_time(10.0)
     assert "Start it with 'kouxing run'" in str(answer.exception(0))
-    scene.commands.on_refused(True)
-    answer = scene.core.request("flush-session", "s")
-    scene.pass_time(10.1)
+    harness.commands.on_refused(True)
+    answer = harness.core.request("flush-session", "s")
+    harness.pass_time(10.1)
     assert "refuses this client" in str(answer.exception(0))
-    scene.sockets.reach_error = "another program answers there"
-    answer = scene.core.request("flush-session", "s")
-    scene.pass_time(10.1)
+    harness.sockets.reach_error = "another program answers there"
+    answer = harness.core.request("flush-session", "s")
+    harness.pass_time(10.1)
     assert "control does not answer: another program" in str(answer.exception(0))
-    scene.pass_time(10.0)
-    assert scene.sockets.num_explained == 3  # an idle client does not connect again and again
+    harness.pass_time(10.0)
+    assert harness.sockets.num_explained == 3  # an idle client does not connect again and again
 
 
 def test_status_collects_all_pages() -> None:
-    scene = Scene()
-    status = scene.core.status("")
-    scene.answer("status-report", services=[CONTROL_STATE], sessions=[], next=7)
-    assert scene.commands.sent[-1][1]["after"] == 7
+    harness = CoreHarness()
+    status = harness.core.status("")
+    harness.answer("status-report", services=[CONTROL_STATE], sessions=[], next=7)
+    assert harness.commands.sent[-1][1]["after"] == 7
     state = {**STATE, "session": "s", "endpoints": {}}
-    scene.answer("status-report", services=[], sessions=[state], next=None)
+    harness.answer("status-report", services=[], sessions=[state], next=None)
     assert [one.service for one in status.result().services] == ["control"]
     assert [one.session for one in status.result().sessions] == ["s"]
 
 
 def test_a_moved_session_sends_the_new_recognizer_what_it_needs() -> None:
-    scene = Scene()
-    scene.push(5)
-    old = scene.audio()
-    scene.commands.answer("session-moved", **MOVED, next_sequence=3)
-    scene.core.tick()
+    harness = CoreHarness()
+    harness.push(5)
+    old = harness.audio()
+    harness.commands.answer("session-moved", **MOVED, next_sequence=3)
+    harness.core.tick()
     assert not old.is_open
-    assert sequences(scene.audio(2)) == [3, 4, 5]
-    assert {fields["epoch"] for _, fields in scene.audio(2).sent} == {2}
-    scene.commands.answer("session-moved", **MOVED, next_sequence=3)  # control may repeat it
-    scene.push(1)
-    assert sequences(scene.audio(2)) == [3, 4, 5, 6]
+    assert sequences(harness.audio(2)) == [3, 4, 5]
+    assert {fields["epoch"] for _, fields in harness.audio(2).sent} == {2}
+    harness.commands.answer("session-moved", **MOVED, next_sequence=3)  # control may repeat it
+    harness.push(1)
+    assert sequences(harness.audio(2)) == [3, 4, 5, 6]
     moved = {**MOVED, "epoch": 3, "phones": "phones 3"}  # the recognizer stays
-    scene.commands.answer("session-moved", **moved)
-    scene.push(1)
-    assert sequences(scene.audio(2)) == [3, 4, 5, 6, 7]
+    harness.commands.answer("session-moved", **moved)
+    harness.push(1)
+    assert sequences(harness.audio(2)) == [3, 4, 5, 6, 7]
 
 
 def test_reconnects_and_resends_if_acknowledgements_stop() -> None:
-    scene = Scene()
-    scene.push(3)
-    dead = scene.audio()
+    harness = CoreHarness()
+    harness.push(3)
+    dead = harness.audio()
     dead.answer("acknowledge", sequence=1)
-    scene.pass_time(ANSWER_LIMITS_S[0] + 0.1)
+    harness.pass_time(ANSWER_LIMITS_S[0] + 0.1)
     assert not dead.is_open
-    assert sequences(scene.audio()) == [2, 3]
-    assert scene.audio().connect_ms < 300, "the round trip was shorter"
+    assert sequences(harness.audio()) == [2, 3]
+    assert harness.audio().connect_ms < 300, "the round trip was shorter"
 
 
 def test_audio_waits_for_subscriptions_so_that_no_frame_is_missed() -> None:
-    scene = Scene()
-    scene.subscribe()
-    scene.confirm()
-    scene.push(2)
-    scene.audio().answer("acknowledge", sequence=1)
-    scene.pass_time(ANSWER_LIMITS_S[0] + 0.1)
-    assert sequences(scene.audio()) == []
-    scene.pass_time(RESUBSCRIBE_S)
-    assert sequences(scene.audio()) == [2]
+    harness = CoreHarness()
+    harness.subscribe()
+    harness.confirm()
+    harness.push(2)
+    harness.audio().answer("acknowledge", sequence=1)
+    harness.pass_time(ANSWER_LIMITS_S[0] + 0.1)
+    assert sequences(harness.audio()) == []
+    harness.pass_time(RESUBSCRIBE_S)
+    assert sequences(harness.audio()) == [2]
 
 
 def test_an_unknown_session_ends_unless_it_moves() -> None:
-    scene = Scene()
-    scene.push(1)
-    scene.audio().answer("error", code="unknown-session", text="x")
-    scene.audio().answer("error", code="bad-audio", text="y")
-    assert [error.code for error in scene.session.errors] == ["bad-audio"]
-    scene.commands.answer("session-moved", **MOVED, next_sequence=1)
-    scene.pass_time(MOVE_LIMIT_S + 0.1)
-    assert not scene.session.is_over
-    scene.audio(2).answer("error", code="unknown-session", text="x")
-    scene.pass_time(MOVE_LIMIT_S + 0.1)
-    assert scene.session.is_over
-    assert "unknown-session" in str(scene.session.failure)
+    harness = CoreHarness()
+    harness.push(1)
+    harness.audio().answer("error", code="unknown-session", text="x")
+    harness.audio().answer("error", code="bad-audio", text="y")
+    assert [error.code for error in harness.session.errors] == ["bad-audio"]
+    harness.commands.answer("session-moved", **MOVED, next_sequence=1)
+    harness.pass_time(MOVE_LIMIT_S + 0.1)
+    assert not harness.session.is_over
+    harness.audio(2).answer("error", code="unknown-session", text="x")
+    harness.pass_time(MOVE_LIMIT_S + 0.1)
+    assert harness.session.is_over
+    assert "unknown-session" in str(harness.session.failure)
 
 
 @pytest.mark.parametrize("is_there", [True, False])
 def test_asks_where_a_silent_session_of_another_program_is(is_there: bool) -> None:
-    scene = Scene()
-    following = scene.core.follow("other", is_live=True)
+    harness = CoreHarness()
+    following = harness.core.follow("other", is_live=True)
     endpoints = {"audio": "a", "phones": "phones 1", "faps": "faps 1"}
     state = {**STATE, "session": "other", "endpoints": endpoints}
-    scene.answer("status-report", services=[CONTROL_STATE], sessions=[state])
-    scene.session = following.result()
-    inbox = scene.subscribe()
-    scene.confirm()
-    scene.pass_time(SILENT_S + 0.1)
-    assert scene.commands.sent[-1][0] == "status-request"
+    harness.answer("status-report", services=[CONTROL_STATE], sessions=[state])
+    harness.session = following.result()
+    inbox = harness.subscribe()
+    harness.confirm()
+    harness.pass_time(SILENT_S + 0.1)
+    assert harness.commands.sent[-1][0] == "status-request"
     if is_there:
         state["endpoints"] = {**endpoints, "faps": "faps 2"}
-        scene.answer("status-report", services=[], sessions=[state])
-        assert scene.sockets.at("faps 2")
+        harness.answer("status-report", services=[], sessions=[state])
+        assert harness.sockets.at("faps 2")
         assert not inbox.is_over
     else:
-        scene.answer("error", code="unknown-session", text="x")
+        harness.answer("error", code="unknown-session", text="x")
         assert inbox.is_over
         assert inbox.failure is None
 
 
 def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
-    scene = Scene()
-    inbox = scene.subscribe()
+    harness = CoreHarness()
+    inbox = harness.subscribe()
     for is_refused in (True, False, True, True):  # the first refusal is short
-        scene.commands.on_refused(is_refused)
+        harness.commands.on_refused(is_refused)
         assert not inbox.is_over
-        scene.pass_time(6.0)
+        harness.pass_time(6.0)
     assert inbox.is_over
     assert "refuses this client" in str(inbox.failure)

@@ -1,4 +1,4 @@
-"""A follower takes each message of a session once, through moves and reconnections."""
+"""A follower passes on each message of a session once, through moves and reconnections."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.fake_sockets import FakeConnection, FakeSockets
 PHONES, FAPS, OTHER_FAPS = "phones", "faps", "other faps"
 
 
-class Scene:
+class FollowerHarness:
     """A follower of frames, sounds and the end, and its connections."""
 
     def __init__(self, epoch: int = 1) -> None:
@@ -33,7 +33,7 @@ class Scene:
     def start(self, epoch: int, faps: str = FAPS) -> None:
         self.follower.start(epoch, {"phones": PHONES, "faps": faps})
 
-    def complete(self) -> Scene:
+    def complete(self) -> FollowerHarness:
         """Confirm the newest subscription."""
         for publisher in ("a", "b"):
             self.connection.on_message(Joined(publisher=publisher))
@@ -59,88 +59,93 @@ def sound(sequence: int, epoch: int = 1) -> Sound:
 
 
 def test_subscribes_again_until_every_publisher_confirms() -> None:
-    scene = Scene()
-    first = scene.connection
+    harness = FollowerHarness()
+    first = harness.connection
     for _ in range(2):
         first.on_message(Joined(publisher="a"))
-    assert not scene.follower.is_complete, "only one has confirmed"
-    scene.sockets.now_s += RETRY_S
-    scene.follower.tick()
+    assert not harness.follower.is_complete, "only one has confirmed"
+    harness.sockets.now_s += RETRY_S
+    harness.follower.tick()
     assert not first.is_open
-    assert scene.connection is not first
-    scene.complete()
-    scene.sockets.now_s += 10 * RETRY_S
-    scene.follower.tick()
-    assert len(scene.sockets.connections) == 2
+    assert harness.connection is not first
+    harness.complete()
+    harness.sockets.now_s += 10 * RETRY_S
+    harness.follower.tick()
+    assert len(harness.sockets.connections) == 2
 
 
 def test_follows_a_move_to_another_publisher() -> None:
-    scene = Scene().complete()
-    old = scene.connection
-    scene.publish(EndOfFaps(epoch=1))
-    assert scene.follower.has_ended
-    scene.start(2, OTHER_FAPS)
-    assert not scene.follower.is_complete
-    scene.complete()
-    scene.received.clear()
+    harness = FollowerHarness().complete()
+    old = harness.connection
+    harness.publish(EndOfFaps(epoch=1))
+    assert harness.follower.has_ended
+    harness.start(2, OTHER_FAPS)
+    assert not harness.follower.is_complete
+    harness.complete()
+    harness.received.clear()
     left_over = frame(2, epoch=1)
-    scene.publish(frame(1, epoch=2), left_over, frame(2, epoch=2))
-    assert scene.received == [frame(1, epoch=2), frame(2, epoch=2)]
-    assert scene.epochs == [2]
-    assert not scene.follower.has_ended
-    assert scene.follower.num_outdated == 1
+    harness.publish(frame(1, epoch=2), left_over, frame(2, epoch=2))
+    assert harness.received == [frame(1, epoch=2), frame(2, epoch=2)]
+    assert harness.epochs == [2]
+    assert not harness.follower.has_ended
+    assert harness.follower.num_outdated == 1
     assert old.is_open, "the publisher of phones is still connected there"
-    scene.sockets.now_s += OVERLAP_S
-    scene.follower.tick()
+    harness.sockets.now_s += OVERLAP_S
+    harness.follower.tick()
     assert not old.is_open
 
 
 def test_drops_copies_from_a_second_connection() -> None:
-    scene = Scene().complete()
-    old = scene.connection
+    harness = FollowerHarness().complete()
+    old = harness.connection
     for _ in range(2):  # it connects again, and once more before that is complete
-        scene.start(1)
-    assert len([one for one in scene.sockets.connections if one.is_open]) == 2
-    scene.complete()
-    for connection, number in ((old, 1), (old, 3), (scene.connection, 2), (scene.connection, 3)):
+        harness.start(1)
+    assert len([one for one in harness.sockets.connections if one.is_open]) == 2
+    harness.complete()
+    for connection, number in (
+        (old, 1),
+        (old, 3),
+        (harness.connection, 2),
+        (harness.connection, 3),
+    ):
         connection.on_message(sound(number))
     old.unread.append(sound(4))
-    scene.sockets.now_s += OVERLAP_S
-    scene.follower.tick()
-    assert scene.received == [sound(number) for number in (1, 3, 2, 4)]
+    harness.sockets.now_s += OVERLAP_S
+    harness.follower.tick()
+    assert harness.received == [sound(number) for number in (1, 3, 2, 4)]
 
 
 def test_drops_what_a_publisher_repeats_for_others() -> None:
-    scene = Scene().complete()
-    scene.publish(*map(sound, (1, 2, 1, 2, 3)))
-    assert scene.received == [sound(1), sound(2), sound(3)]
+    harness = FollowerHarness().complete()
+    harness.publish(*map(sound, (1, 2, 1, 2, 3)))
+    assert harness.received == [sound(1), sound(2), sound(3)]
 
 
 def test_a_new_epoch_of_one_publisher_drops_nothing_of_another() -> None:
-    scene = Scene().complete()
-    scene.publish(frame(1, epoch=2), sound(1, epoch=1))
-    assert scene.received == [frame(1, epoch=2), sound(1, epoch=1)]
-    assert scene.follower.epoch == 2
+    harness = FollowerHarness().complete()
+    harness.publish(frame(1, epoch=2), sound(1, epoch=1))
+    assert harness.received == [frame(1, epoch=2), sound(1, epoch=1)]
+    assert harness.follower.epoch == 2
 
 
 def test_a_publisher_may_report_a_new_epoch_before_control_does() -> None:
-    scene = Scene().complete()
-    scene.publish(frame(5), frame(8), EndOfFaps(epoch=1), frame(9, epoch=2))
-    assert scene.follower.num_missed == 2
-    assert scene.epochs == [2]
-    assert not scene.follower.has_ended
-    scene.start(2)
-    assert scene.epochs == [2]
+    harness = FollowerHarness().complete()
+    harness.publish(frame(5), frame(8), EndOfFaps(epoch=1), frame(9, epoch=2))
+    assert harness.follower.num_missed == 2
+    assert harness.epochs == [2]
+    assert not harness.follower.has_ended
+    harness.start(2)
+    assert harness.epochs == [2]
 
 
 def test_drops_old_live_frames_after_the_process_was_suspended() -> None:
-    scene = Scene().complete()
+    harness = FollowerHarness().complete()
     frames = [frame(number) for number in range(1, 31)]
-    scene.publish(frames[0])
-    scene.sockets.resumed_at_s = scene.sockets.now_s
-    scene.publish(*frames[1:-1])
-    assert scene.received == frames[:1]
-    scene.sockets.now_s += CATCH_UP_S
-    scene.publish(frames[-1])
-    assert scene.received == [frames[0], *frames[-1 - MAX_HELD_FRAMES :]]
-    assert scene.follower.num_missed == 28 - MAX_HELD_FRAMES
+    harness.publish(frames[0])
+    harness.sockets.resumed_at_s = harness.sockets.now_s
+    harness.publish(*frames[1:-1])
+    assert harness.received == frames[:1]
+    harness.sockets.now_s += CATCH_UP_S
+    harness.publish(frames[-1])
+    assert harness.received == [frames[0], *frames[-1 - MAX_HELD_FRAMES :]]
+    assert harness.follower.num_missed == 28 - MAX_HELD_FRAMES

@@ -230,7 +230,9 @@ def test_the_file_for_all_hosts_in_the_docs_is_valid(tmp_path: Path) -> None:
         ("", "tcp://10.0.0.2:5571", "tcp://10.0.0.2:5571"),
     ],
 )
-def test_others_get_the_advertised_address(advertise: str, bound: str, reachable: str) -> None:
+def test_other_hosts_receive_the_advertised_address(
+    advertise: str, bound: str, reachable: str
+) -> None:
     assert SynthesizerConfig(advertise=advertise).reachable(bound) == reachable
 
 

@@ -22,7 +22,7 @@ from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.tarpit import GAP_S, HOLD_S
 
 
-class Scene:
+class SocketHarness:
     """A bound socket for audio; descriptor and inode of a connection are the same number."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
@@ -57,8 +57,8 @@ class Scene:
 
 
 @pytest.fixture
-def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
-    return Scene(monkeypatch)
+def harness(monkeypatch: pytest.MonkeyPatch) -> SocketHarness:
+    return SocketHarness(monkeypatch)
 
 
 def test_a_budget_recovers_and_a_blocked_one_recovers_later() -> None:
@@ -76,135 +76,137 @@ def test_a_budget_recovers_and_a_blocked_one_recovers_later() -> None:
     assert budget.left > 0
 
 
-def test_disconnects_a_peer_whose_message_does_not_end(scene: Scene) -> None:
-    hostile, honest = scene.deliver(1), scene.deliver(2)
-    scene.enforce_limits(0.0)
+def test_disconnects_a_peer_whose_message_does_not_end(harness: SocketHarness) -> None:
+    hostile, honest = harness.deliver(1), harness.deliver(2)
+    harness.enforce_limits(0.0)
     for look in range(1, 100):
-        scene.socket.num_polls += 1
-        scene.deliver(2)
-        scene.traffic = dict.fromkeys((1, 2), Traffic(read=20_000 * look))
-        scene.enforce_limits(float(look))
+        harness.socket.num_polls += 1
+        harness.deliver(2)
+        harness.traffic = dict.fromkeys((1, 2), Traffic(read=20_000 * look))
+        harness.enforce_limits(float(look))
     assert hostile.is_disconnected
     assert not honest.is_disconnected
 
 
-def test_does_not_wake_the_loop_for_an_incomplete_message(scene: Scene) -> None:
-    scene.limiter.waker = waker = mock.Mock()
-    scene.deliver(1)
-    scene.enforce_limits(0.0)
+def test_does_not_wake_the_loop_for_an_incomplete_message(harness: SocketHarness) -> None:
+    harness.limiter.waker = waker = mock.Mock()
+    harness.deliver(1)
+    harness.enforce_limits(0.0)
     for read, number in ((300, 0), (400, 1)):
-        scene.traffic[1] = Traffic(read=read)
+        harness.traffic[1] = Traffic(read=read)
         for look in range(10):
-            scene.enforce_limits(10.0 * number + look)
-            scene.socket.num_polls += 1  # each time that the loop waits
+            harness.enforce_limits(10.0 * number + look)
+            harness.socket.num_polls += 1  # each time that the loop waits
         assert waker.wake.called
         waker.wake.reset_mock()
-        scene.enforce_limits(10.0 * number + 10.0)
+        harness.enforce_limits(10.0 * number + 10.0)
         assert not waker.wake.called
 
 
-def test_sheds_the_owner_with_the_most_undelivered_bytes(scene: Scene) -> None:
-    scene.patch.setattr(connections, "MAX_UNDELIVERED", 700_000)
-    many = [scene.deliver(number, "many") for number in (1, 2, 3)]
-    single = scene.deliver(4, "single")
-    scene.enforce_limits(0.0)
-    scene.traffic = dict.fromkeys((1, 2, 3), Traffic(read=200_000))
-    scene.traffic[4] = Traffic(read=300_000)
-    scene.enforce_limits(1.0)
+def test_sheds_the_owner_with_the_most_undelivered_bytes(harness: SocketHarness) -> None:
+    harness.patch.setattr(connections, "MAX_UNDELIVERED", 700_000)
+    many = [harness.deliver(number, "many") for number in (1, 2, 3)]
+    single = harness.deliver(4, "single")
+    harness.enforce_limits(0.0)
+    harness.traffic = dict.fromkeys((1, 2, 3), Traffic(read=200_000))
+    harness.traffic[4] = Traffic(read=300_000)
+    harness.enforce_limits(1.0)
     assert sum(connection.is_disconnected for connection in many) == 1
     assert not single.is_disconnected
 
 
-def test_disconnects_those_that_read_too_little(scene: Scene) -> None:
-    scene.patch.setattr(connections, "MAX_UNREAD", 3 * MAX_QUEUED)
-    silent = [scene.deliver(number, "silent") for number in range(1, 5)]
-    other = scene.deliver(5, "other")
-    scene.enforce_limits(0.0)
-    scene.socket.num_sent += 10 * MAX_QUEUED
-    scene.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000))
-    scene.enforce_limits(1.0)
+def test_peers_that_read_too_little_are_disconnected(harness: SocketHarness) -> None:
+    harness.patch.setattr(connections, "MAX_UNREAD", 3 * MAX_QUEUED)
+    silent = [harness.deliver(number, "silent") for number in range(1, 5)]
+    other = harness.deliver(5, "other")
+    harness.enforce_limits(0.0)
+    harness.socket.num_sent += 10 * MAX_QUEUED
+    harness.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000))
+    harness.enforce_limits(1.0)
     assert other.unread == 0, "all of them read"
-    scene.socket.num_sent += 10 * MAX_QUEUED
-    scene.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000, unsent=1))
-    scene.enforce_limits(2.0)
+    harness.socket.num_sent += 10 * MAX_QUEUED
+    harness.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000, unsent=1))
+    harness.enforce_limits(2.0)
     assert other.unread == MAX_QUEUED, "libzmq drops more"
     assert sum(connection.is_disconnected for connection in silent) == 2
     assert not other.is_disconnected
 
 
 @pytest.mark.parametrize("key", ["key", ""])
-def test_one_peer_cannot_take_all_connections(scene: Scene, key: str) -> None:
-    made = []
+def test_one_peer_cannot_take_all_connections(harness: SocketHarness, key: str) -> None:
+    connections_made = []
     for number in range(1, 10):
-        made.append(scene.deliver(number, key))
-        scene.enforce_limits(0.0)
-    assert [connection.is_disconnected for connection in made] == [False] * 7 + [True] * 2
+        connections_made.append(harness.deliver(number, key))
+        harness.enforce_limits(0.0)
+    assert [connection.is_disconnected for connection in connections_made] == [False] * 7 + [
+        True
+    ] * 2
 
 
-def test_clients_cannot_use_connections_of_services_or_other_keys(scene: Scene) -> None:
-    honest = [scene.deliver(1, "service"), scene.deliver(2, "laptop")]
+def test_clients_cannot_use_connections_of_services_or_other_keys(harness: SocketHarness) -> None:
+    honest = [harness.deliver(1, "service"), harness.deliver(2, "laptop")]
     for number in range(10, 40):
-        scene.deliver(number, f"flood {number % 2}")
-        scene.enforce_limits(0.0)
-    honest += [scene.deliver(3, "service"), scene.deliver(4, "laptop")]
-    scene.enforce_limits(0.0)
+        harness.deliver(number, f"flood {number % 2}")
+        harness.enforce_limits(0.0)
+    honest += [harness.deliver(3, "service"), harness.deliver(4, "laptop")]
+    harness.enforce_limits(0.0)
     assert not any(connection.is_disconnected for connection in honest)
-    assert len(scene.limiter.connections_to(scene.socket)) == 10 + 2
+    assert len(harness.limiter.connections_to(harness.socket)) == 10 + 2
 
 
-def test_services_can_use_connections_that_clients_do_not_use(scene: Scene) -> None:
-    services = [scene.deliver(number, "service") for number in range(20)]
-    scene.enforce_limits(0.0)
+def test_services_can_use_connections_that_clients_do_not_use(harness: SocketHarness) -> None:
+    services = [harness.deliver(number, "service") for number in range(20)]
+    harness.enforce_limits(0.0)
     assert [connection.is_disconnected for connection in services] == [False] * 15 + [True] * 5
     for number in range(20, 30):
-        scene.deliver(number, f"key {number}")
-    scene.enforce_limits(0.0)
-    assert len(scene.limiter.connections_to(scene.socket)) == 17
+        harness.deliver(number, f"key {number}")
+    harness.enforce_limits(0.0)
+    assert len(harness.limiter.connections_to(harness.socket)) == 17
 
 
-def test_surplus_peers_are_disconnected_later(scene: Scene) -> None:
+def test_surplus_peers_are_disconnected_later(harness: SocketHarness) -> None:
     for number in range(9):
-        scene.deliver(number, "key")
-    scene.enforce_limits(0.0)
+        harness.deliver(number, "key")
+    harness.enforce_limits(0.0)
     for time_s, num_closed in ((HOLD_S - 0.1, 0), (HOLD_S, 1), (HOLD_S + GAP_S, 2)):
-        scene.enforce_limits(time_s)
-        assert sum(held.close.called for held in scene.held.values()) == num_closed
+        harness.enforce_limits(time_s)
+        assert sum(held.close.called for held in harness.held.values()) == num_closed
 
 
-def test_resets_the_oldest_surplus_peers_above_the_capacity(scene: Scene) -> None:
+def test_the_oldest_surplus_peers_above_the_capacity_are_reset(harness: SocketHarness) -> None:
     for number in range(7 + 4 * 10 + 1):
-        scene.deliver(number, "key")
-    scene.enforce_limits(0.0)
-    scene.enforce_limits(0.05)
-    assert [held.close.called for held in scene.held.values()] == [True] + [False] * 40
+        harness.deliver(number, "key")
+    harness.enforce_limits(0.0)
+    harness.enforce_limits(0.05)
+    assert [held.close.called for held in harness.held.values()] == [True] + [False] * 40
 
 
-def test_an_idle_surplus_peer_can_reconnect_at_once(scene: Scene) -> None:
-    scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
+def test_an_idle_surplus_peer_can_reconnect_at_once(harness: SocketHarness) -> None:
+    harness.addresses = {number: f"10.0.0.{number}" for number in range(20)}
     for number in range(10):
-        scene.limiter.find(number, scene.socket)
+        harness.limiter.find(number, harness.socket)
     for look in range(NEW_CHECKS):
-        scene.enforce_limits(float(look))
-    scene.deliver(10, "talker")
-    scene.enforce_limits(float(NEW_CHECKS))
-    assert scene.ended == {0}
-    assert not scene.held
+        harness.enforce_limits(float(look))
+    harness.deliver(10, "talker")
+    harness.enforce_limits(float(NEW_CHECKS))
+    assert harness.ended == {0}
+    assert not harness.held
 
 
-def test_resets_a_surplus_peer_that_keeps_sending(scene: Scene) -> None:
+def test_resets_a_surplus_peer_that_keeps_sending(harness: SocketHarness) -> None:
     for number in range(8):
-        scene.deliver(number, "key")
-    scene.enforce_limits(0.0)
-    scene.ended.clear()  # libzmq still reads
-    scene.enforce_limits(0.05)
-    assert scene.ended == set(scene.held)
+        harness.deliver(number, "key")
+    harness.enforce_limits(0.0)
+    harness.ended.clear()  # libzmq still reads
+    harness.enforce_limits(0.05)
+    assert harness.ended == set(harness.held)
 
 
-def test_silent_connections_make_room(scene: Scene) -> None:
-    scene.addresses = {number: f"10.0.0.{number}" for number in range(20)}
-    silent = [scene.limiter.find(number, scene.socket) for number in range(10)]
-    talker = scene.deliver(10, "talker")
-    scene.enforce_limits(0.0)
+def test_silent_connections_make_room(harness: SocketHarness) -> None:
+    harness.addresses = {number: f"10.0.0.{number}" for number in range(20)}
+    silent = [harness.limiter.find(number, harness.socket) for number in range(10)]
+    talker = harness.deliver(10, "talker")
+    harness.enforce_limits(0.0)
     assert [connection.is_disconnected for connection in silent if connection] == [True] + [
         False
     ] * 9
@@ -214,36 +216,40 @@ def test_silent_connections_make_room(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("number", "trims"), [(NUM_ENDED_BEFORE_TRIM - 1, 0), (NUM_ENDED_BEFORE_TRIM, 1)]
 )
-def test_gives_memory_back_after_many_peers_left(scene: Scene, number: int, trims: int) -> None:
+def test_memory_is_freed_after_many_peers_left(
+    harness: SocketHarness, number: int, trims: int
+) -> None:
     trim = mock.Mock()
-    scene.patch.setattr(connections, "trim_heap", trim)
+    harness.patch.setattr(connections, "trim_heap", trim)
     for descriptor in range(number):
-        scene.deliver(descriptor, f"key {descriptor}")
-        scene.ended.add(descriptor)
-        scene.enforce_limits(0.0)
-    scene.enforce_limits(TRIMS_S[0])
+        harness.deliver(descriptor, f"key {descriptor}")
+        harness.ended.add(descriptor)
+        harness.enforce_limits(0.0)
+    harness.enforce_limits(TRIMS_S[0])
     assert trim.call_count == trims
 
 
-def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(scene: Scene) -> None:
-    scene.deliver(1, "key").disconnect("test", PENALTY_S)
-    scene.enforce_limits(0.0)
-    assert scene.limiter.is_blocked("key")
-    assert not scene.limiter.is_blocked("other")
-    assert list(scene.socket.ended) == [1]
-    honest = scene.deliver(2, "key")
+def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(
+    harness: SocketHarness,
+) -> None:
+    harness.deliver(1, "key").disconnect("test", PENALTY_S)
+    harness.enforce_limits(0.0)
+    assert harness.limiter.is_blocked("key")
+    assert not harness.limiter.is_blocked("other")
+    assert list(harness.socket.ended) == [1]
+    honest = harness.deliver(2, "key")
     assert not honest.is_disconnected
     assert honest.budget.left >= MIN_BUDGET
 
 
-def test_a_reused_descriptor_is_another_connection(scene: Scene) -> None:
-    before = scene.deliver(1)
-    scene.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 77)
-    assert not scene.limiter.is_open(1)
-    assert scene.deliver(1) is not before
-    scene.patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 80)
-    scene.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 78)
-    assert scene.socket.deliver(1, "") is None  # another socket of this process
+def test_a_reused_descriptor_is_another_connection(harness: SocketHarness) -> None:
+    before = harness.deliver(1)
+    harness.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 77)
+    assert not harness.limiter.is_open(1)
+    assert harness.deliver(1) is not before
+    harness.patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 80)
+    harness.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 78)
+    assert harness.socket.deliver(1, "") is None  # another socket of this process
 
 
 @pytest.mark.parametrize(

@@ -15,15 +15,15 @@ from kouxing.services.recognizer.onnx_session import open_network
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, targets
-from kouxing.training.encoder.batches import Material, batch_of, inputs_of
-from kouxing.training.encoder.export import onnx_of
+from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
+from kouxing.training.encoder.export import export_onnx
 from kouxing.training.encoder.network import NUM_FEATURES, AudioEncoder
 from kouxing.training.encoder.recipe import train_encoder
-from kouxing.training.encoder.targets import PITCH, VOICE, Columns, Piece
+from kouxing.training.encoder.targets import PITCH, VOICE, Piece, TargetColumns
 from kouxing.training.encoder.teachers import POSITION_SAMPLES
 from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
-from kouxing.training.networks.network import Shape
+from kouxing.training.networks.network import EncoderShape
 from tests.system import DEMO
 from tests.unit.test_lips_training import name_for, write_clip
 from tests.unit.test_whisper_weights import write_corpus
@@ -33,12 +33,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 NUM_PHONES = 3
-COLUMNS = Columns(NUM_PHONES)
+COLUMNS = TargetColumns(NUM_PHONES)
 
 
 @pytest.fixture
 def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(whisper_weights, "Shape", partial(Shape, width=64, heads=2, inner=48))
+    monkeypatch.setattr(
+        whisper_weights, "EncoderShape", partial(EncoderShape, width=64, heads=2, inner=48)
+    )
     return write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6, width=64))
 
 
@@ -57,8 +59,8 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_PAUSE_PROB", 0.0)
     monkeypatch.setattr(batches, "_ONLY_BACKGROUND_PROB", 0.0)
     monkeypatch.setattr(batches, "change_speed", lambda samples, _: (samples, 1.0))
-    material = Material([piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS)
-    _, rows = batch_of(material, 0, 1)
+    material = BatchSource([piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS)
+    _, rows = draw_batch(material, 0, 1)
     lips = rows[0, 100, COLUMNS.lips].reshape(-1, NUM_OUTPUTS)[:, 0] - rows[0, 100, PITCH]
     # A position's audio ends 45 ms after its start, and the target of row 0 is at 20 ms.
     np.testing.assert_allclose(lips, (0.045 - np.array(LIP_DELAYS_S)) / 0.02 - 1, atol=0.51)
@@ -67,8 +69,8 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_exported_steps_follow_pytorch() -> None:
     torch.manual_seed(0)
     encoder = AudioEncoder(NUM_PHONES, width=16).eval()
-    session = open_network(onnx_of(encoder).tobytes())
-    inputs = inputs_of(HELLO)[:20]
+    session = open_network(export_onnx(encoder).tobytes())
+    inputs = network_inputs(HELLO)[:20]
     with torch.no_grad():
         expected = encoder.split(encoder(torch.from_numpy(inputs)[None]))
     state = np.zeros((2, 32), np.float32)
@@ -120,7 +122,9 @@ def test_trains_resumes_and_writes_a_model(
 
 
 @pytest.mark.parametrize(("name", "problem"), [("a", "no music or noise"), ("d", "no usable rec")])
-def test_needs_speech_and_sounds(tmp_path: Path, whisper: Path, name: str, problem: str) -> None:
+def test_training_needs_speech_and_sounds(
+    tmp_path: Path, whisper: Path, name: str, problem: str
+) -> None:
     corpus = write_corpus(tmp_path / "corpus", {name: HELLO})
     with pytest.raises(UserError, match=problem):
         train_encoder([corpus], tmp_path / "encoder.npz", whisper=whisper, clips=tmp_path)

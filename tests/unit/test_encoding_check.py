@@ -68,7 +68,7 @@ def tone(frequency_hz: float) -> Samples:
     ],
 )
 @pytest.mark.parametrize("gain", [0.1, 0.89])
-def test_names_the_encoding_of_speech(
+def test_the_error_names_the_encoding_of_speech(
     subtype: str, endian: str, kind: str, gain: float, num_bytes: int
 ) -> None:
     gain = 0.89 if subtype == "PCM_U8" else gain  # 8 bits make quiet speech silent
@@ -79,7 +79,7 @@ def test_names_the_encoding_of_speech(
 
 
 @pytest.mark.parametrize("subtype", ["FLOAT", "PCM_24"])
-def test_one_silent_channel_hides_nothing(subtype: str) -> None:
+def test_one_silent_channel_does_not_hide_a_wrong_encoding(subtype: str) -> None:
     with pytest.raises(UserError, match="perhaps"):
         send(raw(stereo(speech(0.3), 0.0), subtype), 2)
 
@@ -140,6 +140,6 @@ def test_accepts_loud_sound(samples: Samples) -> None:
     send(raw(stereo(samples, 0.0)), 2)
 
 
-def test_speech_ends_the_check() -> None:
+def test_the_check_ends_with_the_first_speech() -> None:
     check = send(4 * raw(speech(0.89)))
     check.check(raw(speech(), "ULAW"))

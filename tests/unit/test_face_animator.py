@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
-from kouxing.evaluation.lips.full_model import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.idle_motion import IdleMotion, State
@@ -41,7 +41,7 @@ def test_a_long_vowel_stays_open_without_new_phones() -> None:
     assert jaw[35:].min() > 0.95 * jaw.max() > 240.0
 
 
-def test_relaxes_and_returns_without_a_jump() -> None:
+def test_the_face_relaxes_and_returns_without_a_jump() -> None:
     face = make_face()
     spoken = speak(face)
     rest = face.relax(10) + face.relax(10)
@@ -85,7 +85,7 @@ def test_a_breath_parts_the_lips_only_without_speech() -> None:
     assert speaking == 0.0
 
 
-def test_laughs_while_someone_laughs() -> None:
+def test_the_face_laughs_while_the_voice_laughs() -> None:
     face = make_face()
     faps = []
     for number in range(250):

@@ -9,8 +9,8 @@ import soundfile
 from rich.console import Console
 
 from kouxing.corpora.emotions import read_emotions
-from kouxing.evaluation import face
-from kouxing.evaluation.face import measure_face, print_face
+from kouxing.evaluation import face_motion
+from kouxing.evaluation.face_motion import measure_face, print_face
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
@@ -34,8 +34,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_measures_a_face_that_moves(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(face, "_REST_S", 4.0)
+def test_a_moving_face_has_all_figures(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(face_motion, "_REST_S", 4.0)
     figures = measure_face(load_model("light"), read_emotions(folder))
     assert set(figures.correlations) > {"arousal", "valence"}
     assert figures.still_at_rest < 0.5
@@ -48,16 +48,18 @@ def test_measures_a_face_that_moves(folder: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_movements_match_the_stressed_vowels_that_they_follow() -> None:
     faps = np.zeros((200, 68), np.float32)
-    session = face._Session(faps, [(0.0, 2.0)], [(0.0, 0.0)], np.array([0.5, 1.5]))
-    nods = face._movements([np.array([0.2, 0.7, 1.4, 1.75, 2.4])], [session], minutes=0.5)
+    session = face_motion._Session(faps, [(0.0, 2.0)], [(0.0, 0.0)], np.array([0.5, 1.5]))
+    nods = face_motion._movement_stats(
+        [np.array([0.2, 0.7, 1.4, 1.75, 2.4])], [session], minutes=0.5
+    )
     assert (nods.per_minute, nods.matched) == (10.0, 0.5)
     assert nods.at_end == pytest.approx(0.2)
-    silent = face._Session(faps, [(0.0, 2.0)], [(0.0, 0.0)], np.array([]))
-    assert face._movements([np.array([1.0])], [silent], minutes=1.0).matched is None
+    silent = face_motion._Session(faps, [(0.0, 2.0)], [(0.0, 0.0)], np.array([]))
+    assert face_motion._movement_stats([np.array([1.0])], [silent], minutes=1.0).matched is None
 
 
 def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
-    calm, loud, other = read_emotions(folder, shipping=True)
+    calm, loud, other = read_emotions(folder, only_distributable=True)
     assert (calm.emotion, loud.emotion, other.emotion) == ("boredom", "anger", None)
     assert calm.stressed_s == (0.5, 1.5)
     manifest = folder / "manifest.tsv"

@@ -25,7 +25,7 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.records import replace
-from kouxing.training.ferguson.recipe import fit_openings, relative_openings, travel_of
+from kouxing.training.ferguson.recipe import fit_openings, measure_travel, relative_openings
 from tests.lips import clip_of, phone, utterance
 from tests.live_streams import LiveStream
 from tests.system import DEMO
@@ -52,7 +52,7 @@ def openings(events: Sequence[SoundEvent], face: FaceAnimator | None = None) -> 
     return 5.0 * np.array(frames, dtype=np.float64)[:, LOWER_LIP] / WIDEST
 
 
-SAID: list[SoundEvent] = [
+SENTENCE_EVENTS: list[SoundEvent] = [
     *progress(0.0, 0.5, loud=False),
     SpeechChange(active=True, time_s=0.5),
     *progress(0.5, 0.6, loud=True),
@@ -65,20 +65,20 @@ SAID: list[SoundEvent] = [
 
 
 def test_openings_of_phones_and_rest_in_silence() -> None:
-    made = openings(SAID)
-    assert made[:15].max() == 0.0
-    assert made[25] == pytest.approx(TABLE.opening["m"], abs=0.7)
-    assert made[31] == pytest.approx(TABLE.opening["a"], abs=0.7)
-    assert np.argmax(made) < 36
-    assert made[60:].max() < 0.05  # energy shows the end long before voice activity does
+    live_openings = openings(SENTENCE_EVENTS)
+    assert live_openings[:15].max() == 0.0
+    assert live_openings[25] == pytest.approx(TABLE.opening["m"], abs=0.7)
+    assert live_openings[31] == pytest.approx(TABLE.opening["a"], abs=0.7)
+    assert np.argmax(live_openings) < 36
+    assert live_openings[60:].max() < 0.05  # energy shows the end long before voice activity does
 
 
 def test_no_jump_at_revisions_and_interruptions() -> None:
-    phones = [event for event in SAID if isinstance(event, Phone)]
-    made = openings([*SAID[:-60], phones[0], replace(phones[1], symbol="u")])
-    assert np.abs(np.diff(made)).max() < 2.0
+    phones = [event for event in SENTENCE_EVENTS if isinstance(event, Phone)]
+    live_openings = openings([*SENTENCE_EVENTS[:-60], phones[0], replace(phones[1], symbol="u")])
+    assert np.abs(np.diff(live_openings)).max() < 2.0
     face = FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
-    before = openings(SAID[:42], face)
+    before = openings(SENTENCE_EVENTS[:42], face)
     assert before[-1] > 2.0
     face.flush()
     after = openings(progress(0.74, 1.2, loud=False), face)
@@ -91,15 +91,15 @@ def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
     settings = SynthesizerConfig(
         lips="ferguson", idle_motion=False, expressiveness=1.0, feeling=0.0
     )
-    made = []
+    live_openings = []
     for chunk in (32_000, 333):
         chain = LiveChain(load_model(), LIPS, synthesizer=settings)
         frames = []
         for begin in range(0, len(samples), chunk):
             frames += chain.accept_waveform(samples[begin : begin + chunk])
-        made.append(np.array([faps for _, faps in frames + chain.input_finished()]))
-    np.testing.assert_array_equal(made[0], made[1])
-    opening = 5.0 * made[0][:, LOWER_LIP] / WIDEST
+        live_openings.append(np.array([faps for _, faps in frames + chain.input_finished()]))
+    np.testing.assert_array_equal(live_openings[0], live_openings[1])
+    opening = 5.0 * live_openings[0][:, LOWER_LIP] / WIDEST
     assert opening.min() >= 0.0
     assert 2.5 < opening.max() <= 5.0
 
@@ -110,12 +110,14 @@ RATE_HZ = 16_000
 def speech(parts: Sequence[tuple[str, float]]) -> NDArray[np.float32]:
     """Return a sound of vowels (v), hissing consonants (s), weak nasals (n) and silence (-)."""
     rng = np.random.default_rng(0)
-    made = []
+    live_openings = []
     for kind, length_s in parts:
         time_s = np.arange(round(length_s * RATE_HZ)) / RATE_HZ
         sine, noise = np.sin(2 * np.pi * 200.0 * time_s), rng.standard_normal(len(time_s))
-        made.append({"v": 0.2 * sine, "s": 0.05 * noise, "n": 0.03 * sine, "-": 1e-4 * noise}[kind])
-    return np.concatenate(made).astype(np.float32)
+        live_openings.append(
+            {"v": 0.2 * sine, "s": 0.05 * noise, "n": 0.03 * sine, "-": 1e-4 * noise}[kind]
+        )
+    return np.concatenate(live_openings).astype(np.float32)
 
 
 def test_segments_end_at_pauses_dips_and_hisses() -> None:
@@ -167,7 +169,7 @@ def test_openings_between_key_frames_are_linear() -> None:
     np.testing.assert_allclose(frames.openings_at([-1.0, 0.25, 1.5, 9.0]), [0.0, 1.0, 4.0, 4.0])
 
 
-def test_recovers_openings() -> None:
+def test_training_recovers_the_openings() -> None:
     phones = utterance(0, 200)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.04)
     true = dataclasses.replace(
@@ -186,5 +188,5 @@ def test_recovers_openings() -> None:
     # a phone without data follows its visemes
     assert found["ang"] == pytest.approx(found["a"], abs=0.3)
     travel = faps_of([5.0])[0] / scale
-    np.testing.assert_allclose(travel_of([clip]), travel, rtol=0.05, atol=1e-9)
-    assert len(travel_of([clip])) == len(MOUTH_FAPS)
+    np.testing.assert_allclose(measure_travel([clip]), travel, rtol=0.05, atol=1e-9)
+    assert len(measure_travel([clip])) == len(MOUTH_FAPS)

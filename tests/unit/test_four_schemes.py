@@ -38,7 +38,7 @@ LIVE: list[SoundEvent] = [
 ]
 
 
-def told_phones(events: list[SoundEvent]) -> list[tuple[str, float, float]]:
+def phones_of(events: list[SoundEvent]) -> list[tuple[str, float, float]]:
     phones = [event for event in events if isinstance(event, Phone)]
     indices = [event.index for event in phones]
     assert indices == sorted(set(indices)), "no phone is corrected"
@@ -49,24 +49,24 @@ def told_phones(events: list[SoundEvent]) -> list[tuple[str, float, float]]:
 
 
 def test_the_papers_rule_corrects_nothing() -> None:
-    told = without_corrections(LIVE)
-    assert told_phones(told) == [
+    changed = without_corrections(LIVE)
+    assert phones_of(changed) == [
         ("b", 0.0, 0.1),
         ("a", 0.06, 0.13),
         ("t", 0.08, 0.1),
         ("i", 0.2, 0.11),
     ]
-    assert told.index(Progress(time_s=0.12, level_db=-20.0)) == 5, "i comes after it"
+    assert changed.index(Progress(time_s=0.12, level_db=-20.0)) == 5, "i comes after it"
 
 
 def test_scheme_4_delays_each_phone_by_one() -> None:
-    told = delay_by_one_phone(LIVE)
-    assert told_phones(told) == [("b", 0.0, 0.06), ("d", 0.13, 0.07)]
-    assert told[1:3] == [
+    changed = delay_by_one_phone(LIVE)
+    assert phones_of(changed) == [("b", 0.0, 0.06), ("d", 0.13, 0.07)]
+    assert changed[1:3] == [
         phone(0, "b", 0.0, 0.06, final=False),
         Progress(time_s=0.1, level_db=-20.0),
     ]
-    assert isinstance(told[-1], SpeechChange)
+    assert isinstance(changed[-1], SpeechChange)
 
 
 def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:

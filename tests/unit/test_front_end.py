@@ -18,13 +18,13 @@ from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperM
 from kouxing.shared.errors import UserError
 
 
-def test_scales_int16_to_one() -> None:
+def test_int16_samples_are_scaled_to_one() -> None:
     pcm = np.array([[-32768, 16384], [0, 32767]], "<i2").tobytes()
     expected = [[-1.0, 0.5], [0.0, 32767 / 32768]]
     np.testing.assert_allclose(samples_of(pcm, "s16le", 2), expected)
 
 
-def test_clips_floats_above_one() -> None:
+def test_float_samples_above_one_are_clipped() -> None:
     pcm = np.array([2.0, -3.0, 0.25], "<f4").tobytes()
     np.testing.assert_array_equal(samples_of(pcm, "f32le", 1)[:, 0], [1.0, -1.0, 0.25])
 
@@ -46,7 +46,7 @@ def tone(rate_hz: int, hz: float = 440.0, seconds: float = 1.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rate_hz", RATES)
-def test_keeps_a_tone(rate_hz: int) -> None:
+def test_resampling_keeps_a_tone(rate_hz: int) -> None:
     resampled = to_16_khz(tone(rate_hz), rate_hz)
     assert abs(len(resampled) - 16_000) <= 1
     inner = slice(1000, 15_000)
@@ -106,7 +106,7 @@ def test_live_mean_adapts_from_the_prior_to_the_speaker() -> None:
     np.testing.assert_array_equal(mean.normalize(features), normalized)
 
 
-def test_frames_match_the_definition() -> None:
+def test_feature_frames_match_the_definition() -> None:
     sound = np.random.default_rng(0).normal(0, 0.1, 3000)
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(400) / 400)
     expected = []
@@ -157,7 +157,7 @@ def test_warps_a_low_voice_more_over_time() -> None:
     assert factors[-1] == pytest.approx(np.exp(0.2 * np.log(REFERENCE_HZ / 110)), abs=5e-3)
 
 
-def test_moves_formants_up_by_the_factor() -> None:
+def test_the_warp_moves_formants_up_by_its_factor() -> None:
     log_mel = bands_with_a_peak(2000, 20)
     vtln = VocalTractNormalizer()
     warped = vtln.warp(log_mel, *vtln_voice(90.0, 2000))

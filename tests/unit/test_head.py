@@ -26,7 +26,7 @@ def test_feature_points_move_as_defined(head: Head) -> None:
     for fap in heads.DISPLACING:
         for value in (300.0, -120.0):
             axis, expected = heads.travel_m(head, fap, value)
-            shift = head.deform(heads.only(fap.number, value)) - head.vertices
+            shift = head.deform(heads.single_fap(fap.number, value)) - head.vertices
             for point in fap.feature_points:
                 shown.add(point)
                 moved = shift[head.feature_points[point], axis]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.training.heads import fitted, subdivision
+from kouxing.training.heads import fitted_mesh, subdivision
 
 CUBE = np.array(
     [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1],
@@ -50,10 +50,10 @@ material any.mhmat
 """
 
 
-def test_a_part_follows_the_head_that_it_is_fitted_to(tmp_path: Path) -> None:
+def test_a_fitted_part_follows_its_head(tmp_path: Path) -> None:
     (tmp_path / "part.obj").write_text(OBJ, encoding="utf-8")
     (tmp_path / "part.mhclo").write_text(MHCLO, encoding="utf-8")
-    part = fitted.read(tmp_path, "part")
+    part = fitted_mesh.read(tmp_path, "part")
     head = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0], [0, 0, 1]])
     corners = part.fit(head)
     assert len(corners) == 5  # the third vertex is split by the seam of the texture
@@ -62,8 +62,8 @@ def test_a_part_follows_the_head_that_it_is_fitted_to(tmp_path: Path) -> None:
     np.testing.assert_allclose(corners[np.argmin(part.weights[:, 0])], weighted)
     shift = np.zeros((4, 3))
     shift[2] = [0, 1, 0]
-    moved = part.carry(shift)[:, 1]
+    moved = part.transfer(shift)[:, 1]
     np.testing.assert_allclose(sorted(moved), [0, 0, 0.25, 1, 1])
-    triangle = part.only(np.array([False, True, False]))
+    triangle = part.keep_triangles(np.array([False, True, False]))
     assert len(triangle.triangles) == 1
     assert len(triangle.fit(head)) == 3

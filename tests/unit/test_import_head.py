@@ -66,7 +66,7 @@ def test_parts_textures_and_units(imported: Head) -> None:
 def test_feature_points_move_as_defined(imported: Head) -> None:
     for fap, value in product(heads.DISPLACING, (300.0, -120.0)):
         axis, expected = heads.travel_m(imported, fap, value)
-        shift = moved(imported, heads.only(fap.number, value))
+        shift = moved(imported, heads.single_fap(fap.number, value))
         for point in imported.feature_points.keys() & fap.feature_points:
             travel = shift[imported.feature_points[point], axis]
             assert travel == pytest.approx(expected, rel=0.05), (fap.name, point)

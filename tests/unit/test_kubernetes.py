@@ -29,8 +29,8 @@ per_service = pytest.mark.parametrize("name", WORKLOADS)
 
 
 def container(name: str) -> Any:
-    (only,) = WORKLOADS[name]["spec"]["template"]["spec"]["containers"]
-    return only
+    (single_fap,) = WORKLOADS[name]["spec"]["template"]["spec"]["containers"]
+    return single_fap
 
 
 def ports(name: str) -> dict[str, int]:

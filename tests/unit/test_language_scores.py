@@ -10,8 +10,8 @@ from rich.console import Console
 from kouxing.corpora.speech_corpus import LANGUAGES, RowErrors, read_corpus
 from kouxing.corpora.tables import read_rows
 from kouxing.evaluation.recognizer import languages
+from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
 from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
-from kouxing.evaluation.recognizer.references import align_corpus
 from kouxing.evaluation.rivals import tables
 from kouxing.services.recognizer.acoustic.languages import model_of_language
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig

@@ -14,18 +14,22 @@ from kouxing.evaluation.lips import (
     agreement,
     closure_measures,
     curves,
-    effort,
-    extrema,
-    in_speech,
+    effort_measures,
+    misalignment,
     phone_spread,
-    rest,
+    rest_measures,
+    speech_measures,
 )
 from kouxing.evaluation.lips import closures as closures_module
 from kouxing.evaluation.lips.agreement import agreement_of
-from kouxing.evaluation.lips.closures import Detections, closures, contacts, is_closed_at
+from kouxing.evaluation.lips.closures import DetectionCounts, closures, contacts, is_closed_at
 from kouxing.evaluation.lips.curves import num_turns, pooled_moments
-from kouxing.evaluation.lips.effort import correlate_by_speaker, lip_intensity, opening_range
-from kouxing.evaluation.lips.extrema import match_extrema, misalignment_s, warping_path
+from kouxing.evaluation.lips.effort_measures import (
+    correlate_by_speaker,
+    lip_intensity,
+    opening_range,
+)
+from kouxing.evaluation.lips.misalignment import match_extrema, misalignment_s, warping_path
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_mouth
 from kouxing.evaluation.lips.references import Reference
 from kouxing.evaluation.lips.scored_clip import ScoredClip
@@ -37,7 +41,7 @@ TIME_S = np.arange(0.0, 4.0, 0.02)
 Array = NDArray[np.float64]
 
 
-def mouth_of(opening: Array) -> Mouth:
+def lips_with_opening(opening: Array) -> Mouth:
     """Return made lips with an opening at ``TIME_S``; width and jaw follow it."""
     faps = np.zeros((len(opening), NUM_FAPS))
     faps[:, 4] = -opening
@@ -45,12 +49,12 @@ def mouth_of(opening: Array) -> Mouth:
     return predicted_mouth(faps)
 
 
-def mouth(*closed: tuple[float, float], opening: float = 300.0) -> Mouth:
+def lips_closed_during(*closed: tuple[float, float], opening: float = 300.0) -> Mouth:
     """Return open lips that are closed for some spans of time, seconds."""
     curve = np.full(len(TIME_S), opening)
     for start_s, end_s in closed:
         curve[(start_s - 1e-6 <= TIME_S) & (end_s + 1e-6 >= TIME_S)] = 0.0
-    return mouth_of(curve)
+    return lips_with_opening(curve)
 
 
 def reference(
@@ -71,10 +75,10 @@ def reference(
 
 @pytest.mark.parametrize(
     "module",
-    [agreement, closures_module, curves, effort, extrema, scoring],
+    [agreement, closures_module, curves, effort_measures, misalignment, scoring],
     ids=lambda module: module.__name__,
 )
-def test_examples_of_measures(module: ModuleType) -> None:
+def test_the_examples_in_docstrings_hold(module: ModuleType) -> None:
     outcome = doctest.testmod(module)
     assert outcome.attempted
     assert not outcome.failed
@@ -92,39 +96,39 @@ def test_correlation_error_and_turns_of_curves() -> None:
 
 def test_agreement_measures_the_lag() -> None:
     curve = 150.0 + 150.0 * np.sin(2 * np.pi * TIME_S)
-    real = mouth_of(curve)
-    late = mouth_of(150.0 + 150.0 * np.sin(2 * np.pi * (TIME_S - 0.06)))
+    real = lips_with_opening(curve)
+    late = lips_with_opening(150.0 + 150.0 * np.sin(2 * np.pi * (TIME_S - 0.06)))
     agreement = agreement_of([(late, real)])
     assert agreement.lag_ms == 60
     assert agreement.correlation["opening"] == pytest.approx(np.cos(0.12 * np.pi), abs=0.01)
-    assert agreement_of([(mouth(), real)]).lag_ms is None
+    assert agreement_of([(lips_closed_during(), real)]).lag_ms is None
 
 
 def test_counts_missed_and_false_closures() -> None:
-    real = mouth((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
-    made = mouth((0.54, 0.56), (2.0, 2.1), (2.4, 2.46), (3.5, 3.5))
-    hits = closures(made, real)
-    assert hits == Detections(real=3, met=2, predicted=4, true=2)
+    real = lips_closed_during((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
+    predicted = lips_closed_during((0.54, 0.56), (2.0, 2.1), (2.4, 2.46), (3.5, 3.5))
+    hits = closures(predicted, real)
+    assert hits == DetectionCounts(real=3, met=2, predicted=4, true=2)
     assert hits.recall == pytest.approx(2 / 3)
     assert hits.precision == 0.5
     assert hits.f1 == pytest.approx(4 / 7)
     np.testing.assert_array_equal(
-        is_closed_at(np.array([0.5, 1.5, 2.5]), made), [True, False, True]
+        is_closed_at(np.array([0.5, 1.5, 2.5]), predicted), [True, False, True]
     )
     assert (hits + hits).f1 == hits.f1
-    assert hits + hits == Detections(6, 4, 8, 4)
-    second = contacts(made, real)[1]
+    assert hits + hits == DetectionCounts(6, 4, 8, 4)
+    second = contacts(predicted, real)[1]
     assert second.time_s == pytest.approx(2.05)
     assert not second.is_true
 
 
 def test_closures_after_the_end_of_the_clip_do_not_count() -> None:
-    real = mouth((0.5, 0.5), (1.5, 1.5))
-    made = mouth((0.5, 0.5), (3.5, 3.5))
+    real = lips_closed_during((0.5, 0.5), (1.5, 1.5))
+    predicted = lips_closed_during((0.5, 0.5), (3.5, 3.5))
     is_known = real.time_s < 3.0
     curves = {"opening": real.opening[is_known]}
     clip = Mouth(real.time_s[is_known], curves, real.is_closed[is_known])
-    assert closures(made, clip) == Detections(real=2, met=1, predicted=1, true=1)
+    assert closures(predicted, clip) == DetectionCounts(real=2, met=1, predicted=1, true=1)
 
 
 def test_real_lips_are_closed_in_the_lowest_tenth_of_their_range() -> None:
@@ -136,43 +140,47 @@ def test_real_lips_are_closed_in_the_lowest_tenth_of_their_range() -> None:
 
 
 def test_closures_count_for_the_phones_around_them() -> None:
-    real = mouth((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
-    made = mouth((0.5, 0.5), (1.0, 1.0), (2.5, 2.5), (3.5, 3.5))
+    real = lips_closed_during((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
+    predicted = lips_closed_during((0.5, 0.5), (1.0, 1.0), (2.5, 2.5), (3.5, 3.5))
     phones = [phone(0, "b", 0.48), phone(1, "a", 0.6, 0.9), phone(2, "u", 2.4), phone(3, "m", 3.0)]
-    clips = [ScoredClip(reference(real, phones), made)]
+    clips = [ScoredClip(reference(real, phones), predicted)]
     assert closure_measures.class_precision(clips, "bpm") == 1.0
     assert closure_measures.class_precision(clips, "aei") == 0.0
     assert closure_measures.class_precision(clips, "uo") == 1.0
     assert closure_measures.class_precision(clips, "pause") == 0.0
-    assert closure_measures.labials_shut(clips) == 0.5  # the lips are open in m
-    assert closure_measures.share_shut(clips) == 4 / 200
+    assert closure_measures.labial_closure_rate(clips) == 0.5  # the lips are open in m
+    assert closure_measures.closed_fraction(clips) == 4 / 200
 
 
 def test_lips_rest_and_close_after_the_sound() -> None:
     # sound from 1 to 2 s; the margin of speech is 0.1 s
-    made = mouth((0.0, 0.88), (2.44, 4.0))
-    quiet = reference(mouth(), loud=(1.0, 2.0))
-    clips = [ScoredClip(quiet, made)]
-    assert rest.closing_time_ms(clips) == pytest.approx(440.0)
+    predicted = lips_closed_during((0.0, 0.88), (2.44, 4.0))
+    quiet = reference(lips_closed_during(), loud=(1.0, 2.0))
+    clips = [ScoredClip(quiet, predicted)]
+    assert rest_measures.closing_time_ms(clips) == pytest.approx(440.0)
     # of 141 frames without speech, those at 0.9 s and from 2.1 to 2.42 s are open
-    assert rest.rest_opening(clips) == pytest.approx(300 * 18 / 141)
+    assert rest_measures.rest_opening(clips) == pytest.approx(300 * 18 / 141)
     rig = replace(quiet, clip=replace(quiet.clip, is_rig=True))
-    assert rest.rest_opening([ScoredClip(rig, made)]) is None
-    never = rest.closing_time_ms([ScoredClip(quiet, mouth())])
+    assert rest_measures.rest_opening([ScoredClip(rig, predicted)]) is None
+    never = rest_measures.closing_time_ms([ScoredClip(quiet, lips_closed_during())])
     assert never == pytest.approx(1980.0, abs=25.0)  # the whole pause
 
 
 def test_spread_within_phones_ignores_differences_between_them() -> None:
     curve = np.select([TIME_S < 1, TIME_S < 2, TIME_S < 3], [100.0, 300.0, 500.0], 900.0)
     phones = [phone(k, symbol, k + 0.4, 0.2) for k, symbol in enumerate("aaei")]
-    clips = [ScoredClip(reference(mouth_of(2 * curve), phones), mouth_of(curve))]
+    clips = [ScoredClip(reference(lips_with_opening(2 * curve), phones), lips_with_opening(curve))]
     assert phone_spread.phone_spread(clips) == pytest.approx(100.0)  # of a: 100 and 300
     assert phone_spread.phone_correlation(clips) == pytest.approx(1.0)
 
 
 def test_turns_per_second_of_speech() -> None:
-    clips = [ScoredClip(reference(mouth()), mouth_of(30.0 * np.arange(200.0) % 300.0))]
-    assert in_speech.turns_per_s(clips) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
+    clips = [
+        ScoredClip(
+            reference(lips_closed_during()), lips_with_opening(30.0 * np.arange(200.0) % 300.0)
+        )
+    ]
+    assert speech_measures.turns_per_s(clips) == pytest.approx(38 / 4)  # 19 peaks and 19 valleys
 
 
 def test_effort_correlates_within_speakers() -> None:
@@ -181,19 +189,21 @@ def test_effort_correlates_within_speakers() -> None:
     assert correlate_by_speaker([*"AAABBB"], levels, ranges) == pytest.approx(0.75)
     assert correlate_by_speaker([*"AABB"], levels[:4], ranges[:4]) is None
     assert opening_range(np.arange(101.0)) == pytest.approx(90.0)
-    assert lip_intensity(mouth_of(np.array([0.0, 6.0, 6.0]))) == pytest.approx(300 / np.sqrt(2))
+    assert lip_intensity(lips_with_opening(np.array([0.0, 6.0, 6.0]))) == pytest.approx(
+        300 / np.sqrt(2)
+    )
 
 
 def test_louder_clips_have_wider_and_faster_lips() -> None:
     takes = []
     for gain, extent in ((1.0, 100.0), (2.0, 300.0), (3.0, 200.0)):
-        clip = reference(mouth())
+        clip = reference(lips_closed_during())
         louder = replace(clip, clip=replace(clip.clip, samples=gain * clip.clip.samples))
-        takes.append(ScoredClip(louder, mouth_of(extent * (np.arange(200.0) % 2))))
+        takes.append(ScoredClip(louder, lips_with_opening(extent * (np.arange(200.0) % 2))))
     level_db = 20 * np.log10([1.0, 2.0, 3.0])
     r_db = np.corrcoef(level_db, [100.0, 300.0, 200.0])[0, 1]
-    assert effort.effort_correlation(takes) == pytest.approx(r_db)
-    assert effort.speech_lip_intensity(takes) == pytest.approx(0.5)
+    assert effort_measures.effort_correlation(takes) == pytest.approx(r_db)
+    assert effort_measures.speech_lip_intensity(takes) == pytest.approx(0.5)
 
 
 def test_matched_extrema_of_a_late_mouth() -> None:
@@ -202,6 +212,8 @@ def test_matched_extrema_of_a_late_mouth() -> None:
     late = np.array([0.0, 0.0, 1.0, 4.0, 1.0, 0.0, 2.0, 2.0])
     assert match_extrema(late, real) == [1, 1]  # the last plateau is not a maximum
     time_s = np.arange(0.0, 4.0, 0.02)
-    sines = [mouth_of(200.0 + 100.0 * np.sin(2 * np.pi * (time_s - lag))) for lag in (0.0, 0.1)]
+    sines = [
+        lips_with_opening(200.0 + 100.0 * np.sin(2 * np.pi * (time_s - lag))) for lag in (0.0, 0.1)
+    ]
     assert misalignment_s(sines[1], sines[0]) == pytest.approx(0.1, abs=0.02)
-    assert misalignment_s(mouth(), sines[0]) is None
+    assert misalignment_s(lips_closed_during(), sines[0]) is None

@@ -82,9 +82,9 @@ def test_accuracy_is_one_minus_the_relative_error_of_the_measured_heights() -> N
     real = faps_of(np.array([0.0, 1.0, 2.0, 4.0, 5.0, 3.0]))
     assert accuracy_of(real, real) == pytest.approx(1.0)
     assert accuracy_of(-real, real) == pytest.approx(-1.0)
-    made = 0.75 * real
+    scaled = 0.75 * real
     real[2] = np.nan
     real[:, MOUTH_FAPS.index(52)] = np.nan
-    made[:, MOUTH_FAPS.index(3)] = 1e4  # the jaw is no lip
-    made[:, MOUTH_FAPS.index(6)] = 1e4  # the paper moves lips vertically
-    assert accuracy_of(made, real) == pytest.approx(0.75)
+    scaled[:, MOUTH_FAPS.index(3)] = 1e4  # the jaw is no lip
+    scaled[:, MOUTH_FAPS.index(6)] = 1e4  # the paper moves lips vertically
+    assert accuracy_of(scaled, real) == pytest.approx(0.75)

@@ -18,12 +18,12 @@ from kouxing.services.recognizer.lip_predictor import (
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions
-from tests.lip_predictors import NUM_FEATURES, NUM_LIPS, UNITS, made_up_model
+from tests.lip_predictors import NUM_FEATURES, NUM_LIPS, UNITS, random_lip_predictor
 from tests.live_streams import recognize_live
 from tests.system import VOWELS_FILE, samples_of_file
 
 SAMPLES = samples_of_file(VOWELS_FILE)[:32_000]
-MODEL = made_up_model()
+MODEL = random_lip_predictor()
 
 
 def arrays_of(model: LipPredictor) -> dict[str, np.ndarray]:

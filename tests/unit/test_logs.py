@@ -68,7 +68,7 @@ def test_a_full_log_is_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "control.log.1").read_text() == "one two three\n"
 
 
-def test_a_full_disk_is_reported_once_and_costs_only_whole_lines(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_once_and_drops_only_whole_lines(tmp_path: Path) -> None:
     path, warnings = tmp_path / "driver.log", list[str]()
     log = LogFile(path, warnings.append)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -32,7 +32,7 @@ def _spans(samples: np.ndarray) -> list[tuple[float, float]]:
     [("a.webm", "libopus"), ("a.mkv", "pcm_s16le"), ("a.mkv", "aac"), ("a.mp4", "aac"),
      ("a.ts", "aac"), ("a.ogg", "libopus"), ("a.mka", "libmp3lame"), ("a.asf", "libmp3lame")],
 )  # fmt: skip
-def test_honors_gaps_in_timestamps(tmp_path: Path, name: str, codec: str) -> None:
+def test_gaps_in_timestamps_become_silence(tmp_path: Path, name: str, codec: str) -> None:
     write_tracks(tmp_path / name, codec, [[(0.0, TONE), (5.0, TONE)]], RATE_HZ)
     source = open_audio(tmp_path / name)
     samples = _read(source)

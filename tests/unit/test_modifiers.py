@@ -20,9 +20,9 @@ from tests.lips import (
     UPPER,
     advance,
     articulation_of,
+    frame_context,
     lip_gaps,
     make_face,
-    moment,
     phone,
     viseme_faps,
 )
@@ -122,7 +122,7 @@ def test_closed_lips_stay_closed(amount: float) -> None:
 
 
 @pytest.mark.parametrize("viseme", ["a", "e", "i", "o", "u", "v"])
-def test_opens_further_up_to_a_limit(viseme: str) -> None:
+def test_the_mouth_opens_further_up_to_a_limit(viseme: str) -> None:
     opened = [expressed(viseme_faps(viseme), amount) for amount in (0.5, 0.8, 1.0, DEFAULT, 2.0)]
     middle = [float(lip_gaps(faps)[0]) for faps in opened]
     assert middle == sorted(middle)
@@ -140,7 +140,7 @@ def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[floa
         level = (k * FRAME_S, level_db)
         faps = np.zeros(68, dtype=np.float32)
         faps[[JAW, UPPER[0], LOWER[0], WIDTH]] = 100.0, -100.0, 100.0, -100.0
-        amplitude.apply(faps, moment(k * FRAME_S, articulation, [level], FRAME_S))
+        amplitude.apply(faps, frame_context(k * FRAME_S, articulation, [level], FRAME_S))
         assert faps[UPPER[0]] == -faps[JAW]
         assert faps[LOWER[0]] == 100.0  # pressed lips stay pressed
         assert faps[WIDTH] == -100.0

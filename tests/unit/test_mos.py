@@ -15,7 +15,7 @@ from kouxing.evaluation.head_videos import join_recordings
 from kouxing.evaluation.mos.commands import app
 from kouxing.evaluation.mos.report import make_report, mean_of, opinion_of, print_report
 from kouxing.evaluation.mos.store import FILE_NAME as ANSWERS
-from kouxing.evaluation.mos.store import Answer, Store, read_answers
+from kouxing.evaluation.mos.store import Answer, AnswerStore, read_answers
 from kouxing.evaluation.mos.study import FILE_NAME, load_study, new_study, williams_design
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
@@ -92,12 +92,12 @@ def answers_of(judge: int, place: int, condition: str, score: int, sentence: str
 def test_the_file_is_private_and_has_one_writer(tmp_path: Path) -> None:
     assert read_answers(tmp_path) == []
     (tmp_path / ANSWERS).touch(mode=0o644)
-    store = Store(tmp_path)
+    store = AnswerStore(tmp_path)
     assert (tmp_path / ANSWERS).stat().st_mode & 0o777 == 0o600
     with pytest.raises(UserError, match="another process"):
-        Store(tmp_path)
+        AnswerStore(tmp_path)
     store.close()
-    Store(tmp_path).close()
+    AnswerStore(tmp_path).close()
 
 
 def scores_of(*by_judge: list[int]) -> dict[tuple[int, str], int]:
@@ -129,7 +129,7 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     assert f"kouxing mos serve {folder}" in str(run(app, report).exception)
     study, given = load_study(folder), {"reference": 5, "live": 4, "late": 3, "anchor": 1}
     cells = [(judge, cell) for judge in range(2) for cell in sorted(study.files)]
-    store = Store(folder)
+    store = AnswerStore(folder)
     for place, (judge, (sentence, condition)) in enumerate(cells[:-1]):
         store.add(answers_of(judge, place, condition, given[condition], sentence))
     store.add(answers_of(1, -1, "reference", 1, "a"))

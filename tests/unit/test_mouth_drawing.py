@@ -96,7 +96,7 @@ def test_reports_a_text_that_does_not_fit(
         ("", "mouth.svg", None, "text is empty"),
     ],
 )
-def test_mistakes_are_named(
+def test_errors_name_the_mistake(
     tmp_path: Path, text: str | None, output: str, timing: TimingMethod | None, message: str
 ) -> None:
     with pytest.raises(UserError, match=message):

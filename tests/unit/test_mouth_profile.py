@@ -21,10 +21,10 @@ from kouxing.services.recognizer.mouth_profile import (
     read_mouth_profile,
 )
 from kouxing.shared.errors import UserError
-from tests.lip_predictors import made_up_model
+from tests.lip_predictors import random_lip_predictor
 from tests.system import VOWELS_FILE, samples_of_file
 
-MODEL = made_up_model()
+MODEL = random_lip_predictor()
 SHAPE = MODEL.residual_shape
 NUM_FAPS = len(LIP_FAPS)
 RNG = np.random.default_rng(0)

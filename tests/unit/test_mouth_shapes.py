@@ -69,7 +69,7 @@ def test_oculus_visemes_are_found_again() -> None:
     assert names == list(OCULUS.names)
 
 
-def test_tsv_is_that_of_the_readme() -> None:
+def test_the_tsv_output_equals_the_readmes() -> None:
     text = write_cues(".tsv", HI, "X", 0.479, None)
     assert text == "0.00\tX\n0.05\tD\n0.27\tC\n0.31\tB\n0.43\tX\n0.47\tX\n"
 
@@ -94,7 +94,9 @@ def test_lips_that_close_for_a_rest_are_at_rest_at_once() -> None:
 
 
 @pytest.mark.slow
-def test_runs_like_rhubarb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_equals_rhubarbs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     output = tmp_path / "out.json"
     output.write_text("an older file")
     shapes = ["--extendedShapes", "GX", "--machineReadable"]
@@ -109,7 +111,7 @@ def test_runs_like_rhubarb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert switches[-1].endswith(" rest")
 
 
-def test_reports_errors_like_rhubarb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_equal_rhubarbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = tmp_path / "log.txt"
     with pytest.raises(SystemExit, match="1"):
         rhubarb.main(["--machineReadable", "--logFile", str(log), str(tmp_path / "no.wav")])

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.agreement import moments
 from kouxing.evaluation.lips.closures import closures
-from kouxing.evaluation.lips.curve_tables import read_table, read_tables, shipped_mouth
+from kouxing.evaluation.lips.curve_tables import fap_conversion, read_table, read_tables
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
-from kouxing.evaluation.lips.other_programs import load_programs, load_shipped
+from kouxing.evaluation.lips.other_programs import load_program_faps, load_programs
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 
@@ -58,22 +58,24 @@ def test_an_opening_is_scored_at_its_own_delay(tmp_path: Path) -> None:
     assert fitted.startswith("mine, fitted, ")
     real = real_mouth(HELD.time_s, real_faps(HELD))
     for mouth_of in programs.values():
-        made = mouth_of(HELD)
-        correlation = moments([(made, real)], "opening").correlation
+        mouth = mouth_of(HELD)
+        correlation = moments([(mouth, real)], "opening").correlation
         assert correlation is not None
         assert correlation > 0.99
-        assert closures(made, real).f1 == pytest.approx(1.0)
+        assert closures(mouth, real).f1 == pytest.approx(1.0)
 
 
 def test_the_faps_of_a_program_are_at_its_best_delay(tmp_path: Path) -> None:
     write_table(tmp_path / "held_1.csv", late_opening())
     real = real_mouth(HELD.time_s, real_faps(HELD))
-    made = predicted_mouth(load_shipped(tmp_path, [HELD])(HELD, np.arange(430) / FRAME_RATE_HZ))
-    correlation = moments([(made, real)], "opening").correlation
+    mouth = predicted_mouth(
+        load_program_faps(tmp_path, [HELD])(HELD, np.arange(430) / FRAME_RATE_HZ)
+    )
+    correlation = moments([(mouth, real)], "opening").correlation
     assert correlation is not None
     assert correlation > 0.99
     with pytest.raises(UserError, match=r"add train_1\.csv"):
-        load_shipped(tmp_path, [HELD, TRAINING])
+        load_program_faps(tmp_path, [HELD, TRAINING])
 
 
 def test_without_training_clips_the_curves_count_as_they_are(tmp_path: Path) -> None:
@@ -85,7 +87,7 @@ def test_without_training_clips_the_curves_count_as_they_are(tmp_path: Path) -> 
 def test_shapes_open_the_mouth(tmp_path: Path, jaw: str) -> None:
     write_table(tmp_path / "held_1.csv", {jaw: np.array([0.0, 1.0]), "t": np.array([0.0, 0.01])})
     table = read_tables(tmp_path, [HELD], [])["held_1"]
-    faps = shipped_mouth(tmp_path, [table]).faps(table.values)
+    faps = fap_conversion(tmp_path, [table]).faps(table.values)
     assert not faps[0].any()
     assert -faps[1, 3] - faps[1, 4] > 200.0
 

@@ -61,7 +61,7 @@ def test_a_slow_service_skips_audio_that_it_cannot_process() -> None:
     assert not any(session.run(4.0, speed=3.0))
 
 
-def test_is_never_far_behind_for_long() -> None:
+def test_a_session_is_never_far_behind_for_long() -> None:
     session = Session()
     behind_s = []
     for _ in range(2000):
@@ -100,7 +100,7 @@ def _send_a_long_chunk(session: Session) -> None:
 
 
 @pytest.mark.parametrize("send", [_send_ahead, _send_after_a_pause, _send_a_long_chunk])
-def test_keeps_audio_that_is_not_late(send: Callable[[Session], None]) -> None:
+def test_audio_that_is_not_late_is_kept(send: Callable[[Session], None]) -> None:
     session = Session()
     send(session)
     assert not any(session.run(4.0, speed=1.3, sent=0.0))

@@ -1,4 +1,4 @@
-"""Every class of phones is seen in every output, and shapes lead back to the face they are of."""
+"""Every class of phones changes every output, and shapes determine the lips they come from."""
 
 from collections.abc import Callable
 from functools import cache, partial
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.full_model import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.shapes import SHAPE_SETS

@@ -12,11 +12,11 @@ from kouxing.shared.errors import UserError
 from kouxing.training.phone_lm import open_gram
 from kouxing.training.phone_lm.open_gram import DICTIONARY, NGRAMS, draw_phones
 from kouxing.training.phone_lm.recipe import (
-    Stream,
+    PhoneStream,
     estimate_phone_lm,
+    join_sentences,
     load_phone_lm,
     phones_of_text,
-    stream_of,
     train_phone_lm,
 )
 from tests.languages import MANDARIN, NUM_PHONES, SIL, START, Table, step
@@ -30,7 +30,7 @@ SENTENCE = [
 ]
 
 
-def wandering(num_sentences: int = 400, seed: int = 0) -> Stream:
+def wandering(num_sentences: int = 400, seed: int = 0) -> PhoneStream:
     """Sentences in which two phones tell much about the next."""
     rng = np.random.default_rng(seed)
     likely = rng.dirichlet(np.full(8, 0.2), (8, 8))
@@ -40,7 +40,7 @@ def wandering(num_sentences: int = 400, seed: int = 0) -> Stream:
         for _ in range(length):
             sentence.append(int(rng.choice(8, p=likely[sentence[-2], sentence[-1]])))
         sentences.append([7 * phone for phone in sentence[2:]])
-    return stream_of(sentences, MANDARIN)
+    return join_sentences(sentences, MANDARIN)
 
 
 # --- estimation
@@ -58,7 +58,7 @@ def test_probabilities_after_every_context_sum_to_one(max_ngrams: int) -> None:
 def test_smooths_like_witten_and_bell() -> None:
     """After 1 2 comes 3 eight times and 4 twice, after 5 2 only 4: eq. as in the docstring."""
     sentences = [[1, 2, 3]] * 8 + [[1, 2, 4]] * 2 + [[5, 2, 4]] * 10
-    graph = estimate_phone_lm([stream_of(sentences, MANDARIN)], MANDARIN, order=3).graph
+    graph = estimate_phone_lm([join_sentences(sentences, MANDARIN)], MANDARIN, order=3).graph
     num_phones = 3 * 20 + 20 - 1  # the pause before the first sentence is not counted
     alone = {3: 8.5, 4: 12.5}
     after_2 = {u: ((8, 12)[u == 4] + 2 * alone[u] / (num_phones + 30)) / 22 for u in (3, 4)}
@@ -112,7 +112,7 @@ def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def words_of(stream: Stream) -> list[str]:
+def words_of(stream: PhoneStream) -> list[str]:
     """Read the words back: each begins with a phone of its own."""
     readable = [word for word in WORDS if MANDARIN.readable.fullmatch(word)]
     words = {phones_of_text(word, MANDARIN): word for word in readable}

@@ -104,7 +104,7 @@ def test_splits_a_syllable_into_phones() -> None:
         ("1.2.3版，9·11，08:05，0.25", "一点二点三版九一一八点零五分零点二五"),
     ],
 )
-def test_reads_numbers(text: str, read: str) -> None:
+def test_numbers_become_syllables(text: str, read: str) -> None:
     assert "".join(syllable.text for syllable in transcribe(text).syllables) == read
 
 

@@ -15,11 +15,11 @@ WORKERS = ("recognizer-1", "recognizer-2", "synthesizer-1", "synthesizer-2")
 
 def loaded(num_sessions: int, load: float) -> WorkerLoad:
     """Return the load of a worker at 10 s; its sessions were placed long ago."""
-    made = WorkerLoad()
+    worker_load = WorkerLoad()
     for _ in range(num_sessions):
-        made.add_session(0.0, paced=True)
-    made.measure(load, 10.0)
-    return made
+        worker_load.add_session(0.0, paced=True)
+    worker_load.measure(load, 10.0)
+    return worker_load
 
 
 def num_admitted(load: WorkerLoad, now_s: float) -> int:
@@ -67,10 +67,10 @@ def test_silent_sessions_do_not_hide_what_they_cost_when_they_speak() -> None:
 
 @pytest.fixture
 def system() -> System:
-    made = System(max_sessions=100, max_load=MAX_LOAD)
-    made.add(worker("recognizer", "recognizer-2"))
-    made.add(worker("synthesizer", "synthesizer-2"))
-    return made
+    system = System(max_sessions=100, max_load=MAX_LOAD)
+    system.add(worker("recognizer", "recognizer-2"))
+    system.add(worker("synthesizer", "synthesizer-2"))
+    return system
 
 
 def measure(system: System, instance: str, load: float, now_s: float) -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from kouxing.corpora.scoring import matched_pairs
+from kouxing.corpora.scoring import align_symbols
+from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
 from kouxing.evaluation.recognizer.disturbances import check_conditions, disturbances_for
 from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
-from kouxing.evaluation.recognizer.references import align_corpus
 from kouxing.evaluation.recognizer.report import print_figures
 from kouxing.evaluation.recognizer.synthetic_sounds import varying_noise as noise
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -30,12 +30,12 @@ def test_aligns_random_strings_with_the_fewest_errors() -> None:
 
     for _ in range(30):
         a, b = ("".join(rng.choice(list("abc"), rng.integers(0, 6))) for _ in range(2))
-        pairs = matched_pairs(a, b)
+        pairs = align_symbols(a, b)
         assert sum(i is None or j is None or a[i] != b[j] for i, j in pairs) == distance(a, b)
 
 
 @pytest.mark.slow
-def test_evaluates_a_corpus_with_bad_rows(
+def test_a_corpus_with_bad_rows_is_evaluated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vowels = VOWELS_FILE

@@ -56,7 +56,9 @@ def chunk(
         (chunk(sequence=0), SOCKET, ErrorCode.BAD_AUDIO, "from 1"),
     ],
 )
-def test_rejects_a_sender(message: AudioChunk, socket: Socket, code: ErrorCode, text: str) -> None:
+def test_audio_of_a_wrong_sender_is_rejected(
+    message: AudioChunk, socket: Socket, code: ErrorCode, text: str
+) -> None:
     make_session().check_sender(chunk(), SOCKET)
     with pytest.raises(AudioRejected, match=text) as rejection:
         make_session().check_sender(message, socket)

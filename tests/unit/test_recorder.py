@@ -38,19 +38,19 @@ class FakeRecording:
         self.is_discarded = True
 
 
-class Stage:
+class RecorderHarness:
     """A recorder of fake videos."""
 
     def __init__(self) -> None:
         self.reports: list[tuple[object, ...]] = []
-        self.made: list[FakeRecording] = []
+        self.recordings: list[FakeRecording] = []
         self.recorder = Recorder(self._make, lambda *report: self.reports.append(report))
 
     def _make(self, path: Path) -> Any:
         if path.name == "unwritable":
             raise UserError("cannot write unwritable")
-        self.made.append(FakeRecording(path))
-        return self.made[-1]
+        self.recordings.append(FakeRecording(path))
+        return self.recordings[-1]
 
     def begin(self, number: int, key: str, num_frames: int, path: str = "video") -> None:
         self.recorder.begin(number, key, Path(path))
@@ -65,43 +65,43 @@ class Stage:
 
 
 @pytest.fixture
-def stage() -> Stage:
-    return Stage()
+def harness() -> RecorderHarness:
+    return RecorderHarness()
 
 
-def test_every_key_gets_the_same_number_of_images(stage: Stage) -> None:
+def test_every_key_gets_the_same_number_of_images(harness: RecorderHarness) -> None:
     for number in range(3):
-        stage.begin(number, "greedy", 2)
-    stage.begin(3, "other", 2)
-    assert stage.draw() == [0, 3, 1, 3, 2, 0, 1, 2]
+        harness.begin(number, "greedy", 2)
+    harness.begin(3, "other", 2)
+    assert harness.draw() == [0, 3, 1, 3, 2, 0, 1, 2]
 
 
-def test_completes_a_video_once_its_frames_are_drawn(stage: Stage) -> None:
-    stage.begin(0, "a", 2)
-    stage.recorder.end(0)
-    stage.recorder.add_frame(0, 9.0, FRAME)
-    assert stage.draw() == [0, 0]
-    assert stage.reports[-1] == ("written", 0, Path("video"))
+def test_completes_a_video_once_its_frames_are_drawn(harness: RecorderHarness) -> None:
+    harness.begin(0, "a", 2)
+    harness.recorder.end(0)
+    harness.recorder.add_frame(0, 9.0, FRAME)
+    assert harness.draw() == [0, 0]
+    assert harness.reports[-1] == ("written", 0, Path("video"))
 
 
-def test_an_error_ends_one_video_only(stage: Stage) -> None:
-    stage.begin(0, "a", 1, "bad")
-    stage.begin(1, "a", 1, "unwritable")
-    stage.begin(2, "a", 1)
-    assert stage.draw() == [2]
-    assert stage.reports[:2] == [
+def test_an_error_ends_one_video_only(harness: RecorderHarness) -> None:
+    harness.begin(0, "a", 1, "bad")
+    harness.begin(1, "a", 1, "unwritable")
+    harness.begin(2, "a", 1)
+    assert harness.draw() == [2]
+    assert harness.reports[:2] == [
         ("failed", 1, "cannot write unwritable"),
         ("failed", 0, "the encoder failed"),
     ]
-    assert stage.made[0].is_discarded
+    assert harness.recordings[0].is_discarded
 
 
 def test_ends_a_video_early_when_drawing_is_too_far_behind(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
+    harness: RecorderHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "MAX_QUEUED_FRAMES", 3)
-    stage.begin(0, "a", 2)
-    stage.begin(1, "a", 4)
-    assert stage.draw() == [0, 1, 0, 1, 1]
-    ends = [report[:2] for report in stage.reports if report[0] != "image"]
+    harness.begin(0, "a", 2)
+    harness.begin(1, "a", 4)
+    assert harness.draw() == [0, 1, 0, 1, 1]
+    ends = [report[:2] for report in harness.reports if report[0] != "image"]
     assert ends == [("short", 1), ("written", 1)]

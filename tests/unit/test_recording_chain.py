@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.evaluation.lips.full_model import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text
@@ -28,12 +28,12 @@ def test_dynamic_visemes_are_the_full_model() -> None:
     )
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
-    made = np.array([faps for _, faps in animate_recording(analyzed, lips, STILL)])
+    frames = np.array([faps for _, faps in animate_recording(analyzed, lips, STILL)])
     num_frames = int(analyzed.duration_s * 50) + 1
     full = synthesize(lips, analyzed.phones, num_frames, 50.0, level_track(samples))
     assert np.ptp(full[:, 2]) > 100
-    np.testing.assert_allclose(made[:num_frames], full, atol=1e-3)
-    assert len(made) == num_frames + 15, "and the way to rest"
+    np.testing.assert_allclose(frames[:num_frames], full, atol=1e-3)
+    assert len(frames) == num_frames + 15, "and the way to rest"
 
 
 def test_lips_close_and_open_for_the_phones_of_a_known_text() -> None:

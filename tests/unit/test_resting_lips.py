@@ -1,4 +1,4 @@
-"""Lips rest as filmed ones: ajar in pauses, closed in silence, and parted before a sound."""
+"""Lips rest as on film: ajar in pauses, closed in silence, and parted before a sound."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ LOUD_DB, QUIET_DB = -20.0, -60.0
 SOUND_S = 1.0  # when the sound ends
 
 
-def shares(
+def ajar_amounts(
     level_at: Callable[[float], float],
     until_s: float,
     delay_s: float = 0.06,
@@ -30,12 +30,12 @@ def shares(
     closure: float = 0.1,
     phone_s: float = math.inf,
 ) -> NDArray[np.float64]:
-    """Return the share at each frame; ``voice`` are the times at which the voice changes."""
+    """Return how far the mouth is ajar at each frame; ``voice``: times at which it changes."""
     lips = RestingLips()
     for number, time_s in enumerate(voice):
         lips.add_event(SpeechChange(active=number % 2 == 0, time_s=time_s))
     delay = round(delay_s / FRAME_S)
-    made = []
+    amounts = []
     for number in range(round(until_s / FRAME_S) + delay):
         time_s = number * FRAME_S
         lips.add_event(Progress(time_s=time_s, level_db=level_at(time_s)))
@@ -44,16 +44,16 @@ def shares(
             lips.follow_voice(frame_s)
             is_phone = phone_s <= frame_s < phone_s + 0.1
             lips.doubt_at(frame_s, closure if frame_s > SOUND_S else 0.1, 2.0 * is_phone)
-            made.append(lips.amount_at(frame_s))
-    return np.array(made)
+            amounts.append(lips.amount_at(frame_s))
+    return np.array(amounts)
 
 
 def sound_until_pause(time_s: float) -> float:
     return LOUD_DB if time_s <= SOUND_S else QUIET_DB
 
 
-def at(made: NDArray[np.float64], time_s: float) -> float:
-    return float(made[round(time_s / FRAME_S)])
+def at(amounts: NDArray[np.float64], time_s: float) -> float:
+    return float(amounts[round(time_s / FRAME_S)])
 
 
 def test_the_ajar_mouth_is_as_open_as_filmed_ones_in_pauses() -> None:
@@ -63,54 +63,56 @@ def test_the_ajar_mouth_is_as_open_as_filmed_ones_in_pauses() -> None:
 
 @pytest.mark.parametrize("delay_s", [0.06, 0.3])
 def test_lips_part_in_a_pause_hold_and_close_slowly(delay_s: float) -> None:
-    made = shares(sound_until_pause, 3.0, delay_s)
-    assert not made[: round(SOUND_S / FRAME_S)].any()
-    assert at(made, SOUND_S + 0.24) == 1.0
-    assert at(made, SOUND_S + 0.8) == 1.0
-    closing_s = 1e-9 + FRAME_S * np.count_nonzero((made > 0.0) & (np.diff(made, append=0.0) < 0.0))
+    amounts = ajar_amounts(sound_until_pause, 3.0, delay_s)
+    assert not amounts[: round(SOUND_S / FRAME_S)].any()
+    assert at(amounts, SOUND_S + 0.24) == 1.0
+    assert at(amounts, SOUND_S + 0.8) == 1.0
+    closing_s = 1e-9 + FRAME_S * np.count_nonzero(
+        (amounts > 0.0) & (np.diff(amounts, append=0.0) < 0.0)
+    )
     assert 0.3 <= closing_s <= 0.45
-    assert not made[round((SOUND_S + 1.3) / FRAME_S) :].any()
-    assert np.abs(np.diff(made)).max() < 0.25  # no jump
+    assert not amounts[round((SOUND_S + 1.3) / FRAME_S) :].any()
+    assert np.abs(np.diff(amounts)).max() < 0.25  # no jump
 
 
-def test_the_closure_of_a_stop_is_no_pause() -> None:
-    made = shares(lambda time_s: QUIET_DB if 1.0 < time_s <= 1.1 else LOUD_DB, 2.0)
-    assert not made.any()
+def test_the_closure_of_a_stop_does_not_count_as_a_pause() -> None:
+    amounts = ajar_amounts(lambda time_s: QUIET_DB if 1.0 < time_s <= 1.1 else LOUD_DB, 2.0)
+    assert not amounts.any()
 
 
 def test_lips_follow_the_predictor_again_before_the_next_sound() -> None:
-    made = shares(lambda time_s: QUIET_DB if 1.0 < time_s <= 1.5 else LOUD_DB, 2.0)
-    assert at(made, 1.4) == 1.0
-    assert at(made, 1.52) < 0.01
-    assert not made[round(1.54 / FRAME_S) :].any()
+    amounts = ajar_amounts(lambda time_s: QUIET_DB if 1.0 < time_s <= 1.5 else LOUD_DB, 2.0)
+    assert at(amounts, 1.4) == 1.0
+    assert at(amounts, 1.52) < 0.01
+    assert not amounts[round(1.54 / FRAME_S) :].any()
 
 
 def test_lips_that_the_predictor_closes_in_a_pause_stay_closed() -> None:
-    assert not shares(sound_until_pause, 3.0, closure=CERTAIN).any()
+    assert not ajar_amounts(sound_until_pause, 3.0, closure=CERTAIN).any()
 
 
 def test_a_closing_phone_closes_the_lips_in_a_pause() -> None:
-    made = shares(sound_until_pause, 3.0, phone_s=1.5)
-    assert at(made, 1.48) == 1.0
-    assert at(made, 1.58) == 0.0
-    assert at(made, 1.8) == 1.0
+    amounts = ajar_amounts(sound_until_pause, 3.0, phone_s=1.5)
+    assert at(amounts, 1.48) == 1.0
+    assert at(amounts, 1.58) == 0.0
+    assert at(amounts, 1.8) == 1.0
 
 
 def test_lips_part_before_a_sound_as_early_as_it_is_known() -> None:
-    made = shares(lambda t: LOUD_DB if t > 1.3 else QUIET_DB, 1.3, 0.3, voice=(1.1,))
-    assert not made[: round((1.1 - LEAD_S) / FRAME_S)].any()
-    assert at(made, 1.1 - LEAD_S + PART_S + 0.02) == 1.0
-    assert at(made, 1.2) == 1.0
+    amounts = ajar_amounts(lambda t: LOUD_DB if t > 1.3 else QUIET_DB, 1.3, 0.3, voice=(1.1,))
+    assert not amounts[: round((1.1 - LEAD_S) / FRAME_S)].any()
+    assert at(amounts, 1.1 - LEAD_S + PART_S + 0.02) == 1.0
+    assert at(amounts, 1.2) == 1.0
 
 
 @pytest.mark.parametrize("level_db", [QUIET_DB, LOUD_DB])
 def test_lips_stay_closed_without_voice(level_db: float) -> None:
-    assert not shares(lambda _: level_db, 2.0, voice=()).any()
+    assert not ajar_amounts(lambda _: level_db, 2.0, voice=()).any()
 
 
 def test_a_bang_does_not_freeze_the_mouth() -> None:
-    made = shares(lambda time_s: 0.0 if 0.5 < time_s <= 0.6 else -30.0, 3.0)
-    assert not made[round(1.2 / FRAME_S) :].any()
+    amounts = ajar_amounts(lambda time_s: 0.0 if 0.5 < time_s <= 0.6 else -30.0, 3.0)
+    assert not amounts[round(1.2 / FRAME_S) :].any()
 
 
 def test_the_end_of_the_sound_closes_the_lips_in_300_ms() -> None:
@@ -120,11 +122,11 @@ def test_the_end_of_the_sound_closes_the_lips_in_300_ms() -> None:
         lips.add_event(
             Progress(time_s=number * FRAME_S, level_db=sound_until_pause(number * FRAME_S))
         )
-    made = []
+    amounts = []
     for number in range(94):
         if number == 79:
             lips.add_event(EndOfSound(time_s=number * FRAME_S))
         lips.follow_voice(number * FRAME_S)
-        made.append(lips.amount_at(number * FRAME_S))
-    assert made[78] == 1.0
-    assert made[-1] == 0.0
+        amounts.append(lips.amount_at(number * FRAME_S))
+    assert amounts[78] == 1.0
+    assert amounts[-1] == 0.0

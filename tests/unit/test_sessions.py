@@ -142,7 +142,7 @@ def test_the_client_and_the_services_get_the_endpoints_and_facts(system: System)
 
 
 @pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
-def test_names_a_missing_service(system: System, service: str) -> None:
+def test_the_error_names_a_missing_service(system: System, service: str) -> None:
     system.registry.remove(f"{service}-1")
     with refused("no-service", f"no {service} is running"):
         system.open()

@@ -131,7 +131,7 @@ def test_words_that_espeak_joins_stay_apart() -> None:
     ]
 
 
-def test_names_what_it_cannot_read() -> None:
+def test_the_error_names_words_that_cannot_be_read() -> None:
     transcript = load_inventory("english").read("Hello 你好 ☃ привет, world")
     assert [word.text for word in transcript.syllables] == ["Hello", "world"]
     assert set(transcript.dropped) == {"你好", "☃", "привет"}

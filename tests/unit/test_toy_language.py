@@ -75,7 +75,7 @@ def symbols(phones: list[Phone], toy: PhoneInventory) -> str:
     return " ".join(phone.symbol for phone in spoken(phones, toy))
 
 
-def test_recognizes_it_live_and_offline(toy: PhoneInventory, path: Path) -> None:
+def test_the_language_is_recognized_live_and_offline(toy: PhoneInventory, path: Path) -> None:
     model = load_model(path)
     assert model.inventory is toy
     assert toy.phones == ("sil", "m", "a", "o", "e", "i", "u", "y")
@@ -86,7 +86,7 @@ def test_recognizes_it_live_and_offline(toy: PhoneInventory, path: Path) -> None
     assert symbols(final, toy) == heard
 
 
-def test_aligns_text(toy: PhoneInventory, path: Path) -> None:
+def test_a_text_of_the_language_is_aligned(toy: PhoneInventory, path: Path) -> None:
     aligned = spoken(align_text(load_model(path), SAMPLES, 16_000, "aoe iuy"), toy)
     assert symbols(aligned, toy) == "a o e i u y"
     expected = spoken(align_text(load_model(), SAMPLES, 16_000, "啊喔鹅衣乌迂"), load_inventory())
@@ -96,7 +96,7 @@ def test_aligns_text(toy: PhoneInventory, path: Path) -> None:
         align_text(load_model(path), SAMPLES, 16_000, "xyz")
 
 
-def test_opens_the_mouth(toy: PhoneInventory, path: Path) -> None:
+def test_the_language_opens_the_mouth(toy: PhoneInventory, path: Path) -> None:
     visemes = "dynamic-visemes"
     config = SynthesizerConfig(lips=visemes)
     chain = LiveChain(load_model(path), load_lip_model("toy", visemes), synthesizer=config)

@@ -8,7 +8,7 @@ import pytest
 import soundfile
 from typer.testing import CliRunner
 
-from kouxing.corpora.speech_corpus import RowErrors, may_ship, read_corpus
+from kouxing.corpora.speech_corpus import RowErrors, may_distribute, read_corpus
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.forced_path import utterance_graph, viterbi_path
 from kouxing.shared.errors import UserError
@@ -120,12 +120,12 @@ def test_licenses_that_allow_distribution() -> None:
         "Apache-2.0 (AISHELL-1/OpenSLR33)", "MIT", "CC0-1.0 (Common Voice)", "CC-BY-SA (shtooka)",
         "CC BY 4.0", "Unlicense (public domain)", "synthetic (Kokoro-82M, Apache-2.0)",
     ):  # fmt: skip
-        assert may_ship(free), free
+        assert may_distribute(free), free
     for closed in (
         "CC-BY-NC-ND-4.0", "CC BY-NC 4.0", "CC BY-SA-NC", "Apache-2.0 with exceptions", "",
         "MIT (repo); film clip", "MIT (repo sample); YouTube footage", "all rights reserved",
     ):  # fmt: skip
-        assert not may_ship(closed), closed
+        assert not may_distribute(closed), closed
 
 
 # --- paths

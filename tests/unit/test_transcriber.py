@@ -51,7 +51,7 @@ def paraformer(tmp_path: Path) -> Path:
     return folder
 
 
-def test_transcribes_with_the_smallest_file(paraformer: Path) -> None:
+def test_the_smallest_file_of_a_model_is_used(paraformer: Path) -> None:
     (paraformer / "model.onnx").write_bytes(bytes(100_000))  # cannot be loaded
     transcriber = Transcriber(paraformer)
     assert [transcriber.transcribe(sound) for sound in (SOUND, SOUND[:8000])] == ["你好", "你好"]

@@ -18,10 +18,10 @@ from kouxing.shared import records
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.blocks.network import BlockReadout, layout
+from kouxing.training.blocks.network import BlockReadout, block_layout
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.universal.encoder import BLOCK_LENGTH, RIGHT_CONTEXT, FeatureEncoder
-from kouxing.training.universal.export import extension_of
+from kouxing.training.universal.export import export_extension
 from tests.live_streams import LiveStream
 from tests.unit.test_block_model import (
     BLOCK,
@@ -48,19 +48,19 @@ def readout() -> BlockReadout:
 
 @cache
 def extended() -> BlockModel:
-    extension = extension_of(readout(), blocks(), LAYERS)
+    extension = export_extension(readout(), blocks(), LAYERS)
     return replace(blocks(), network=np.concatenate([blocks().network, extension]))
 
 
 @pytest.mark.parametrize("hop", [1, 2])
 def test_the_second_readout_agrees_with_pytorch(hop: int) -> None:
     encoder, _ = networks()
-    laid = layout(len(FRAMES) // 2, hop * BLOCK, LENGTH - hop * BLOCK)
+    layout = block_layout(len(FRAMES) // 2, hop * BLOCK, LENGTH - hop * BLOCK)
     repeated = torch.from_numpy(np.concatenate([FRAMES, FRAMES[-1:]]))[None]
     with torch.no_grad():
-        hidden = encoder(repeated, laid)
+        hidden = encoder(repeated, layout)
         features = torch.cat([hidden[..., :32], hidden[..., -32:]], dim=-1)
-        expected = readout().read(features, laid)[0, : len(FRAMES) // 2].flatten(0, 1).numpy()
+        expected = readout().read(features, layout)[0, : len(FRAMES) // 2].flatten(0, 1).numpy()
     stream = extended().create_stream()
     stream.set_hop(hop)
     scores = np.concatenate([stream.score(frame[None]) for frame in FRAMES])
@@ -88,15 +88,15 @@ def test_the_first_readout_and_the_caches_do_not_change() -> None:
 
 def test_training_uses_the_features_of_the_network() -> None:
     encoder, _ = networks()
-    laid = layout(len(FRAMES) // 2, BLOCK_LENGTH, RIGHT_CONTEXT)
+    layout = block_layout(len(FRAMES) // 2, BLOCK_LENGTH, RIGHT_CONTEXT)
     repeated = np.concatenate([FRAMES, FRAMES[-1:]])
     with torch.no_grad():
-        hidden = encoder(torch.from_numpy(repeated)[None], laid)[0, :, -32:].numpy()
+        hidden = encoder(torch.from_numpy(repeated)[None], layout)[0, :, -32:].numpy()
     first, second = FeatureEncoder(blocks(), (-1,)).encode([FRAMES, FRAMES[:75]])
     assert first.shape == (17, BLOCK_LENGTH + RIGHT_CONTEXT, 32)
     assert len(second) == 4
-    rows = hidden[laid.blocks.numpy()]
-    exists = laid.exists.numpy()
+    rows = hidden[layout.blocks.numpy()]
+    exists = layout.is_valid.numpy()
     exists[-4:] = False  # they lack positions here
     error = np.abs(first[exists] - rows[exists]).mean()  # of 8-bit integers
     assert error < 0.02 * rows[exists].std()
@@ -107,7 +107,7 @@ def test_a_file_belongs_to_one_block_network(
 ) -> None:
     path = tmp_path / "universal.npz"
     monkeypatch.setattr(load, "_block_network", lambda: blocks().network)
-    extension = extension_of(readout(), blocks(), LAYERS)
+    extension = export_extension(readout(), blocks(), LAYERS)
     save_universal(path, extended(), extension)
     model = load_model(path)
     assert isinstance(model, BlockModel)

@@ -55,7 +55,7 @@ def test_names_unknown_symbols() -> None:
     assert read_ipa("ma?ǂ") == (("m", "a"), ("?", "ǂ"))
 
 
-def test_writes_what_it_reads() -> None:
+def test_written_ipa_is_read_back() -> None:
     for phone in {*UNIVERSAL.phones} - {"sil"}:
         assert read_ipa(ipa_of(phone)) == ((phone,), ())
     assert UNIVERSAL.spell(("h", "a", "uh", "s")) == "haʊs"
@@ -123,7 +123,7 @@ def test_labels_of_a_stop_are_one_phone(tmp_path: Path) -> None:
         ({"text": "xyz", "language": "yue"}, "'xyz' is not jyutping"),
     ],
 )
-def test_rejects_what_it_cannot_read(row: dict[str, str], message: str) -> None:
+def test_unreadable_labels_are_rejected(row: dict[str, str], message: str) -> None:
     with pytest.raises(UserError, match=message):
         words_of(**row)
 

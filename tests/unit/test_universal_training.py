@@ -56,7 +56,7 @@ def test_trains_resumes_and_writes_model_and_card(
     languages = [write_corpus(tmp_path / "corpus")]
     train = partial(train_universal, [], output, languages=languages)
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "extension_of", interrupt)
+        patch.setattr(recipe, "export_extension", interrupt)
         with pytest.raises(KeyboardInterrupt):
             train(num_steps=1)
     train(num_steps=2)

@@ -17,7 +17,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_IND
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.training.visemes.fit import estimate, frames_of
+from kouxing.training.visemes.fit import collect_frames, fit_parameters
 from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
 
 INVENTORY = load_inventory()
@@ -36,7 +36,7 @@ def test_estimates_the_parameters_behind_curves() -> None:
     curve = blend(true, build_timeline(phones, INVENTORY), time_s)
     faps[:, measured] = curve[:, measured]
 
-    found = estimate(frames_of([clip_of(time_s, faps)], [phones], INVENTORY))
+    found = fit_parameters(collect_frames([clip_of(time_s, faps)], [phones], INVENTORY))
 
     again = blend(found, build_timeline(phones, INVENTORY), time_s)
     before = blend(START, build_timeline(phones, INVENTORY), time_s)

@@ -11,14 +11,14 @@ from rich.console import Console
 
 from kouxing.corpora.sounds import Sound, read_sounds
 from kouxing.corpora.speech_corpus import Utterance
-from kouxing.evaluation.recognizer import voice
-from kouxing.evaluation.recognizer.disturbances import add_sound, music_from
-from kouxing.evaluation.recognizer.references import Reference
+from kouxing.evaluation.recognizer import voice_activity
+from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
+from kouxing.evaluation.recognizer.disturbances import add_sound, held_out_music
 from kouxing.evaluation.recognizer.synthetic_sounds import held_vowels, varying_noise
-from kouxing.evaluation.recognizer.voice import (
-    Material,
+from kouxing.evaluation.recognizer.voice_activity import (
+    LabeledAudio,
     evaluate_voice,
-    materials_of,
+    labeled_audio,
     print_voice,
     voice_states,
 )
@@ -39,7 +39,7 @@ def sounds(tmp_path: Path) -> list[Sound]:
         soundfile.write(tmp_path / f"{name}.flac", np.full(RATE_HZ, level), RATE_HZ)
         rows.append(f"{name}.flac\t{kind}\tCC0")
     (tmp_path / "manifest.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    return read_sounds([tmp_path], shipping=True)
+    return read_sounds([tmp_path], only_distributable=True)
 
 
 @pytest.mark.slow
@@ -61,11 +61,11 @@ def test_measures_parts_with_and_without_a_voice(monkeypatch: pytest.MonkeyPatch
         first = np.arange(len(samples)) < len(samples) / 2
         return np.stack([first, ~first, first & ~first], axis=1)
 
-    monkeypatch.setattr(voice, "voice_states", first_half)
+    monkeypatch.setattr(voice_activity, "voice_states", first_half)
     masks = np.array([[True, True, True, False], [True, False, False, False]])
     pieces = [(np.zeros(4, np.float32), mask) for mask in masks]
     voiced = (np.zeros(2, np.float32), np.full(2, True))
-    materials = [Material("mixed", pieces), Material("voice", [voiced])]
+    materials = [LabeledAudio("mixed", pieces), LabeledAudio("voice", [voiced])]
     results = evaluate_voice({"one": load_model("gmm")}, materials)
     shares = results["one"]["mixed"]
     assert shares["seconds"] == {"voice": pytest.approx(0.08), "no_voice": pytest.approx(0.08)}
@@ -81,10 +81,10 @@ def test_measures_parts_with_and_without_a_voice(monkeypatch: pytest.MonkeyPatch
 def test_materials_have_a_voice_where_the_text_has_phones(
     sounds: list[Sound], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(voice, "_SYNTHETIC_S", 1.0)
+    monkeypatch.setattr(voice_activity, "_SYNTHETIC_S", 1.0)
     phone = Phone(index=0, symbol="a", onset_s=0.2, duration_s=0.4, confidence=1.0, final=True)
-    reference = Reference(Utterance(utterance_id="vowels", path=VOWELS_FILE), [phone])
-    materials = materials_of([reference], {"clean": np.copy}, varying_noise(1.0), sounds)
+    reference = AlignedRecording(Utterance(utterance_id="vowels", path=VOWELS_FILE), [phone])
+    materials = labeled_audio([reference], {"clean": np.copy}, varying_noise(1.0), sounds)
     by_kind = {material.kind: material.recordings for material in materials}
     ((_, mask),) = by_kind["speech, clean"]
     assert np.flatnonzero(mask).tolist() == list(range(110, 130))  # after 2 s
@@ -96,13 +96,13 @@ def test_materials_have_a_voice_where_the_text_has_phones(
 
 
 def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> None:
-    music = music_from(sounds)
+    music = held_out_music(sounds)
     assert len(music) == RATE_HZ
     speech = held_vowels()[0]
     power = np.mean((add_sound(speech, music, 10.0) - speech) ** 2) / np.mean(speech**2)
     assert 10 * np.log10(power) == pytest.approx(-10, abs=0.1)
     with pytest.raises(UserError, match="the sounds contain no held-out music"):
-        music_from([sound for sound in sounds if not sound.is_held_out])
+        held_out_music([sound for sound in sounds if not sound.is_held_out])
 
 
 @pytest.mark.parametrize(
@@ -117,4 +117,4 @@ def test_reports_an_unusable_list_of_sounds(tmp_path: Path, rows: str, problem: 
     columns = "path\tkind" if "license" in problem else "kind\tlicense\tpath"
     (tmp_path / "manifest.tsv").write_text(f"{columns}\n{rows}", encoding="utf-8")
     with pytest.raises(UserError, match=problem):
-        read_sounds([tmp_path], shipping=False)
+        read_sounds([tmp_path], only_distributable=False)

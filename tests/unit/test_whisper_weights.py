@@ -10,14 +10,14 @@ import torch
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.shared.errors import UserError
-from kouxing.training.networks.network import Shape
+from kouxing.training.networks.network import EncoderShape
 from kouxing.training.networks.teacher import WholeEncoder
 from kouxing.training.networks.whisper import load_whisper
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
-SMALL = partial(Shape, width=32, heads=2, layers=2, inner=48)
+SMALL = partial(EncoderShape, width=32, heads=2, layers=2, inner=48)
 SHAPE = SMALL()
 
 

@@ -29,7 +29,7 @@ from kouxing.training.networks.augmentation import (
     scale_level,
     source_frames,
 )
-from kouxing.training.networks.batches import Recording, Targets, sampling_probs
+from kouxing.training.networks.batches import FrameTargets, LabeledRecording, sampling_probs
 
 BATCH_S = 32
 BATCHES_PER_STEP = 8
@@ -61,10 +61,10 @@ Integers = NDArray[np.int16]
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
-    """The recordings, and sounds for their background, that batches are drawn from."""
+class BatchSource:
+    """Recordings and background sounds from which batches are drawn."""
 
-    recordings: Sequence[Recording]
+    recordings: Sequence[LabeledRecording]
     backgrounds: Sequence[Integers] = ()  # music and noise
 
 
@@ -80,7 +80,7 @@ class BlockBatch:
     start: int  # row of the first position
 
 
-def block_batch(material: Material, seed: int, number: int) -> BlockBatch:
+def draw_block_batch(material: BatchSource, seed: int, number: int) -> BlockBatch:
     """Draw the batch with this number; the batches of a step have the same shape."""
     of_step = np.random.default_rng([seed, number // BATCHES_PER_STEP])
     length = int(of_step.choice(_LENGTHS))
@@ -109,8 +109,8 @@ def block_batch(material: Material, seed: int, number: int) -> BlockBatch:
 
 
 def _excerpt(
-    material: Material, probs: NDArray[np.float64], num_frames: int, rng: np.random.Generator
-) -> tuple[Floats, Targets]:
+    material: BatchSource, probs: NDArray[np.float64], num_frames: int, rng: np.random.Generator
+) -> tuple[Floats, FrameTargets]:
     """Draw an excerpt: frames, clean and disturbed, (num_frames, 160), and their targets."""
     tempo, shortening = 1.0, 0.0
     draw = rng.random()
@@ -129,19 +129,19 @@ def _excerpt(
     if rng.random() < _DISTURB_PROB:
         disturbed = _distort(disturb(_add_background(sound, material, rng), rng), rng)
     frames = np.hstack(
-        [WhisperMel().accept_waveform(one) for one in (sound, scale_level(disturbed, rng))]
+        [WhisperMel().accept_waveform(version) for version in (sound, scale_level(disturbed, rng))]
     )
     kept = _shorten(frames, tempo, shortening, num_frames)
     source = source_frames(len(frames), speed, len(targets))
-    return frames[kept], targets.of(source[kept])
+    return frames[kept], targets.select(source[kept])
 
 
 def _speech(
-    recordings: Sequence[Recording],
+    recordings: Sequence[LabeledRecording],
     probs: NDArray[np.float64],
     num_frames: int,
     rng: np.random.Generator,
-) -> tuple[Samples, Targets]:
+) -> tuple[Samples, FrameTargets]:
     """Draw recordings until they fill the frames; the first may start anywhere.
 
     ``probs`` are cumulative.
@@ -156,11 +156,11 @@ def _speech(
             start_frame = int(rng.integers(size - num_frames))
         size = min(size - start_frame, missing)
         sounds.append(recording.samples[HOP_SAMPLES * start_frame :][: HOP_SAMPLES * size])
-        target = recording.targets.of(slice(start_frame, start_frame + size))
+        target = recording.targets.select(slice(start_frame, start_frame + size))
         states.append(target.states)
         target_probs.append(target.probs)
         missing -= size
-    targets = Targets(np.concatenate(states), np.concatenate(target_probs))
+    targets = FrameTargets(np.concatenate(states), np.concatenate(target_probs))
     return as_floats(np.concatenate(sounds)), targets
 
 
@@ -180,7 +180,7 @@ def _shorten(frames: Floats, tempo: float, shortening: float, num_frames: int) -
     return np.minimum(source_frames, len(frames) - 1)
 
 
-def _add_background(sound: Samples, material: Material, rng: np.random.Generator) -> Samples:
+def _add_background(sound: Samples, material: BatchSource, rng: np.random.Generator) -> Samples:
     """Add music, noise or other voices of random levels, or nothing."""
     draw = rng.random()
     if draw < _BABBLE_PROB:

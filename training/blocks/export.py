@@ -37,14 +37,21 @@ from onnx import TensorProto, helper
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
 from kouxing.training.networks.network import MAX_DEVIATIONS
-from kouxing.training.networks.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
+from kouxing.training.networks.onnx_graph import (
+    DOMAIN,
+    Floats,
+    Graph,
+    floats,
+    halves,
+    module_arrays,
+)
 from kouxing.training.networks.teacher import KEPT_LAYERS
 
 _KINDS = ("keys", "values")
 _LAST_OF_BLOCK = "last_of_block"
 
 
-def onnx_of(
+def export_onnx(
     encoder: BlockEncoder,
     readout: BlockReadout,
     block_length: int,
@@ -71,7 +78,7 @@ class ReadoutGraph(Graph):
     ) -> None:
         super().__init__(prefix)
         self.block, self.length = block, length
-        self._readout = arrays_of(readout, "readout.") if readout else {}
+        self._readout = module_arrays(readout, "readout.") if readout else {}
 
     @property
     def state(self) -> onnx.ValueInfoProto:
@@ -179,7 +186,7 @@ class BlockGraph(ReadoutGraph):
         super().__init__(readout, block_length, block_length + right_context)
         self._shape = encoder.shape
         self._size = encoder.shape.width // encoder.shape.heads
-        self._encoder = arrays_of(encoder)
+        self._encoder = module_arrays(encoder)
         self._past = past
         self._new: list[str] = []  # keys and values of the block
 

@@ -12,16 +12,16 @@ from torch import nn
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout
-from kouxing.training.networks.network import ReadoutShape, Shape
+from kouxing.training.networks.network import EncoderShape, ReadoutShape
 
 M = TypeVar("M", bound=nn.Module)
 _Tensors = Mapping[str, NDArray[Any]]
 
 
-def encoder_of(model: BlockModel) -> BlockEncoder:
+def rebuild_encoder(model: BlockModel) -> BlockEncoder:
     """Rebuild the encoder."""
     tensors, sizes = _tensors_of(model), model.session.sizes
-    shape = Shape(
+    shape = EncoderShape(
         width=sizes.width,
         heads=sizes.heads,
         layers=sizes.layers,
@@ -30,7 +30,7 @@ def encoder_of(model: BlockModel) -> BlockEncoder:
     return _load(BlockEncoder(shape), tensors)
 
 
-def readout_of(model: BlockModel) -> BlockReadout:
+def rebuild_readout(model: BlockModel) -> BlockReadout:
     """Rebuild the readout, whose recurrent layer is exported in ONNX's layout."""
     tensors = _tensors_of(model)
     inner = len(tensors["readout.inner.bias"])

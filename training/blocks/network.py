@@ -49,7 +49,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
-from kouxing.training.networks.network import PADDING_FRAMES, Encoder, Readout, ReadoutShape, Shape
+from kouxing.training.networks.network import (
+    PADDING_FRAMES,
+    Encoder,
+    EncoderShape,
+    Readout,
+    ReadoutShape,
+)
 from kouxing.training.networks.teacher import KEPT_LAYERS
 
 RIGHT_CONTEXT = 10  # positions, 200 ms
@@ -61,55 +67,55 @@ _GRU_WEIGHTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class BlockLayout:
     """The positions that are computed for a recording, and their attention mask."""
 
     num_positions: int  # number of positions in the recording
     places: Tensor  # (n,) in the recording: all positions, then each block's right context
-    may_attend: Tensor  # (n, n)
+    attention_mask: Tensor  # (n, n)
     blocks: Tensor  # (blocks, B + R), the positions of a block and its right context, of n
-    exists: Tensor  # (blocks, B + R)
-    in_blocks: Tensor  # (n,), places in the flattened blocks
-    in_right: Tensor  # (copies,), places in the flattened right contexts
+    is_valid: Tensor  # (blocks, B + R)
+    block_indices: Tensor  # (n,), places in the flattened blocks
+    right_indices: Tensor  # (copies,), places in the flattened right contexts
     block_length: int  # B
 
     def in_order(self, of_blocks: Tensor) -> Tensor:
         """Put values of the blocks, (batch, blocks, B + R, width), in order: (batch, n, width)."""
-        return of_blocks.flatten(1, 2)[:, self.in_blocks]
+        return of_blocks.flatten(1, 2)[:, self.block_indices]
 
 
 @cache
-def layout(
+def block_layout(
     num_positions: int,
     block_length: int,
     right_context: int = RIGHT_CONTEXT,
     device: torch.device = _CPU,
-) -> Layout:
+) -> BlockLayout:
     """Lay out a recording's positions and right contexts."""
     num_blocks = math.ceil(num_positions / block_length)
     begins = block_length * torch.arange(num_blocks)
     places = begins[:, None] + torch.arange(block_length + right_context)
-    exists = places < num_positions
-    copied = exists.clone()
+    is_valid = places < num_positions
+    copied = is_valid.clone()
     copied[:, :block_length] = False
     blocks = places.clone()
     blocks[copied] = num_positions + torch.arange(int(copied.sum()))
-    blocks[~exists] = 0
+    blocks[~is_valid] = 0
     positions = torch.arange(num_positions)
     block_of = torch.cat([positions // block_length, copied.nonzero()[:, 0]])
     begin = begins[block_of][:, None]  # start of the attending position's block
-    may_attend = block_of == block_of[:, None]
-    may_attend[:, :num_positions] |= (positions < begin) & (positions >= begin - PAST)
-    of_block = exists & ~copied
-    in_blocks = torch.cat([part.flatten().nonzero()[:, 0] for part in (of_block, copied)])
-    return Layout(
+    attention_mask = block_of == block_of[:, None]
+    attention_mask[:, :num_positions] |= (positions < begin) & (positions >= begin - PAST)
+    of_block = is_valid & ~copied
+    block_indices = torch.cat([part.flatten().nonzero()[:, 0] for part in (of_block, copied)])
+    return BlockLayout(
         num_positions=num_positions,
         places=torch.cat([positions, places[copied]]).to(device),
-        may_attend=may_attend.to(device),
+        attention_mask=attention_mask.to(device),
         blocks=blocks.to(device),
-        exists=exists.to(device),
-        in_blocks=in_blocks.to(device),
-        in_right=copied[:, block_length:].flatten().nonzero()[:, 0].to(device),
+        is_valid=is_valid.to(device),
+        block_indices=block_indices.to(device),
+        right_indices=copied[:, block_length:].flatten().nonzero()[:, 0].to(device),
         block_length=block_length,
     )
 
@@ -117,20 +123,20 @@ def layout(
 class BlockEncoder(Encoder):
     """Whisper's encoder in blocks."""
 
-    def __init__(self, shape: Shape) -> None:
+    def __init__(self, shape: EncoderShape) -> None:
         super().__init__(shape, dropout=0.0, padding=0)
 
-    def forward(self, frames: Tensor, laid: Layout, start: int = 0) -> Tensor:
+    def forward(self, frames: Tensor, layout: BlockLayout, start: int = 0) -> Tensor:
         """Run the layers: (batch, frames, 80) to the kept layers, (batch, n, 3 width).
 
         There are ``2 positions + 1`` frames; ``start`` is the first position's row in the table.
         """
         loudest = frames.amax(dim=2, keepdim=True).cummax(dim=1).values
         bands = pad(torch.maximum(frames, loudest - FLOOR_BANDS), (0, 0, PADDING_FRAMES, 0))
-        hidden = self.embed(bands.transpose(1, 2), start)[:, laid.places]
+        hidden = self.embed(bands.transpose(1, 2), start)[:, layout.places]
         after = []
         for layer in self.layers:
-            hidden = layer(hidden, laid.may_attend)
+            hidden = layer(hidden, layout.attention_mask)
             after.append(hidden)
         return torch.cat([after[place] for place in KEPT_LAYERS], dim=-1)
 
@@ -138,20 +144,20 @@ class BlockEncoder(Encoder):
 class BlockReadout(Readout):
     """A readout whose backward direction restarts in each block."""
 
-    def read(self, features: Tensor, laid: Layout) -> Tensor:
+    def read(self, features: Tensor, layout: BlockLayout) -> Tensor:
         """Compute log posteriors: (batch, n, features) to (batch, n, 2, states)."""
         inner = self.inner_of(features)
-        of_blocks = inner[:, laid.blocks]
-        forward_states = self._forward_states(inner[:, : laid.num_positions], of_blocks, laid)
-        context = torch.cat([forward_states, self._backward_states(of_blocks, laid)], dim=-1)
+        of_blocks = inner[:, layout.blocks]
+        forward_states = self._forward_states(inner[:, : layout.num_positions], of_blocks, layout)
+        context = torch.cat([forward_states, self._backward_states(of_blocks, layout)], dim=-1)
         return self.log_posteriors(context, inner).view(*features.shape[:2], 2, -1)
 
-    def _forward_states(self, inner: Tensor, of_blocks: Tensor, laid: Layout) -> Tensor:
+    def _forward_states(self, inner: Tensor, of_blocks: Tensor, layout: BlockLayout) -> Tensor:
         outputs = self._run(inner, inner.new_zeros(len(inner), self.gru.hidden_size))
-        last = laid.blocks[:, : laid.block_length].amax(dim=1)
-        right = of_blocks[:, :, laid.block_length :]
+        last = layout.blocks[:, : layout.block_length].amax(dim=1)
+        right = of_blocks[:, :, layout.block_length :]
         after = self._run(right.flatten(0, 1), outputs[:, last].flatten(0, 1).contiguous())
-        of_right = after.reshape(len(inner), -1, after.shape[-1])[:, laid.in_right]
+        of_right = after.reshape(len(inner), -1, after.shape[-1])[:, layout.right_indices]
         return torch.cat([outputs, of_right], dim=1)
 
     def _run(self, inputs: Tensor, state: Tensor) -> Tensor:
@@ -161,7 +167,7 @@ class BlockReadout(Readout):
         )  # with biases, one layer, no dropout, one direction, batch first
         return outputs
 
-    def _backward_states(self, of_blocks: Tensor, laid: Layout) -> Tensor:
+    def _backward_states(self, of_blocks: Tensor, layout: BlockLayout) -> Tensor:
         """Run backward over each right context and its block: (batch, n, width)."""
         weights = [getattr(self.gru, f"{kind}_l0_reverse") for kind in _GRU_WEIGHTS]
         state = of_blocks.new_zeros(
@@ -170,7 +176,7 @@ class BlockReadout(Readout):
         states = []
         for column in reversed(range(of_blocks.shape[2])):
             state = torch.gru_cell(of_blocks[:, :, column].flatten(0, 1), state, *weights)
-            state = state * laid.exists[:, column].repeat(len(of_blocks))[:, None]
+            state = state * layout.is_valid[:, column].repeat(len(of_blocks))[:, None]
             states.append(state)
         steps = torch.stack(states[::-1], dim=1)
-        return laid.in_order(steps.view(*of_blocks.shape[:3], -1))
+        return layout.in_order(steps.view(*of_blocks.shape[:3], -1))

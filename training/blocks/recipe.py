@@ -36,14 +36,14 @@ from kouxing.services.recognizer.acoustic.model_file import (
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, frames_in
 from kouxing.shared.terminal import print_message
-from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, Material
-from kouxing.training.blocks.export import onnx_of
+from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, BatchSource
+from kouxing.training.blocks.export import export_onnx
 from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
 from kouxing.training.encoder.singing import sing
 from kouxing.training.model_card import write_card
-from kouxing.training.networks.batches import Recording, Targets
-from kouxing.training.networks.labels import STATES_PER_PHONE, Mix, label, statistics_of
+from kouxing.training.networks.batches import FrameTargets, LabeledRecording
+from kouxing.training.networks.labels import STATES_PER_PHONE, DataMix, alignment_statistics, label
 from kouxing.training.networks.whisper import init_encoder, load_whisper
 from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_examples
 
@@ -52,17 +52,17 @@ from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_examp
 BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
 _ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY, _RATE_WEIGHT = 3.2, 120.0  # chosen on speech of many rates, for `light` too
-_MIX = Mix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
+_DATA_MIX = DataMix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
 _SUNG_EVERY, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
 _MAX_SUNG_FRAMES = 800  # limit for the sung part of a recording
 _FRAMES_PER_POSITION = 2
 
 
 @dataclass(frozen=True, slots=True)
-class _Labeled:
+class _LabeledSet:
     """The recordings to train on, and the statistics of their alignment."""
 
-    recordings: list[Recording]
+    recordings: list[LabeledRecording]
     topology: Topology
     log_prior: NDArray[np.float32]  # (states,)
 
@@ -74,20 +74,20 @@ class _Labeled:
             "log_prior": self.log_prior,
             "samples": np.concatenate([recording.samples for recording in self.recordings]),
             "num_samples": [len(recording.samples) for recording in self.recordings],
-            "states": np.concatenate([one.states for one in targets]),
-            "probs": np.concatenate([one.probs for one in targets]),
-            "num_frames": [len(one) for one in targets],
+            "states": np.concatenate([frame_targets.states for frame_targets in targets]),
+            "probs": np.concatenate([frame_targets.probs for frame_targets in targets]),
+            "num_frames": [len(frame_targets) for frame_targets in targets],
             "weights": [recording.weight for recording in self.recordings],
         }
 
     @classmethod
-    def of(cls, saved: dict[str, NDArray[Any]]) -> _Labeled:
+    def from_arrays(cls, saved: dict[str, NDArray[Any]]) -> _LabeledSet:
         """Restore the object from :meth:`arrays`."""
         samples = np.split(saved["samples"], np.cumsum(saved["num_samples"])[:-1])
         bounds = np.cumsum(saved["num_frames"])[:-1]
         states, probs = np.split(saved["states"], bounds), np.split(saved["probs"], bounds)
         recordings = [
-            Recording(samples=sound, targets=Targets(*pair), weight=float(weight))
+            LabeledRecording(samples=sound, targets=FrameTargets(*pair), weight=float(weight))
             for sound, *pair, weight in zip(samples, states, probs, saved["weights"], strict=True)
         ]
         return cls(recordings, topology_from(Archive(saved)), saved["log_prior"])
@@ -103,7 +103,7 @@ def train_blocks(
     sounds: Sequence[Path] = (),
     seed: int = 0,
     num_steps: int = 1000,
-    shipping: bool = True,
+    only_distributable: bool = True,
 ) -> None:
     """Train the block model, and write it with its card.
 
@@ -118,9 +118,9 @@ def train_blocks(
     num_states = STATES_PER_PHONE * len(before.inventory)
     whole = init_encoder(whisper)
     errors = RowErrors()
-    backgrounds = training_backgrounds(read_sounds(sounds, shipping=shipping))
+    backgrounds = training_backgrounds(read_sounds(sounds, only_distributable=only_distributable))
     examples = load_examples(
-        corpora, errors, before.inventory, shipping=shipping, with_samples=True
+        corpora, errors, before.inventory, only_distributable=only_distributable, with_samples=True
     )
     labels, checkpoint = (output.with_suffix(end) for end in (".labels.npz", ".network.pt"))
 
@@ -128,33 +128,33 @@ def train_blocks(
         aligned, recordings = label(
             examples,
             untranscribed,
-            _MIX,
+            _DATA_MIX,
             aligner=before,
             encoder=whole,
             errors=errors,
             seed=seed,
         )
         weights = [recording.weight for recording in recordings[: len(aligned)]]
-        statistics = statistics_of(
-            [one.alignment for one in aligned], weights, before.topology.phone_lm
+        statistics = alignment_statistics(
+            [example.alignment for example in aligned], weights, before.topology.phone_lm
         )
-        return _Labeled([*recordings, *_sung_copies(recordings, seed)], *statistics).arrays()
+        return _LabeledSet([*recordings, *_sung_copies(recordings, seed)], *statistics).arrays()
 
-    labeled = _Labeled.of(load_or_compute(labels, compute_labels))
+    labeled = _LabeledSet.from_arrays(load_or_compute(labels, compute_labels))
     encoder = BlockEncoder(whole.shape)
     load_whisper(encoder, whisper)
     readout = BlockReadout(whole.shape.width * len(whole.kept_layers), num_states, READOUT)
     network = train_network(
         BlockNetwork(encoder, readout),
         whole,
-        Material(labeled.recordings, backgrounds),
+        BatchSource(labeled.recordings, backgrounds),
         seed=seed,
         num_steps=num_steps,
         checkpoint=checkpoint,
     ).cpu()
     model = BlockModel(
         topology=replace(labeled.topology, phone_penalty=_PHONE_PENALTY, rate_weight=_RATE_WEIGHT),
-        network=onnx_of(network.encoder, network.readout, BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST),
+        network=export_onnx(network.encoder, network.readout, BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST),
         log_prior=labeled.log_prior,
         acoustic_scale=_ACOUSTIC_SCALE,
     )
@@ -165,7 +165,7 @@ def train_blocks(
         path.unlink()
 
 
-def _sung_copies(recordings: Sequence[Recording], seed: int) -> Iterator[Recording]:
+def _sung_copies(recordings: Sequence[LabeledRecording], seed: int) -> Iterator[LabeledRecording]:
     """Yield copies of some recordings that are sung, or have a held vowel."""
     numbers = np.random.default_rng(seed).permutation(len(recordings))[::_SUNG_EVERY].tolist()
     copies = process_in_order(partial(_sung_copy, recordings, seed), numbers)
@@ -174,7 +174,9 @@ def _sung_copies(recordings: Sequence[Recording], seed: int) -> Iterator[Recordi
             yield copy
 
 
-def _sung_copy(recordings: Sequence[Recording], seed: int, number: int) -> Recording | None:
+def _sung_copy(
+    recordings: Sequence[LabeledRecording], seed: int, number: int
+) -> LabeledRecording | None:
     """Sing the start of a recording; None if it has too little voice."""
     recording = recordings[number]
     speech = as_floats(recording.samples[: HOP_SAMPLES * _MAX_SUNG_FRAMES])
@@ -183,11 +185,11 @@ def _sung_copy(recordings: Sequence[Recording], seed: int, number: int) -> Recor
     if sung is None:
         return None
     frames = _FRAMES_PER_POSITION * sung.source[:, None] + np.arange(_FRAMES_PER_POSITION)
-    targets = recording.targets.of(np.minimum(frames.flatten(), len(recording.targets) - 1))
+    targets = recording.targets.select(np.minimum(frames.flatten(), len(recording.targets) - 1))
     num_frames = min(len(targets), frames_in(len(sung.samples)))
-    return Recording(
+    return LabeledRecording(
         samples=as_integers(sung.samples),
-        targets=targets.of(slice(num_frames)),
+        targets=targets.select(slice(num_frames)),
         weight=_SUNG_WEIGHT * recording.weight,
     )
 
@@ -197,11 +199,11 @@ def _write_card(
     start: Path,
     seed: int,
     num_steps: int,
-    recordings: Sequence[Recording],
+    recordings: Sequence[LabeledRecording],
     examples: Sequence[Example],
     errors: RowErrors,
 ) -> None:
-    minutes = sum(len(one.targets) for one in recordings) / FRAMES_PER_MINUTE
+    minutes = sum(len(recording.targets) for recording in recordings) / FRAMES_PER_MINUTE
     write_card(
         output,
         title="Block model: Whisper's encoder in blocks with a cached past, gently tuned",

@@ -33,18 +33,26 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from kouxing.corpora.parallel import process_in_order
-from kouxing.training.blocks.batches import BATCHES_PER_STEP, BlockBatch, Material, block_batch
-from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.blocks.batches import (
+    BATCHES_PER_STEP,
+    BatchSource,
+    BlockBatch,
+    draw_block_batch,
+)
+from kouxing.training.blocks.network import BlockEncoder, BlockReadout, block_layout
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.networks.optimizer import cross_entropy, optimize
 from kouxing.training.networks.teacher import WholeEncoder
 
-_RATE, _READOUT_RATE = 1.5e-4, 1.5e-3  # learning rates of the last layer and of the readout
-_RATE_BELOW = 0.85  # relative to the rate of the layer above
+_LEARNING_RATE, _READOUT_LEARNING_RATE = (
+    1.5e-4,
+    1.5e-3,
+)  # learning rates of the last layer and of the readout
+_LAYER_RATE_DECAY = 0.85  # relative to the rate of the layer above
 _READOUT_STEPS = 150
 _WARM_UP_STEPS = 60
-_FALLING = 0.6  # fraction of the steps, at the end, over which the rates fall to 0
+_DECAY_FRACTION = 0.6  # fraction of the steps, at the end, over which the rates fall to 0
 _NUM_STANDARDIZED = 4  # batches that mean and deviation of the features are computed from
 _JOINED = BATCHES_PER_STEP if DEVICE.type == "cuda" else 1  # batches that are computed together
 _HIDDEN_WEIGHT, _RIGHT_WEIGHT = 0.5, 0.5  # weights of the losses
@@ -62,7 +70,7 @@ class BlockNetwork(nn.Module):
 def train_network(
     network: BlockNetwork,
     teacher: WholeEncoder,
-    material: Material,
+    material: BatchSource,
     *,
     seed: int,
     num_steps: int,
@@ -73,7 +81,7 @@ def train_network(
     ``network`` has Whisper's weights and an untrained readout, ``teacher`` is Whisper's encoder.
     Training saves its state in ``checkpoint``, and resumes from it if the file exists.
     """
-    first = [block_batch(material, seed, number) for number in range(_NUM_STANDARDIZED)]
+    first = [draw_block_batch(material, seed, number) for number in range(_NUM_STANDARDIZED)]
     with torch.no_grad():
         features = [
             teacher(_tensor([batch.clean]), batch.start)[:, : batch.states.shape[1]].flatten(0, 1)
@@ -87,7 +95,7 @@ def train_network(
         nonlocal batches
         if batches is None:
             numbers = range(BATCHES_PER_STEP * step, BATCHES_PER_STEP * num_steps)
-            batches = process_in_order(partial(block_batch, material, seed), numbers)
+            batches = process_in_order(partial(draw_block_batch, material, seed), numbers)
         total = torch.zeros((), device=DEVICE)
         for last in range(_JOINED, BATCHES_PER_STEP + 1, _JOINED):
             joined = list(islice(batches, _JOINED))
@@ -105,7 +113,7 @@ def train_network(
         loss,
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
-        falling=_FALLING,
+        decay_fraction=_DECAY_FRACTION,
         seed=seed,
         checkpoint=checkpoint,
     )
@@ -132,18 +140,18 @@ def _loss(
     With ``only_readout`` the cross-entropy does not train the encoder.
     """
     num_positions, start = batches[0].states.shape[1], batches[0].start
-    laid = layout(num_positions, *batches[0].block, DEVICE)
+    layout = block_layout(num_positions, *batches[0].block, DEVICE)
     frames, clean, states, probs = (
         _tensor([getattr(batch, name) for batch in batches])
         for name in ("frames", "clean", "states", "probs")
     )
     with mixed_precision():
         with torch.no_grad():
-            whole = teacher(clean, start)[:, laid.places]
-        features = network.encoder(frames, laid, start).float()
-    log_posteriors = network.readout.read(features.detach() if only_readout else features, laid)
+            whole = teacher(clean, start)[:, layout.places]
+        features = network.encoder(frames, layout, start).float()
+    log_posteriors = network.readout.read(features.detach() if only_readout else features, layout)
     apart = ((features - whole) / network.readout.deviation).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
-    states, probs = states[:, laid.places], probs[:, laid.places]
+    states, probs = states[:, layout.places], probs[:, layout.places]
     losses = []
     for part in (slice(num_positions), slice(num_positions, None)):
         entropy = cross_entropy(log_posteriors[:, part], states[:, part], probs[:, part])
@@ -158,7 +166,10 @@ def _groups(network: BlockNetwork) -> list[dict[str, object]]:
         convolution.requires_grad_(False)
     layers = list(network.encoder.layers)
     groups: list[dict[str, object]] = [
-        {"params": list(layer.parameters()), "lr": _RATE * _RATE_BELOW ** (len(layers) - 1 - place)}
+        {
+            "params": list(layer.parameters()),
+            "lr": _LEARNING_RATE * _LAYER_RATE_DECAY ** (len(layers) - 1 - place),
+        }
         for place, layer in enumerate(layers)
     ]
-    return [*groups, {"params": list(network.readout.parameters()), "lr": _READOUT_RATE}]
+    return [*groups, {"params": list(network.readout.parameters()), "lr": _READOUT_LEARNING_RATE}]

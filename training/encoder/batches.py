@@ -18,7 +18,7 @@ from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.encoder.network import NUM_INPUTS
-from kouxing.training.encoder.targets import PITCH, VOICE, Columns, Piece, Samples
+from kouxing.training.encoder.targets import PITCH, VOICE, Piece, Samples, TargetColumns
 from kouxing.training.encoder.teachers import POSITION_SAMPLES
 from kouxing.training.networks.augmentation import (
     Sound,
@@ -49,19 +49,19 @@ _TINY = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
-    """The recordings and background sounds that batches are drawn from."""
+class BatchSource:
+    """Recordings and background sounds from which batches are drawn."""
 
     pieces: Sequence[Piece]
     backgrounds: Sequence[Samples]  # music and noise
-    columns: Columns
+    columns: TargetColumns
 
     def draw(self, rng: np.random.Generator, probs: NDArray[np.float64]) -> Piece:
         """Draw a piece; ``probs`` are the cumulative probabilities."""
         return self.pieces[int(np.searchsorted(probs, rng.random() * probs[-1]))]
 
 
-def batch_of(material: Material, seed: int, number: int) -> Batch:
+def draw_batch(material: BatchSource, seed: int, number: int) -> Batch:
     """Draw a batch by its number."""
     rng = np.random.default_rng([seed, number])
     probs = np.cumsum([piece.weight for piece in material.pieces])
@@ -70,14 +70,14 @@ def batch_of(material: Material, seed: int, number: int) -> Batch:
     return inputs, targets
 
 
-def inputs_of(samples: Floats) -> Floats:
+def network_inputs(samples: Floats) -> Floats:
     """Compute the network's inputs from samples at 16 kHz, (positions, 160)."""
     frames = WhisperMel().accept_waveform(samples)[1:]
     return frames[: len(frames) // 2 * 2].reshape(-1, NUM_INPUTS)
 
 
 def _excerpt(
-    material: Material, probs: NDArray[np.float64], rng: np.random.Generator
+    material: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     samples, targets = _speech(material, probs, rng)
     sound, speed = change_speed(samples, rng)
@@ -90,7 +90,7 @@ def _excerpt(
             snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
             sound = _add_background(sound, material, rng, snr_db, with_voices=True)
         sound = disturb(sound, rng)
-    inputs = inputs_of(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
+    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
     source = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
     chosen = _rows(targets, source)
     chosen[:, PITCH] += np.float32(np.log2(speed))
@@ -110,7 +110,7 @@ def _rows(targets: Floats, positions: NDArray[np.floating]) -> Floats:
 
 
 def _speech(
-    material: Material, probs: NDArray[np.float64], rng: np.random.Generator
+    material: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Join recordings and pauses that are long enough for an excerpt at any speed."""
     sounds: list[Floats] = []
@@ -137,7 +137,12 @@ def _speech(
 
 
 def _add_background(
-    sound: Sound, material: Material, rng: np.random.Generator, snr_db: float, *, with_voices: bool
+    sound: Sound,
+    material: BatchSource,
+    rng: np.random.Generator,
+    snr_db: float,
+    *,
+    with_voices: bool,
 ) -> Sound:
     """Add music, noise or other voices, ``snr_db`` below a sound."""
     if with_voices and rng.random() < _VOICES_PROB:

@@ -31,15 +31,15 @@ from kouxing.training.encoder.network import (
     NUM_INPUTS,
     AudioEncoder,
 )
-from kouxing.training.networks.onnx_graph import Floats, Graph, arrays_of, floats
+from kouxing.training.networks.onnx_graph import Floats, Graph, floats, module_arrays
 
 
 def save_encoder(path: Path, encoder: AudioEncoder) -> None:
     """Write the model as an npz file (arrays only, no pickle)."""
-    write_archive(path, {"format": np.array(FORMAT), "network": onnx_of(encoder)})
+    write_archive(path, {"format": np.array(FORMAT), "network": export_onnx(encoder)})
 
 
-def onnx_of(encoder: AudioEncoder) -> NDArray[np.uint8]:
+def export_onnx(encoder: AudioEncoder) -> NDArray[np.uint8]:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
     return _EncoderGraph(encoder).build_step_model()
 
@@ -47,7 +47,7 @@ def onnx_of(encoder: AudioEncoder) -> NDArray[np.uint8]:
 class _EncoderGraph(Graph):
     def __init__(self, encoder: AudioEncoder) -> None:
         super().__init__()
-        self._parameters = arrays_of(encoder)
+        self._parameters = module_arrays(encoder)
         self._width = len(self._parameters["entry.bias"])
         self._num_phones = encoder.columns.num_phones
 

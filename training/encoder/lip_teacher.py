@@ -43,8 +43,8 @@ from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.output_file import open_output
 from kouxing.shared.phones.events import Phone
 from kouxing.training.encoder.teachers import Teachers
-from kouxing.training.lips.recipe import repeats_by_source, standardize, units_of
-from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.lips.recipe import measure_scale, repeats_by_source, standardize
+from kouxing.training.lips.recurrent import LipNetwork, SpeechExample, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
 
 Floats = NDArray[np.float32]
@@ -76,7 +76,7 @@ class Projection:
     directions: Floats  # (features, components)
 
     @classmethod
-    def of(cls, positions: Floats) -> Projection:
+    def fit(cls, positions: Floats) -> Projection:
         """Fit it to positions, (n, features)."""
         some = positions[::_STRIDE]
         mean, deviation = some.mean(axis=0), some.std(axis=0) + _MIN_DEVIATION
@@ -104,7 +104,7 @@ class LipTeacher:
     networks: Sequence[LipNetwork]
 
     @torch.no_grad()
-    def lips_of(self, features: TeacherFeatures) -> Floats:
+    def predict_lips(self, features: TeacherFeatures) -> Floats:
         """Predict FAPs in canonical units, closure and lip to teeth: (positions, 17)."""
         inputs = torch.from_numpy(_inputs(self.projection, features))
         outputs = torch.stack([network(inputs[None])[0, :, 0] for network in self.networks])
@@ -149,20 +149,22 @@ def train_lip_teacher(
     seed: int,
 ) -> LipTeacher:
     """Train the teacher on filmed clips; ``phones`` has phones by clip name."""
-    projection = Projection.of(np.concatenate([one.whisper for one in features]))
+    projection = Projection.fit(
+        np.concatenate([clip_features.whisper for clip_features in features])
+    )
     closed_at = closed_below(clips)
     targets = []
-    for clip, one in zip(clips, features, strict=True):
-        time_s = POSITION_S * np.arange(1.0, 1 + len(one.whisper))
+    for clip, clip_features in zip(clips, features, strict=True):
+        time_s = POSITION_S * np.arange(1.0, 1 + len(clip_features.whisper))
         known = phones.get(clip.name)
         targets.append(targets_at(clip, known, closed_at[clip.speaker], time_s, [0.0]))
-    units = units_of(targets)
+    units = measure_scale(targets)
     speakers = sorted({clip.speaker for clip in clips})
     repeats = repeats_by_source(clips)
     examples = []
-    for clip, one, target in zip(clips, features, targets, strict=True):
-        rows = _inputs(projection, one), standardize(target, units)
-        example = Example(*rows, speakers.index(clip.speaker))
+    for clip, clip_features, target in zip(clips, features, targets, strict=True):
+        rows = _inputs(projection, clip_features), standardize(target, units)
+        example = SpeechExample(*rows, speakers.index(clip.speaker))
         examples += repeats[clip.source] * [example]
 
     def train(number: int) -> LipNetwork:

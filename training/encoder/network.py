@@ -43,7 +43,7 @@ from kouxing.training.encoder.targets import (
     NUM_COMPONENTS,
     PITCH,
     VOICE,
-    Columns,
+    TargetColumns,
 )
 
 NUM_INPUTS = 2 * NUM_MELS
@@ -57,7 +57,7 @@ _PHONES_WEIGHT, _VOICING_WEIGHT, _SCALAR_WEIGHT = 1 / 2, 1 / 3, 1 / 5
 
 
 @dataclass(frozen=True, slots=True)
-class Outputs:
+class OutputParts:
     """The parts of an output row."""
 
     early: Tensor  # (..., 128)
@@ -79,7 +79,7 @@ class AudioEncoder(nn.Module):
 
     def __init__(self, num_phones: int, width: int = WIDTH) -> None:
         super().__init__()
-        self.columns = Columns(num_phones)
+        self.columns = TargetColumns(num_phones)
         self.entry = nn.Linear(NUM_INPUTS, width)
         self.first = nn.GRU(width, width, batch_first=True)
         self.second = nn.GRU(width, width, batch_first=True)
@@ -94,11 +94,11 @@ class AudioEncoder(nn.Module):
         rows: Tensor = self.output(first + second)
         return rows
 
-    def split(self, rows: Tensor) -> Outputs:
+    def split(self, rows: Tensor) -> OutputParts:
         """Split output rows into their parts."""
         *ranges, voicing, pitch, level, effort = torch.split(rows, self.sizes, dim=-1)
         scalars = (scalar.squeeze(-1) for scalar in (voicing, pitch, level, effort))
-        return Outputs(*ranges, *scalars)
+        return OutputParts(*ranges, *scalars)
 
     @torch.no_grad()
     def rescale_lips(self, mean: NDArray[np.float32], deviation: NDArray[np.float32]) -> None:

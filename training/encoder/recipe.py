@@ -33,17 +33,17 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.device import DEVICE, mixed_precision
-from kouxing.training.encoder.batches import BATCH_S, Batch, Material, batch_of
+from kouxing.training.encoder.batches import BATCH_S, Batch, BatchSource, draw_batch
 from kouxing.training.encoder.export import save_encoder
 from kouxing.training.encoder.lip_teacher import LipTeacher, teacher_features, train_lip_teacher
 from kouxing.training.encoder.network import AudioEncoder
-from kouxing.training.encoder.targets import Columns, Recording, Samples, TargetStore
+from kouxing.training.encoder.targets import Samples, SourceRecording, TargetColumns, TargetStore
 from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.optimizer import optimize
 from kouxing.training.training_set import read_utterances, weights_of
 
-_RATE, _WARM_UP_STEPS, _FALLING = 2e-3, 200, 0.5
+_LEARNING_RATE, _WARM_UP_STEPS, _DECAY_FRACTION = 2e-3, 200, 0.5
 _OTHER_VOICES = {"laughter": VoiceKind.LAUGHTER, "breath": VoiceKind.NONE}  # by the kind of a sound
 _OTHER_VOICE_WEIGHT = 0.02  # per recording; the total weight of speech is 1
 
@@ -67,7 +67,7 @@ def train_encoder(
     sounds: Sequence[Path] = (),
     seed: int = 0,
     num_steps: int = 7000,
-    shipping: bool = True,
+    only_distributable: bool = True,
 ) -> None:
     """Train the audio encoder, and write it with its model card.
 
@@ -80,17 +80,17 @@ def train_encoder(
         utterance
         for corpus in corpora
         for utterance in read_utterances(
-            corpus, errors, inventory, split="train", shipping=shipping
+            corpus, errors, inventory, split="train", only_distributable=only_distributable
         )
     ]
     if not utterances:
         raise errors.no_recording_error("of split 'train' in the corpora")
-    all_sounds = read_sounds(sounds, shipping=shipping)
+    all_sounds = read_sounds(sounds, only_distributable=only_distributable)
     backgrounds = training_backgrounds(all_sounds)
     if not backgrounds:
         raise UserError("no music or noise to mix with the speech; add a folder with --sounds")
     others = [
-        Recording(
+        SourceRecording(
             sound.name,
             partial(np.copy, sound.samples),
             _OTHER_VOICE_WEIGHT,
@@ -100,7 +100,8 @@ def train_encoder(
         if sound.kind in _OTHER_VOICES and not sound.is_held_out
     ]
     filmed = training_clips(
-        read_clips(clips, any_license=not shipping, language=None), any_license=not shipping
+        read_clips(clips, any_license=not only_distributable, language=None),
+        any_license=not only_distributable,
     )
     if not any(clip.is_in_sync for clip in filmed):
         raise no_clip_error(clips)
@@ -110,7 +111,7 @@ def train_encoder(
     folder.mkdir(parents=True, exist_ok=True)
     lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", filmed, teachers, seed)
     store = TargetStore(folder, recordings, teachers, lip_teacher, errors, seed)
-    material = Material(store.pieces(), backgrounds, Columns(len(inventory)))
+    material = BatchSource(store.pieces(), backgrounds, TargetColumns(len(inventory)))
     trained = _train_network(material, num_steps, seed, output)
     trained.rescale_lips(store.lips_mean, store.lips_deviation)
     save_encoder(output, trained)
@@ -128,10 +129,10 @@ def train_encoder(
 
 def _speech_of(
     utterances: Sequence[Utterance], untranscribed: Sequence[Path], filmed: Sequence[Path]
-) -> list[Recording]:
+) -> list[SourceRecording]:
     """List all speech. Sources are weighted by the square root of their size; the sum is 1."""
     weights = zip(utterances, weights_of(utterances), strict=True)
-    of_sources = [[(one.path, weight * one.seconds) for one, weight in weights]]
+    of_sources = [[(utterance.path, weight * utterance.seconds) for utterance, weight in weights]]
     for folder in untranscribed:
         of_sources.append([(path, 1.0) for path in audio_files(folder) if not is_held_out(path)])
     of_sources.append([(path, 1.0) for path in filmed])
@@ -147,8 +148,8 @@ def _speech_of(
     return recordings
 
 
-def _recording(path: Path, weight: float) -> Recording:
-    return Recording(path.name, partial(_read, path), weight)
+def _recording(path: Path, weight: float) -> SourceRecording:
+    return SourceRecording(path.name, partial(_read, path), weight)
 
 
 def _read(path: Path) -> Samples:
@@ -171,7 +172,7 @@ def _load_lip_teacher(
     return LipTeacher.load(path)
 
 
-def _train_network(material: Material, num_steps: int, seed: int, output: Path) -> AudioEncoder:
+def _train_network(material: BatchSource, num_steps: int, seed: int, output: Path) -> AudioEncoder:
     torch.manual_seed(seed)
     encoder = AudioEncoder(material.columns.num_phones).to(DEVICE)
     batches: Iterator[Batch] | None = None
@@ -180,7 +181,7 @@ def _train_network(material: Material, num_steps: int, seed: int, output: Path) 
         nonlocal batches
         if batches is None:
             numbers = range(step, num_steps)
-            batches = process_in_order(partial(batch_of, material, seed), numbers)
+            batches = process_in_order(partial(draw_batch, material, seed), numbers)
         with mixed_precision():
             return encoder.loss(
                 *(torch.from_numpy(part).to(DEVICE).float() for part in next(batches))
@@ -188,11 +189,11 @@ def _train_network(material: Material, num_steps: int, seed: int, output: Path) 
 
     return optimize(
         encoder,
-        [{"params": list(encoder.parameters()), "lr": _RATE}],
+        [{"params": list(encoder.parameters()), "lr": _LEARNING_RATE}],
         loss,
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
-        falling=_FALLING,
+        decay_fraction=_DECAY_FRACTION,
         seed=seed,
         max_norm=1.0,
         checkpoint=output.with_suffix(".checkpoint.pt"),

@@ -55,7 +55,7 @@ _MIN_VARIANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class SourceRecording:
     """A recording to train on."""
 
     name: str
@@ -74,7 +74,7 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True)
-class Columns:
+class TargetColumns:
     """The target columns that are ranges."""
 
     num_phones: int
@@ -101,7 +101,7 @@ class TargetStore:
     def __init__(
         self,
         folder: Path,
-        recordings: Sequence[Recording],
+        recordings: Sequence[SourceRecording],
         teachers: Teachers,
         lip_teacher: LipTeacher,
         errors: RowErrors,
@@ -114,7 +114,9 @@ class TargetStore:
         self._folder, self._errors, self._seed = folder, errors, seed
         self._teachers, self._lip_teacher = teachers, lip_teacher
         rng = np.random.default_rng(seed)
-        order = rng.exponential(size=len(recordings)) / [one.weight for one in recordings]
+        order = rng.exponential(size=len(recordings)) / [
+            recording.weight for recording in recordings
+        ]
         self._recordings = [recordings[number] for number in np.argsort(order)]
         self.num_chunks = -(-len(recordings) // CHUNK_SIZE)
         folder.mkdir(parents=True, exist_ok=True)
@@ -155,12 +157,14 @@ class TargetStore:
 
     def _compute_basis(self) -> dict[str, Floats]:
         """Compute the bases of components and lips from the first recordings."""
-        speech = [one for one in self._recordings if one.voice == VoiceKind.SPEECH][:_NUM_FITTED]
-        sounds = [sound for one in speech for sound in _cut(one)]
+        speech = [
+            recording for recording in self._recordings if recording.voice == VoiceKind.SPEECH
+        ][:_NUM_FITTED]
+        sounds = [sound for recording in speech for sound in _cut(recording)]
         computed = process_in_order(self._teachers.compute_targets, sounds)
         features = [TeacherFeatures(outputs.whisper, outputs.phones) for outputs in computed]
-        whisper = np.concatenate([one.whisper for one in features])
-        lips = np.concatenate([self._lip_teacher.lips_of(one) for one in features])
+        whisper = np.concatenate([outputs.whisper for outputs in features])
+        lips = np.concatenate([self._lip_teacher.predict_lips(outputs) for outputs in features])
         return {
             "whisper_mean": whisper.mean(axis=0),
             "whisper": _components_of(whisper - whisper.mean(axis=0)),
@@ -180,7 +184,7 @@ class TargetStore:
             np.load(self._file(chunk, name), mmap_mode="r") for name in ("samples", "targets")
         )
         parts = np.split(samples, POSITION_SAMPLES * bounds), np.split(targets, bounds)
-        return [Piece(*one) for one in zip(*parts, weights.tolist(), strict=True)]
+        return [Piece(*fields) for fields in zip(*parts, weights.tolist(), strict=True)]
 
     def _compute(self, chunk: int) -> list[tuple[str, str]]:
         """Compute and store a chunk; return the recordings that cannot be read, with messages."""
@@ -207,7 +211,7 @@ class TargetStore:
         unfinished.replace(ends)  # it marks the chunk as complete
         return errors
 
-    def pieces_of(self, recording: Recording) -> list[Piece]:
+    def pieces_of(self, recording: SourceRecording) -> list[Piece]:
         """Compute the targets of a recording; ValueError if it cannot be read."""
         pieces = []
         for samples in _cut(recording):
@@ -216,7 +220,7 @@ class TargetStore:
             voice[~self._is_audible(outputs, recording.voice)] = VoiceKind.NONE
             scalars = [outputs.pitch, outputs.level, outputs.effort, voice]
             whisper = (outputs.whisper - self._basis["whisper_mean"]) @ self._basis["whisper"]
-            lips = self._lip_teacher.lips_of(TeacherFeatures(outputs.whisper, outputs.phones))
+            lips = self._lip_teacher.predict_lips(TeacherFeatures(outputs.whisper, outputs.phones))
             lips = (lips - self._basis["lips_mean"]) / self._basis["lips_deviation"]
             rows: list[NDArray[np.floating]] = [*scalars, outputs.phones, whisper, lips]
             targets = np.column_stack(rows).astype(np.float16)
@@ -230,7 +234,7 @@ class TargetStore:
         return np.asarray(outputs.level > _LAUGHING_LEVEL)
 
 
-def _cut(recording: Recording) -> list[Samples]:
+def _cut(recording: SourceRecording) -> list[Samples]:
     """Read a recording in parts of up to 20 s; ValueError if it cannot be read."""
     samples = recording.read()
     starts = range(0, max(1, len(samples) - _MIN_SAMPLES), _MAX_SAMPLES)

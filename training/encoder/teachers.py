@@ -34,8 +34,8 @@ from kouxing.corpora.feature_cache import as_floats
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.training.blocks.exported import encoder_of, readout_of
-from kouxing.training.blocks.network import layout
+from kouxing.training.blocks.exported import rebuild_encoder, rebuild_readout
+from kouxing.training.blocks.network import block_layout
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.whisper import init_encoder
 
@@ -64,7 +64,7 @@ class Teachers:
     """The teachers, ready to run."""
 
     def __init__(self, blocks: BlockModel, whisper: Path) -> None:
-        self._blocks, self._readout = encoder_of(blocks), readout_of(blocks)
+        self._blocks, self._readout = rebuild_encoder(blocks), rebuild_readout(blocks)
         self._whisper = init_encoder(whisper, _WHISPER_LAYERS)
         self._networks = (self._blocks, self._readout, self._whisper)
         self.silence = blocks.inventory.index[blocks.inventory.silence]  # number of the phone
@@ -85,7 +85,7 @@ class Teachers:
         return TeacherOutputs(
             whisper=self._whisper.features(samples)[:num_positions].astype(np.float32),
             phones=self._phones(frames),
-            pitch=pitch_of(samples, num_positions),
+            pitch=track_pitch(samples, num_positions),
             level=(level - np.percentile(level, _LOUD_PERCENTILE)).astype(np.float32),
             effort=np.log10((high + _TINY_POWER) / (low + _TINY_POWER)).astype(np.float32),
         )
@@ -95,14 +95,14 @@ class Teachers:
         num_positions = (frames.shape[1] - 1) // 2
         missing = -num_positions % _BLOCK_POSITIONS  # few sizes: layouts are cached
         padded = pad(frames, (0, 0, 0, 2 * missing), mode="replicate")
-        laid = layout(num_positions + missing, _BLOCK_POSITIONS, device=DEVICE)
+        layout = block_layout(num_positions + missing, _BLOCK_POSITIONS, device=DEVICE)
         with mixed_precision():
-            features = self._blocks(padded.to(DEVICE), laid)
-        states = self._readout.read(features.float(), laid)[0, :num_positions].exp().mean(dim=1)
+            features = self._blocks(padded.to(DEVICE), layout)
+        states = self._readout.read(features.float(), layout)[0, :num_positions].exp().mean(dim=1)
         return np.add.reduceat(states.cpu().numpy(), self._first_state[:-1], axis=1)
 
 
-def pitch_of(samples: NDArray[np.int16], num_positions: int) -> Floats:
+def track_pitch(samples: NDArray[np.int16], num_positions: int) -> Floats:
     """Track the pitch; log2 of Hz, NaN without voice, (positions,)."""
     tracker, floats = PitchTracker(), as_floats(samples)
     starts = POSITION_SAMPLES * np.arange(num_positions)

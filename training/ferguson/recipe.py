@@ -24,7 +24,13 @@ from scipy.optimize import lsq_linear
 
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, openings_of, read_clips
-from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
+from kouxing.corpora.speech_corpus import (
+    RowErrors,
+    Utterance,
+    may_distribute,
+    read_corpus,
+    syllables_of,
+)
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken
@@ -101,7 +107,7 @@ def influence_levels(
     values = np.array([fractions[final] for final in finals])
     weights = np.array([weight[final] for final in finals])
 
-    def groups(cuts: tuple[int, ...]) -> list[slice]:
+    def split_levels(cuts: tuple[int, ...]) -> list[slice]:
         return [slice(start, end) for start, end in pairwise((0, *cuts, len(finals)))]
 
     def factor(group: slice) -> float:
@@ -109,10 +115,11 @@ def influence_levels(
 
     def misfit(cuts: tuple[int, ...]) -> float:
         return sum(
-            float(weights[group] @ (values[group] - factor(group)) ** 2) for group in groups(cuts)
+            float(weights[group] @ (values[group] - factor(group)) ** 2)
+            for group in split_levels(cuts)
         )
 
-    best = groups(min(combinations(range(1, len(finals)), NUM_LEVELS - 1), key=misfit))
+    best = split_levels(min(combinations(range(1, len(finals)), NUM_LEVELS - 1), key=misfit))
     level = {final: row for row, group in enumerate(best, start=1) for final in finals[group]}
     factors = [factor(group) for group in best]
     return level, {final: factors[level[final] - 1] for final in finals}
@@ -122,15 +129,15 @@ def _means(
     by_phone: Mapping[str, list[float]], phones: Sequence[str], kind: Callable[[str], str]
 ) -> dict[str, float]:
     """Compute the mean of each phone; rare phones are shrunk toward the mean of their kind."""
-    of_kind: dict[str, list[float]] = defaultdict(list)
+    values_by_kind: dict[str, list[float]] = defaultdict(list)
     for phone in phones:
-        of_kind[kind(phone)] += by_phone.get(phone, [])
-    everything = [value for values in of_kind.values() for value in values]
+        values_by_kind[kind(phone)] += by_phone.get(phone, [])
+    everything = [value for values in values_by_kind.values() for value in values]
     means = {}
     for phone in phones:
         values = by_phone.get(phone, [])
-        usual = np.mean(of_kind[kind(phone)] or everything)
-        means[phone] = float((sum(values) + _KIND_RIDGE * usual) / (len(values) + _KIND_RIDGE))
+        kind_mean = np.mean(values_by_kind[kind(phone)] or everything)
+        means[phone] = float((sum(values) + _KIND_RIDGE * kind_mean) / (len(values) + _KIND_RIDGE))
     return means
 
 
@@ -172,7 +179,7 @@ def fit_openings(
     return dict(zip(inventory.phones, (fitted * is_open).tolist(), strict=True))
 
 
-def travel_of(clips: Sequence[LipClip]) -> Array:
+def measure_travel(clips: Sequence[LipClip]) -> Array:
     """Measure the travel of each mouth FAP from a closed to the widest mouth, FAP units.
 
     These are the coefficients of motion of Zhang et al. 2021, section 3, by least squares through
@@ -242,7 +249,7 @@ def train_ferguson(
     rows = training_rows(corpora, inventory, errors, any_license=any_license)
     table = phone_table(openings, aligned_speech(model, rows, errors), inventory)
     errors.report_to(print_message)
-    of_fap = dict(zip(MOUTH_FAPS, travel_of(used), strict=True))
+    of_fap = dict(zip(MOUTH_FAPS, measure_travel(used), strict=True))
     for name, point in lip_points().items():
         if point.fap is not None:
             travel = of_fap[point.fap]
@@ -270,7 +277,7 @@ def training_rows(
     for corpus in corpora:
         for row in read_corpus(corpus, errors, inventory, split="train"):
             number = of_speaker.get(row.speaker, 0)
-            is_free = any_license or may_ship(row.license)
+            is_free = any_license or may_distribute(row.license)
             if is_free and len(row.syllables) >= _MIN_SYLLABLES and number < _MAX_OF_SPEAKER:
                 of_speaker[row.speaker] = number + 1
                 chosen.append(row)

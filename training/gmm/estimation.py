@@ -52,7 +52,7 @@ _LOUD_LEVEL = 0.4  # threshold of speech between quiet (0) and loud (1)
 
 
 @dataclass(frozen=True, slots=True)
-class Copy:
+class RecordingCopy:
     """A copy of a recording, with or without augmentation."""
 
     example: Example
@@ -61,7 +61,7 @@ class Copy:
 
 
 @dataclass(slots=True, kw_only=True)
-class Hmm:
+class HmmParameters:
     """The parameters to estimate."""
 
     first_state: NDArray[np.int64]  # (num_phones + 1,)
@@ -102,8 +102,8 @@ def _spread(nodes: NDArray[np.int64], num_frames: int) -> NDArray[np.int64]:
     return nodes[(np.arange(num_frames) * len(nodes)) // max(1, num_frames)]
 
 
-def features_of(
-    copy: Copy, prior_mean: NDArray[np.float32], half_width: int
+def normalized_features(
+    copy: RecordingCopy, prior_mean: NDArray[np.float32], half_width: int
 ) -> NDArray[np.float32]:
     """Compute the normalized features of a copy as a new session does, (frames, 39)."""
     features = with_differences(cepstra_of_all(copy.log_mel.astype(np.float32)), half_width)
@@ -124,14 +124,14 @@ class FrameSet:
     @classmethod
     def build(
         cls,
-        copies: Sequence[Copy],
+        copies: Sequence[RecordingCopy],
         inventory: PhoneInventory,
         first_state: NDArray[np.int64],
         prior_mean: NDArray[np.float32],
         half_width: int,
     ) -> FrameSet:
         """Compute the features and the flat start."""
-        blocks = [features_of(copy, prior_mean, half_width) for copy in copies]
+        blocks = [normalized_features(copy, prior_mean, half_width) for copy in copies]
         silence = inventory.index[inventory.silence]
         graphs = [
             utterance_graph(
@@ -150,7 +150,7 @@ class FrameSet:
             paths=paths,
         )
 
-    def realign(self, hmm: Hmm) -> float:
+    def realign(self, hmm: HmmParameters) -> float:
         """Align every copy by its best path; return the mean log likelihood of a frame."""
         matrix = hmm.mixtures.score_matrix().reshape(2 * NUM_FEATURES + 1, hmm.num_states, -1)
         num_mixtures = matrix.shape[2]
@@ -186,7 +186,7 @@ _NUM_ROTATION_STEPS = 15
 _MIN_STAY, _MAX_STAY = 0.05, 0.99
 
 
-def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> Hmm:
+def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> HmmParameters:
     """Estimate one Gaussian per state from the flat start."""
     num_states = int(first_state[-1])
     half = np.full(num_states, np.log(0.5), np.float32)
@@ -197,7 +197,9 @@ def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> Hmm:
         means=np.tile(mean_of_all, (num_states, 1, 1)).astype(np.float32),
         covars=np.tile(overall, (num_states, 1, 1)).astype(np.float32),
     )
-    hmm = Hmm(first_state=first_state, log_stay=half, log_leave=half.copy(), mixtures=blank)
+    hmm = HmmParameters(
+        first_state=first_state, log_stay=half, log_leave=half.copy(), mixtures=blank
+    )
     return estimate(frames, hmm)
 
 
@@ -206,8 +208,8 @@ def variance_floor(frames: FrameSet) -> NDArray[np.float32]:
     return np.asarray(_VARIANCE_FLOOR * frames.features.var(axis=0))
 
 
-def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:
-    """Re-estimate along the current path by expectation-maximisation (HTK book, eq. 8.6-8.13)."""
+def estimate(frames: FrameSet, hmm: HmmParameters, num_iterations: int = 1) -> HmmParameters:
+    """Re-estimate along the current path by expectation maximization (HTK book, eq. 8.6-8.13)."""
     floor = variance_floor(frames)
     mixtures = hmm.mixtures
     weights, means, covars = mixtures.weights.copy(), mixtures.means.copy(), mixtures.covars.copy()
@@ -217,9 +219,11 @@ def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:
             continue
         x = frames.features[numbers]
         design = np.concatenate([x * x, x, np.ones((len(x), 1), np.float32)], axis=1)
-        one = slice(state, state + 1)
+        only_state = slice(state, state + 1)
         for _ in range(num_iterations):
-            now = GaussianMixtures(weights=weights[one], means=means[one], covars=covars[one])
+            now = GaussianMixtures(
+                weights=weights[only_state], means=means[only_state], covars=covars[only_state]
+            )
             sums = _component_sums(design, now.score_matrix(), frames.weights[numbers])
             counts = sums[:, -1]
             is_used = counts > 0
@@ -253,7 +257,9 @@ def _component_sums(
     return sums
 
 
-def _transitions(frames: FrameSet, hmm: Hmm) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _transitions(
+    frames: FrameSet, hmm: HmmParameters
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     occupied = np.full(hmm.num_states, 2.0)
     left = np.full(hmm.num_states, 1.0)
     for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
@@ -267,7 +273,7 @@ def _transitions(frames: FrameSet, hmm: Hmm) -> tuple[NDArray[np.float32], NDArr
     return np.log(stay).astype(np.float32), np.log(1 - stay).astype(np.float32)
 
 
-def split(hmm: Hmm, frames: FrameSet, num_mixtures: int) -> Hmm:
+def split(hmm: HmmParameters, frames: FrameSet, num_mixtures: int) -> HmmParameters:
     """Split the heaviest components until every state has ``num_mixtures`` (HTK book, 10.6).
 
     States with little data keep fewer components; the others have weight 0.
@@ -308,7 +314,7 @@ def _drop_light(weights: NDArray[np.float32], count: float) -> None:
     weights /= weights.sum()
 
 
-def topology_of(hmm: Hmm, phone_lm: PhoneLanguageModel, frames: FrameSet) -> Topology:
+def topology_of(hmm: HmmParameters, phone_lm: PhoneLanguageModel, frames: FrameSet) -> Topology:
     """Make the model's topology, with phone durations from the alignment."""
     durations = PhoneDurations(phone_lm.inventory)
     for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
@@ -326,7 +332,7 @@ def topology_of(hmm: Hmm, phone_lm: PhoneLanguageModel, frames: FrameSet) -> Top
     )
 
 
-def decorrelate(frames: FrameSet, hmm: Hmm) -> tuple[Hmm, NDArray[np.float32]]:
+def decorrelate(frames: FrameSet, hmm: HmmParameters) -> tuple[HmmParameters, NDArray[np.float32]]:
     """Rotate the features, in place, so that diagonal covariances fit best (Gales 1999, eq. 20-24).
 
     Returns the rotated model and the rotation, (39, 39), for ``x @ rotation``.
@@ -359,7 +365,7 @@ def decorrelate(frames: FrameSet, hmm: Hmm) -> tuple[Hmm, NDArray[np.float32]]:
 
 
 def _component_covariances(
-    frames: FrameSet, hmm: Hmm
+    frames: FrameSet, hmm: HmmParameters
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute the covariance, (components, 39, 39), and weight, (components,), of components."""
     mixtures = hmm.mixtures

@@ -13,9 +13,9 @@ from kouxing.services.recognizer.front_end.features import NUM_FEATURES, LogMel,
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.gmm.estimation import (
-    Copy,
     FrameSet,
-    Hmm,
+    HmmParameters,
+    RecordingCopy,
     decorrelate,
     estimate,
     first_estimate,
@@ -49,7 +49,7 @@ def train_gmm(
     seed: int = 0,
     phone_lm: Path | None = None,
     num_mixtures: int = 32,
-    shipping: bool = True,
+    only_distributable: bool = True,
 ) -> None:
     """Train the Gaussian mixture recognizer, and write the model with its card.
 
@@ -57,7 +57,9 @@ def train_gmm(
     train on.
     """
     errors = RowErrors()
-    examples = load_examples(corpora, errors, inventory, shipping=shipping, with_samples=True)
+    examples = load_examples(
+        corpora, errors, inventory, only_distributable=only_distributable, with_samples=True
+    )
     lm = load_phone_lm(phone_lm, inventory) if phone_lm else phone_lm_of(examples, inventory)
     rng = np.random.default_rng(seed)
     copies = [copy for example in examples for copy in _copies(example, rng)]
@@ -82,8 +84,8 @@ def train_gmm(
         half_width=_HALF_WIDTH,
     )
 
-    chosen = choose_search_weights(model, corpora, shipping=shipping)
-    (chosen or _UNTUNED).applied_to(model).save(output)
+    chosen = choose_search_weights(model, corpora, only_distributable=only_distributable)
+    (chosen or _UNTUNED).apply_to(model).save(output)
     write_card(
         output,
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
@@ -97,8 +99,8 @@ def train_gmm(
 
 
 def _train_mixtures(
-    frames: FrameSet, hmm: Hmm, num_mixtures: int
-) -> tuple[Hmm, NDArray[np.float32]]:
+    frames: FrameSet, hmm: HmmParameters, num_mixtures: int
+) -> tuple[HmmParameters, NDArray[np.float32]]:
     """Double the mixtures step by step; return the model and the rotation of the features."""
     rotation = np.eye(NUM_FEATURES, dtype=np.float32)
     print_message(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
@@ -115,7 +117,7 @@ def _train_mixtures(
     return hmm, rotation
 
 
-def _copies(example: Example, rng: np.random.Generator) -> list[Copy]:
+def _copies(example: Example, rng: np.random.Generator) -> list[RecordingCopy]:
     """Make the copies of a recording: three of a natural sentence, one of anything else.
 
     Half of the first copies are augmented, and all others. Isolated words have a lower weight.
@@ -133,12 +135,12 @@ def _copies(example: Example, rng: np.random.Generator) -> list[Copy]:
     copies = []
     for number in range(num_copies):
         is_augmented = number > 0 or rng.random() < 0.5
-        log_mel = _augmented(example.samples, rng) if is_augmented else example.log_mel
-        copies.append(Copy(example, weight, log_mel))
+        log_mel = _augmented_log_mel(example.samples, rng) if is_augmented else example.log_mel
+        copies.append(RecordingCopy(example, weight, log_mel))
     return copies
 
 
-def _augmented(samples: NDArray[np.int16], rng: np.random.Generator) -> NDArray[np.float16]:
+def _augmented_log_mel(samples: NDArray[np.int16], rng: np.random.Generator) -> NDArray[np.float16]:
     """Compute the features of augmented samples, (frames, 41)."""
     sound, _ = augment_samples(as_floats(samples), rng)
     return LogMel().accept_waveform(scale_level(sound, rng)).astype(np.float16)

@@ -35,21 +35,27 @@ class SearchWeights:
             f" rate {100 * self.error_rate:.1f} %"
         )
 
-    def applied_to(self, model: GmmModel) -> GmmModel:
+    def apply_to(self, model: GmmModel) -> GmmModel:
         """Return the model with these weights."""
         topology = replace(model.topology, phone_penalty=self.phone_penalty)
         return replace(model, topology=topology, acoustic_scale=self.acoustic_scale)
 
 
 def choose_search_weights(
-    model: GmmModel, corpora: Sequence[Path], *, shipping: bool
+    model: GmmModel, corpora: Sequence[Path], *, only_distributable: bool
 ) -> SearchWeights | None:
     """Choose the weights with the lowest error rate on the split ``dev``; None if it is empty.
 
     ``model`` has an acoustic scale of 1.
     """
     try:
-        dev = load_examples(corpora, RowErrors(), model.inventory, split="dev", shipping=shipping)
+        dev = load_examples(
+            corpora,
+            RowErrors(),
+            model.inventory,
+            split="dev",
+            only_distributable=only_distributable,
+        )
     except UserError:
         print_message("no dev recordings; acoustic scale and phone penalty keep their defaults")
         return None

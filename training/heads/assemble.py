@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import interpolate, ndimage, spatial
 
 from kouxing.shared.face.faps import FAPS
-from kouxing.training.heads import fitted, paint, parts, subdivision, textures
+from kouxing.training.heads import fitted_mesh, paint, parts, subdivision, textures
 from kouxing.training.heads.makehuman import PIVOT, MakeHuman
 from kouxing.training.heads.measures import (
     eye_centers,
@@ -24,11 +24,11 @@ from kouxing.training.heads.measures import (
     mouth_cavity,
     neckline_height,
 )
-from kouxing.training.heads.occlusion import shade
+from kouxing.training.heads.occlusion import bake_occlusion
 from kouxing.training.heads.parts import HeadPiece, eye_pieces, teeth_pieces, tongue_piece, write
-from kouxing.training.heads.people import REFERENCE, Person, Shape
+from kouxing.training.heads.people import REFERENCE, MorphTargets, Person
 from kouxing.training.heads.textures import encode
-from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivided
+from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivide
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -69,7 +69,7 @@ _TEAR_REACH = 1.015  # distance of its edge from the eye's center, in radii of t
 _LASH_COLOR = (0.09, 0.07, 0.065)
 
 
-class Builder:
+class HeadBuilder:
     """Makes heads from MakeHuman's data; ``folder`` has its hair, brows, lashes, eyes and teeth."""
 
     def __init__(self, source: MakeHuman, folder: Path) -> None:
@@ -83,20 +83,20 @@ class Builder:
         neck = middle[:, 1] > np.maximum(4.2 - 0.3 * middle[:, 2], 4.0)  # well below the neckline
         self._face = mesh.quads[body & neck & ~is_socket]
         self._torso = mesh.quads[body & (middle[:, 1] > LOWEST) & (abs(middle[:, 0]) < 2.8)]
-        self._tongue = subdivided(self._plain, mesh.quads[mesh.group("helper-tongue")])
-        self._layout = subdivided(self._plain, self._face).vertices
-        self._cavity = mouth_cavity(mesh, subdivided(self._plain, self._face))
+        self._tongue = subdivide(self._plain, mesh.quads[mesh.group("helper-tongue")])
+        self._layout = subdivide(self._plain, self._face).vertices
+        self._cavity = mouth_cavity(mesh, subdivide(self._plain, self._face))
         self.reference = self._skin(self._plain)
         self._map = self._face_map()
         self._scalp = paint.scalp(self._map, textures.load(folder, _PAINTED_HAIR))
-        self._teeth = fitted.read(folder, "teeth/teeth_base/teeth_base")
+        self._teeth = fitted_mesh.read(folder, "teeth/teeth_base/teeth_base")
         blink, squint = (
-            [self.reference.carry(source.face_unit(unit + side)) for side in _SIDES]
+            [self.reference.transfer(source.face_unit(unit + side)) for side in _SIDES]
             for unit in ("eyeBlink", "eyeSquint")
         )
         self._unit_fields = FaceFields(self.reference, self._cavity, blink, squint).fields
 
-    def _shaped(self, targets: Shape, face_units: Shape) -> Float:
+    def _shaped(self, targets: MorphTargets, face_units: MorphTargets) -> Float:
         """Shape the mesh (19158, 3), and move its pivot to the common place."""
         vertices = self._mesh.vertices.copy()
         for name, amount in targets:
@@ -107,7 +107,7 @@ class Builder:
         return np.asarray(vertices - vertices[joint].mean(axis=0) + PIVOT)
 
     def _skin(self, vertices: Float) -> Skin:
-        skin = subdivided(vertices, self._face)
+        skin = subdivide(vertices, self._face)
         x, y, z = self._layout.T
         top = np.clip((y - 6.48) / 0.15, 0, 1)
         normals = subdivision.vertex_normals(skin.vertices, subdivision.triangles_of(skin.quads))
@@ -135,7 +135,7 @@ class Builder:
             self._lashes(vertices, skin, face, person),
             hair,
         ]
-        shade(pieces, self.reference.vertices, self._cavity)
+        bake_occlusion(pieces, self.reference.vertices, self._cavity)
         output.parent.mkdir(parents=True, exist_ok=True)
         write(
             output,
@@ -171,7 +171,7 @@ class Builder:
 
     def _garment(self, vertices: Float) -> HeadPiece:
         """Make a round-necked top: the torso, slightly enlarged, cut off around the neck."""
-        torso, plain = (subdivided(shape, self._torso) for shape in (vertices, self._plain))
+        torso, plain = (subdivide(shape, self._torso) for shape in (vertices, self._plain))
         smooth, layout = (skin.vertices[: len(skin.base)] for skin in (torso, plain))
         triangles = subdivision.triangles_of(torso.coarse_quads)
         normals = subdivision.vertex_normals(smooth, triangles)
@@ -205,7 +205,8 @@ class Builder:
     def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], person: Person) -> list[HeadPiece]:
         lips = ("2.2", "2.3")
         middle, target = (
-            one.vertices[one.points(*lips)].mean(axis=0) for one in (self.reference, skin)
+            surface.vertices[surface.points(*lips)].mean(axis=0)
+            for surface in (self.reference, skin)
         )
         corners = self.reference.points("8.3", "8.4")
         size = np.ptp(skin.vertices[corners, 0]) / np.ptp(self.reference.vertices[corners, 0])
@@ -213,7 +214,9 @@ class Builder:
         for piece in pieces:
             piece.part.vertices = (piece.part.vertices - middle) * size + target
             is_upper = piece.name == "teeth_upper"
-            piece.part.vertices[:, 1] += person.tucked if is_upper else person.raised
+            piece.part.vertices[:, 1] += (
+                person.upper_teeth_offset if is_upper else person.lower_teeth_offset
+            )
         return pieces
 
     def _strands(self, person: Person) -> Float:
@@ -231,7 +234,7 @@ class Builder:
         over inner ones. Triangles without strands are removed; they would cast shadows. ``alpha``
         (H, W) is the alpha channel of the texture.
         """
-        hair = fitted.read(self._folder, f"hair/{person.hair}/{person.hair}")
+        hair = fitted_mesh.read(self._folder, f"hair/{person.hair}/{person.hair}")
         points = hair.fit(vertices)
         # a crown that narrows evenly toward its top looks pointed
         height = (points[:, 1] - _WIDEST_HAIR) / (points[:, 1].max() - _WIDEST_HAIR)
@@ -283,7 +286,7 @@ class Builder:
 
     def _brows(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the brows, and raise their inner ends; they follow the skin below them."""
-        brows = fitted.read(self._folder, f"eyebrows/{person.brows}/{person.brows}")
+        brows = fitted_mesh.read(self._folder, f"eyebrows/{person.brows}/{person.brows}")
         points = brows.fit(vertices)
         inward = np.abs(points[:, 0])
         inward = (inward.max() - inward) / np.ptp(inward)
@@ -309,17 +312,17 @@ class Builder:
 
     def _lashes(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the upper lashes; they follow the face units of the eyelids, and the skin."""
-        lashes = fitted.read(self._folder, f"eyelashes/{person.lashes}/{person.lashes}")
+        lashes = fitted_mesh.read(self._folder, f"eyelashes/{person.lashes}/{person.lashes}")
         middle = self._plain[lashes.base[lashes.triangles]].mean(axis=(1, 2))
-        lashes = lashes.only(middle[:, 1] > eye_centers(self._plain, self._mesh)[0, 1])
+        lashes = lashes.keep_triangles(middle[:, 1] > eye_centers(self._plain, self._mesh)[0, 1])
         points = lashes.fit(vertices)
         shifts = {}
         for unit, faps in (("eyeBlink", (19, 20)), ("eyeSquint", (21, 22))):
             for side, fap in zip(_SIDES, faps, strict=True):
                 moved = self._source.face_unit(unit + side)
-                face = self.reference.carry(moved)
+                face = self.reference.transfer(moved)
                 scale = (fields[fap] * face).sum() / (face * face).sum()
-                shifts[fap] = scale * lashes.carry(moved)
+                shifts[fap] = scale * lashes.transfer(moved)
         near = spatial.cKDTree(skin.vertices).query(points)[1]
         shifts |= {fap: fields[fap][near] for fap in (27, 28)}
         color = np.tile(textures.tint(_LASH_COLOR), (len(points), 1))

@@ -42,7 +42,7 @@ def openness(vertices: Float, normals: Float, triangles: NDArray[np.int64]) -> F
     """
     index = np.arange(_NUM_DIRECTIONS) + 0.5  # a Fibonacci lattice on the sphere
     polar, turn = np.arccos(1 - 2 * index / _NUM_DIRECTIONS), np.pi * (1 + 5**0.5) * index
-    ways = np.stack(
+    directions = np.stack(
         [np.sin(polar) * np.cos(turn), np.cos(polar), np.sin(polar) * np.sin(turn)], axis=1
     )
     context = standalone_context()
@@ -58,11 +58,11 @@ def openness(vertices: Float, normals: Float, triangles: NDArray[np.int64]) -> F
     middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     reach = np.linalg.norm(vertices - middle, axis=1).max() * 1.01
     seen, total = np.zeros(len(vertices)), np.zeros(len(vertices))
-    for way in ways:
-        up = np.array([0.0, 1.0, 0.0]) if abs(way[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
-        right = np.cross(up, way)
+    for direction in directions:
+        up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+        right = np.cross(up, direction)
         right /= np.linalg.norm(right)
-        axes = np.stack([right, np.cross(way, right), -way]) / reach
+        axes = np.stack([right, np.cross(direction, right), -direction]) / reach
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = axes, -axes @ middle
         program["view"] = tuple(view.T.ravel())
@@ -76,7 +76,9 @@ def openness(vertices: Float, normals: Float, triangles: NDArray[np.int64]) -> F
         row = np.clip(((place[:, 1] + 1) / 2 * _SIZE).astype(int), 0, _SIZE - 1)
         visible = (place[:, 2] + 1) / 2 <= depth[row, column] + 0.0015
         # most light comes from above and from the front
-        cosine = np.maximum(normals @ way, 0.0) * np.exp(1.2 * way[1] + 0.5 * way[2])
+        cosine = np.maximum(normals @ direction, 0.0) * np.exp(
+            1.2 * direction[1] + 0.5 * direction[2]
+        )
         seen += cosine * visible
         total += cosine
     context.release()
@@ -84,21 +86,21 @@ def openness(vertices: Float, normals: Float, triangles: NDArray[np.int64]) -> F
 
 
 # an open mouth and drooping lids, for the occlusion of lips, teeth and lids
-_OPEN = {
+_OPEN_MOUTH = {
     3: 300, 4: -200, 8: -180, 9: -180, 5: -400, 10: -360, 11: -360, 51: -180, 55: -160, 56: -160,
     52: -360, 57: -320, 58: -320, 19: 650, 20: 650,
 }  # fmt: skip
 
 
-def _opened(piece: HeadPiece) -> Float:
+def _open_mouth_vertices(piece: HeadPiece) -> Float:
     vertices = piece.part.vertices.copy()
-    for fap, value in _OPEN.items():
+    for fap, value in _OPEN_MOUTH.items():
         if fap in piece.fields:
             vertices += piece.fields[fap] * (value / 1024)
     return vertices
 
 
-def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> None:
+def bake_occlusion(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> None:
     """Bake the ambient occlusion into the vertex colors of a head's pieces; skin is the first.
 
     Hidden triangles of the teeth are removed, and teeth that are mostly hidden.
@@ -108,10 +110,10 @@ def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> 
     """
     solid = [p for p in pieces if p.name not in ("lashes", "brows", "tears")]
     offsets = np.cumsum([0] + [len(p.part.vertices) for p in solid])
-    vertices = np.concatenate([_opened(p) for p in solid])
+    vertices = np.concatenate([_open_mouth_vertices(p) for p in solid])
     normals = np.concatenate([_outward(p) for p in solid])
 
-    def unhidden(with_hair: bool) -> Float:
+    def visibility(with_hair: bool) -> Float:
         triangles = [
             p.part.triangles + first
             for p, first in zip(solid, offsets, strict=False)
@@ -120,7 +122,7 @@ def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> 
         return openness(vertices, normals, np.concatenate(triangles))
 
     # strands let some light through
-    seen = 0.5 * unhidden(False) + 0.5 * unhidden(True)
+    seen = 0.5 * visibility(False) + 0.5 * visibility(True)
     for piece, first in zip(solid, offsets, strict=False):
         part = piece.part
         light = np.clip(seen[first : first + len(part.vertices)], 0, 1)[:, None]
@@ -147,10 +149,12 @@ def shade(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> 
         part.colors = part.colors * shaded
         if piece.name.startswith("teeth"):
             visible = seen[first : first + len(part.vertices)] > _HIDDEN
-            piece.keep(_shown(part.triangles, visible))
+            piece.keep(_visible_triangles(part.triangles, visible))
 
 
-def _shown(triangles: NDArray[np.int64], visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _visible_triangles(
+    triangles: NDArray[np.int64], visible: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Return which triangles (F,) of the teeth are visible, without fragments of hidden teeth."""
     edges = np.concatenate([triangles[:, :2], triangles[:, 1:]]).T
     graph = coo_array((np.ones(edges.shape[1]), edges), shape=(len(visible), len(visible)))
@@ -162,7 +166,7 @@ def _shown(triangles: NDArray[np.int64], visible: NDArray[np.bool_]) -> NDArray[
 
 def _outward(piece: HeadPiece) -> Float:
     """Return normals (V, 3). Normals of hair point away from the skull."""
-    points = _opened(piece)
+    points = _open_mouth_vertices(piece)
     if piece.name != "hair":
         return subdivision.vertex_normals(points, piece.part.triangles)
     away = points - _SKULL

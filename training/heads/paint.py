@@ -87,7 +87,7 @@ def scalp(face: FaceMap, texture: Float) -> Float:
     return np.asarray(dark + (parting - dark) * high)
 
 
-def _spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
+def _soft_spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
     """Make a soft spot (H, W) on the front of the face."""
     spot = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
     return spot * np.clip((1.5 - face.angle) / 0.25, 0, 1)
@@ -145,11 +145,11 @@ def skin(
     weight = np.clip((face.y - jaw) / 0.15, 0, 1) * np.clip((6.45 - face.y) / 0.2, 0, 1)
     tones = 1 + (tones - 1) * weight[..., None]
     # MakeHuman's skin has larger nostrils than the heads
-    nose = np.clip(1.5 * _spot(face, 0.10, 5.38, 0.17, 0.13), 0, 1)[..., None]
+    nose = np.clip(1.5 * _soft_spot(face, 0.10, 5.38, 0.17, 0.13), 0, 1)[..., None]
     tones += (ndimage.gaussian_filter(np.maximum(tones, 0.85), (18, 18, 0)) - tones) * nose
     # its lips have other outlines, and its tear ducts are folded
-    mouth = _spot(face, 0.0, 5.145, lips[-1, 0] + 0.07, 0.13)
-    duct = _spot(face, lid[0, 0] - 0.025, lid[0, 1] + 0.01, 0.055, 0.075)
+    mouth = _soft_spot(face, 0.0, 5.145, lips[-1, 0] + 0.07, 0.13)
+    duct = _soft_spot(face, lid[0, 0] - 0.025, lid[0, 1] + 0.01, 0.055, 0.075)
     for hidden in (mouth, duct):
         tones = _inpaint(tones, np.clip(4 * hidden - 0.8, 0, 1))
     # its light and shade would not follow the light on the heads
@@ -162,7 +162,7 @@ def skin(
     fine = 0.012 * noise(shape, 1.1, 2) + 0.008 * noise(shape, 3.5, 3)
     image *= 1 + (grain * fine)[..., None]
     rosy = tone(1.01, 0.77, 0.80)
-    image = mix(image, rosy, 0.26 * look.blush * _spot(face, 0.42, 5.42, 0.20, 0.17))
+    image = mix(image, rosy, 0.26 * look.blush * _soft_spot(face, 0.42, 5.42, 0.20, 0.17))
     if look.stubble:
         image = _paint_stubble(image, face, look.stubble, tone(0.74, 0.79, 0.86), lips)
     if look.age:
@@ -180,10 +180,10 @@ def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lip
     )
     jaw = 1 / (1 + np.exp((face.y - top) / 0.03)) * np.clip((face.y - 4.60) / 0.25, 0, 1)
     jaw *= np.clip((1.60 - face.angle) / 0.45, 0, 1)
-    lip = np.clip(1.1 * _spot(face, 0.10, 5.235, 0.12, 0.04), 0, 1) * (face.y < 5.32)
+    lip = np.clip(1.1 * _soft_spot(face, 0.10, 5.235, 0.12, 0.04), 0, 1) * (face.y < 5.32)
     upper = np.interp(face.x, lips[:, 0], lips[:, 1])
     lip *= np.clip((face.y - upper - 0.008) / 0.015, 0, 1)
-    soul = 1 - 0.6 * _spot(face, 0.0, 5.01, 0.20, 0.05)
+    soul = 1 - 0.6 * _soft_spot(face, 0.0, 5.01, 0.20, 0.05)
     dots = np.clip(0.75 + 0.30 * noise(face.x.shape, 0.9, 21), 0.2, 1.2)
     return mix(image, color, amount * np.maximum(jaw * soul, lip) * dots)
 
@@ -244,7 +244,7 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
     lines = noise(face.x.shape, (14, 1.8), 4)
     color = np.array(look.lip) * (1 + 0.022 * lines[..., None])
     image = image + (color - image) * (look.lip_strength * inside)[..., None]
-    below = _spot(face, 0.0, 5.005, 0.15, 0.024) * (1 - inside)
+    below = _soft_spot(face, 0.0, 5.005, 0.15, 0.024) * (1 - inside)
     return np.asarray(image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33]))
 
 

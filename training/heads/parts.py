@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kouxing.services.driver.head.head import FORMAT
 from kouxing.shared.output_file import open_output
 from kouxing.training.heads import subdivision
-from kouxing.training.heads.fitted import Fitted
+from kouxing.training.heads.fitted_mesh import FittedMesh
 from kouxing.training.heads.makehuman import FEATURE_POINTS, METERS_PER_UNIT, PIVOT, BaseMesh
 from kouxing.training.heads.measures import eye_centers, eye_radius
 from kouxing.training.heads.zones import Fields, Skin, jaw_fields, tongue_fields
@@ -225,7 +225,7 @@ def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[
     return pieces
 
 
-def teeth_pieces(teeth: Fitted, vertices: Float, fapu: dict[str, float]) -> list[HeadPiece]:
+def teeth_pieces(teeth: FittedMesh, vertices: Float, fapu: dict[str, float]) -> list[HeadPiece]:
     """Make the upper and the lower teeth; the lower teeth move with the jaw.
 
     ``vertices`` (19158, 3) is the base mesh's shape for which the mouth is laid out.
@@ -237,7 +237,7 @@ def teeth_pieces(teeth: Fitted, vertices: Float, fapu: dict[str, float]) -> list
         ("teeth_upper", ~is_lower, 5.144, 1.238),
         ("teeth_lower", is_lower, 5.146, 1.206),
     ):
-        row = teeth.only(in_row & (depth > depth[in_row].max() - _TEETH_DEPTH))
+        row = teeth.keep_triangles(in_row & (depth > depth[in_row].max() - _TEETH_DEPTH))
         points = row.fit(vertices)
         part = Geometry(points, row.triangles, row.uv, np.ones_like(points), row.welds)
         middle = points[middle_of_teeth(part, is_upper=name == "teeth_upper")[0]]

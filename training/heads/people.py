@@ -4,15 +4,15 @@ from dataclasses import dataclass
 
 from kouxing.training.heads.paint import Look
 
-Shape = tuple[tuple[str, float], ...]
+MorphTargets = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Person:
     """A head to build."""
 
-    targets: Shape  # MakeHuman targets and their amounts
-    face_units: Shape
+    targets: MorphTargets  # MakeHuman targets and their amounts
+    face_units: MorphTargets
     look: Look
     skin: str  # names of MakeHuman's parts
     hair: str
@@ -20,17 +20,17 @@ class Person:
     lashes: str = "eyelashes01"
     hair_width: float = 1.0  # factor on the width of MakeHuman's hair
     crown: float = 0.0  # how much wider the hair is between its widest height and its top
-    raised: float = 0.0  # offset of tongue and lower teeth, dm
-    tucked: float = 0.0  # offset of the upper teeth, dm, so that f meets them and u and o differ
+    lower_teeth_offset: float = 0.0  # offset of tongue and lower teeth, dm
+    upper_teeth_offset: float = 0.0  # dm, so that f meets the teeth, and u and o differ
 
 
-def _both(name: str, amount: float) -> Shape:
+def _both_sides(name: str, amount: float) -> MorphTargets:
     folder, target = name.split("/")
     return (f"{folder}/l-{target}", amount), (f"{folder}/r-{target}", amount)
 
 
 # closes the lips, which the plain targets leave apart
-_REST: Shape = (
+_CLOSED_LIPS: MorphTargets = (
     ("mouthPressLeft", 0.12),
     ("mouthPressRight", 0.12),
     ("mouthRollLower", 0.10),
@@ -39,7 +39,7 @@ _REST: Shape = (
 )
 
 # The head on which zones, texture and hair are laid out. The others share its mesh.
-REFERENCE: tuple[Shape, Shape] = (
+REFERENCE: tuple[MorphTargets, MorphTargets] = (
     (
         ("macrodetails/asian-female-young", 1.0),
         ("head/head-oval", 0.35),
@@ -47,18 +47,18 @@ REFERENCE: tuple[Shape, Shape] = (
         ("nose/nose-scale-horiz-decr", 0.25),
         ("mouth/mouth-upperlip-height-decr", 0.35),
         ("mouth/mouth-lowerlip-height-decr", 0.40),
-        *_both("eyes/eye-height2-incr", 0.55),
-        *_both("eyes/eye-scale-incr", 0.20),
-        *_both("ears/ear-wing-decr", 0.80),
-        *_both("ears/ear-scale-decr", 0.40),
-        *_both("ears/ear-lobe-decr", 0.60),
+        *_both_sides("eyes/eye-height2-incr", 0.55),
+        *_both_sides("eyes/eye-scale-incr", 0.20),
+        *_both_sides("ears/ear-wing-decr", 0.80),
+        *_both_sides("ears/ear-scale-decr", 0.40),
+        *_both_sides("ears/ear-lobe-decr", 0.60),
     ),
-    _REST,
+    _CLOSED_LIPS,
 )
 
 # raises the corners of the mouth and the cheeks a little
-_SMILING: Shape = (
-    *_REST,
+_SMILING: MorphTargets = (
+    *_CLOSED_LIPS,
     ("mouthSmileLeft", 0.42),
     ("mouthSmileRight", 0.42),
     ("mouthDimpleLeft", 0.15),
@@ -68,7 +68,7 @@ _SMILING: Shape = (
 )
 
 # also levels the brows and relaxes the lids
-_FRIENDLY: Shape = (
+_FRIENDLY: MorphTargets = (
     *_SMILING,
     ("browOuterUpLeft", 0.10),
     ("browOuterUpRight", 0.10),
@@ -82,22 +82,22 @@ PEOPLE = {
     "woman": Person(
         targets=(*REFERENCE[0], ("head/head-scale-horiz-decr", 0.60),
             ("head/head-invertedtriangular", 0.30), ("mouth/mouth-scale-horiz-decr", 0.20),
-            *_both("cheek/cheek-volume-decr", 0.35),
-            *_both("eyes/eye-scale-incr", 0.40)),
+            *_both_sides("cheek/cheek-volume-decr", 0.35),
+            *_both_sides("eyes/eye-scale-incr", 0.40)),
         face_units=_FRIENDLY,
         look=Look(brow_strength=1.1),
         skin="young_lightskinned_female_diffuse",
         hair="bob02",
         crown=0.15,
         brows="eyebrow001",
-        tucked=0.0075,
+        upper_teeth_offset=0.0075,
     ),
     "man": Person(
-        targets=(("macrodetails/asian-male-young", 1.0), *_both("ears/ear-wing-decr", 0.50),
-            *_both("ears/ear-scale-decr", 0.30), ("mouth/mouth-upperlip-height-decr", 0.40),
-            ("mouth/mouth-lowerlip-height-decr", 0.30), *_both("eyes/eye-height2-incr", 0.45),
-            *_both("eyes/eye-scale-incr", 0.30), *_both("ears/ear-shape-round", 0.60),
-            *_both("cheek/cheek-volume-decr", 0.30), ("mouth/mouth-angles-up", 0.25),
+        targets=(("macrodetails/asian-male-young", 1.0), *_both_sides("ears/ear-wing-decr", 0.50),
+            *_both_sides("ears/ear-scale-decr", 0.30), ("mouth/mouth-upperlip-height-decr", 0.40),
+            ("mouth/mouth-lowerlip-height-decr", 0.30), *_both_sides("eyes/eye-height2-incr", 0.45),
+            *_both_sides("eyes/eye-scale-incr", 0.30), *_both_sides("ears/ear-shape-round", 0.60),
+            *_both_sides("cheek/cheek-volume-decr", 0.30), ("mouth/mouth-angles-up", 0.25),
             ("eyebrows/eyebrows-angle-up", 0.40)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.845, 0.660, 0.550), lip=(0.700, 0.440, 0.400), lip_strength=0.75,
@@ -106,12 +106,12 @@ PEOPLE = {
         skin="young_lightskinned_male_diffuse",
         hair="short04",
         brows="eyebrow012",
-        tucked=0.0105,
+        upper_teeth_offset=0.0105,
     ),
     "elder": Person(
-        targets=(("macrodetails/asian-male-old", 1.0), *_both("ears/ear-wing-decr", 0.40),
+        targets=(("macrodetails/asian-male-old", 1.0), *_both_sides("ears/ear-wing-decr", 0.40),
             ("mouth/mouth-angles-up", 0.35), ("eyebrows/eyebrows-trans-up", 0.6),
-            *_both("eyes/eye-height2-incr", 0.5), *_both("eyes/eye-scale-incr", 0.20)),
+            *_both_sides("eyes/eye-height2-incr", 0.5), *_both_sides("eyes/eye-scale-incr", 0.20)),
         face_units=_SMILING,
         look=Look(skin=(0.825, 0.645, 0.540), lip=(0.690, 0.450, 0.420), lip_strength=0.50,
             hair=(0.46, 0.455, 0.45), brow=(0.42, 0.39, 0.37), blush=0.35,
@@ -119,13 +119,13 @@ PEOPLE = {
         skin="old_lightskinned_male_diffuse2",
         hair="short04",
         brows="eyebrow012",
-        tucked=0.0110,
+        upper_teeth_offset=0.0110,
     ),
     "child": Person(
         targets=(("macrodetails/asian-male-child", 0.65), ("macrodetails/asian-male-baby", 0.35),
-            ("mouth/mouth-trans-down", 0.3), *_both("ears/ear-wing-decr", 0.60),
-            *_both("ears/ear-scale-decr", 0.40), *_both("eyes/eye-scale-incr", 0.75),
-            *_both("eyes/eye-height2-incr", 0.40), ("nose/nose-scale-horiz-decr", 0.50),
+            ("mouth/mouth-trans-down", 0.3), *_both_sides("ears/ear-wing-decr", 0.60),
+            *_both_sides("ears/ear-scale-decr", 0.40), *_both_sides("eyes/eye-scale-incr", 0.75),
+            *_both_sides("eyes/eye-height2-incr", 0.40), ("nose/nose-scale-horiz-decr", 0.50),
             ("mouth/mouth-scale-horiz-decr", 0.30), ("mouth/mouth-upperlip-height-decr", 0.30),
             ("mouth/mouth-lowerlip-height-decr", 0.30), ("neck/neck-scale-horiz-decr", 0.60),
             ("neck/neck-scale-depth-decr", 0.50)),
@@ -137,7 +137,7 @@ PEOPLE = {
         hair_width=0.94,
         crown=0.04,
         brows="eyebrow001",
-        tucked=0.0060,
+        upper_teeth_offset=0.0060,
     ),
     "ada": Person(
         targets=(("macrodetails/african-female-young", 1.0), ("mouth/mouth-trans-down", 0.5),
@@ -145,8 +145,8 @@ PEOPLE = {
             ("mouth/mouth-angles-up", 0.25),
             ("mouth/mouth-upperlip-height-decr", 0.25),
             ("mouth/mouth-lowerlip-height-decr", 0.25), ("nose/nose-scale-horiz-decr", 0.40),
-            *_both("eyes/eye-scale-incr", 0.45), *_both("ears/ear-wing-decr", 0.50),
-            *_both("ears/ear-scale-decr", 0.30)),
+            *_both_sides("eyes/eye-scale-incr", 0.45), *_both_sides("ears/ear-wing-decr", 0.50),
+            *_both_sides("ears/ear-scale-decr", 0.30)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.540, 0.380, 0.305), lip=(0.510, 0.275, 0.255), lip_strength=0.80,
             hair=(0.105, 0.085, 0.080), brow=(0.11, 0.08, 0.07), iris=(0.30, 0.17, 0.10),
@@ -154,18 +154,18 @@ PEOPLE = {
         skin="young_darkskinned_female_diffuse",
         hair="afro01",
         brows="eyebrow001",
-        tucked=0.0120,
-        raised=0.003,
+        upper_teeth_offset=0.0120,
+        lower_teeth_offset=0.003,
     ),
     "leo": Person(
         targets=(("macrodetails/caucasian-male-young", 1.0), ("eyebrows/eyebrows-trans-up", 0.5),
             ("eyebrows/eyebrows-angle-up", 0.60),
-            *_both("eyes/eye-height1-incr", 0.2),
-            *_both("eyes/eye-height2-incr", 0.6), ("mouth/mouth-trans-down", 0.3),
+            *_both_sides("eyes/eye-height1-incr", 0.2),
+            *_both_sides("eyes/eye-height2-incr", 0.6), ("mouth/mouth-trans-down", 0.3),
             ("mouth/mouth-angles-up", 0.35),
             ("mouth/mouth-upperlip-height-decr", 0.25),
-            ("mouth/mouth-lowerlip-height-decr", 0.25), *_both("eyes/eye-scale-incr", 0.30),
-            *_both("ears/ear-wing-decr", 0.50), *_both("ears/ear-scale-decr", 0.20)),
+            ("mouth/mouth-lowerlip-height-decr", 0.25), *_both_sides("eyes/eye-scale-incr", 0.30),
+            *_both_sides("ears/ear-wing-decr", 0.50), *_both_sides("ears/ear-scale-decr", 0.20)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.880, 0.700, 0.605), lip=(0.700, 0.395, 0.365), lip_strength=0.80,
             hair=(0.370, 0.270, 0.185), brow=(0.33, 0.23, 0.15), iris=(0.42, 0.54, 0.62),
@@ -174,13 +174,13 @@ PEOPLE = {
         skin="young_lightskinned_male_diffuse3",
         hair="short02",
         brows="eyebrow012",
-        raised=0.008,
-        tucked=0.0222,
+        lower_teeth_offset=0.008,
+        upper_teeth_offset=0.0222,
     ),
     "rosa": Person(
         targets=(("macrodetails/caucasian-female-old", 1.0), ("eyebrows/eyebrows-angle-up", 0.6),
             ("mouth/mouth-trans-down", 0.40),
-            *_both("eyes/eye-scale-incr", 0.40), *_both("ears/ear-wing-decr", 0.50)),
+            *_both_sides("eyes/eye-scale-incr", 0.40), *_both_sides("ears/ear-wing-decr", 0.50)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.890, 0.720, 0.640), lip=(0.700, 0.370, 0.360), lip_strength=0.75,
             hair=(0.62, 0.60, 0.58), brow=(0.48, 0.43, 0.39), iris=(0.40, 0.50, 0.42),
@@ -188,8 +188,8 @@ PEOPLE = {
         skin="old_lightskinned_female_diffuse2",
         hair="ponytail01",
         brows="eyebrow010",
-        raised=0.015,
-        tucked=0.0207,
+        lower_teeth_offset=0.015,
+        upper_teeth_offset=0.0207,
     ),
     "mika": Person(
         targets=(("macrodetails/asian-female-young", 0.5),
@@ -199,9 +199,9 @@ PEOPLE = {
             ("nose/nose-volume-decr", 0.60), ("mouth/mouth-trans-down", 0.25),
             ("mouth/mouth-scale-horiz-decr", 0.30), ("mouth/mouth-upperlip-height-decr", 0.60),
             ("mouth/mouth-lowerlip-height-decr", 0.40), ("neck/neck-scale-horiz-decr", 0.70),
-            ("neck/neck-scale-depth-decr", 0.50), *_both("eyes/eye-scale-incr", 2.3),
-            *_both("eyes/eye-height2-incr", 1.2), *_both("ears/ear-wing-decr", 0.60),
-            *_both("ears/ear-scale-decr", 0.50)),
+            ("neck/neck-scale-depth-decr", 0.50), *_both_sides("eyes/eye-scale-incr", 2.3),
+            *_both_sides("eyes/eye-height2-incr", 1.2), *_both_sides("ears/ear-wing-decr", 0.60),
+            *_both_sides("ears/ear-scale-decr", 0.50)),
         face_units=_FRIENDLY,
         look=Look(skin=(0.965, 0.835, 0.770), lip=(0.820, 0.470, 0.455), lip_strength=1.0,
             hair=(0.36, 0.42, 0.66), brow=(0.14, 0.14, 0.28), iris=(0.30, 0.62, 0.80),
@@ -210,6 +210,6 @@ PEOPLE = {
         skin="young_lightskinned_female_diffuse",
         hair="bob01",
         brows="eyebrow008",
-        tucked=0.0165,
+        upper_teeth_offset=0.0165,
     ),
 }  # fmt: skip

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from kouxing.training.heads.fitted import find
+from kouxing.training.heads.fitted_mesh import find
 from kouxing.training.heads.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
 
 Float = NDArray[np.float64]

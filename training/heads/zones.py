@@ -50,7 +50,7 @@ class Skin:
     vertices: Float  # fine, dm
     base: Index  # base mesh vertex of each coarse vertex
 
-    def carry(self, target: Float) -> Float:
+    def transfer(self, target: Float) -> Float:
         """Transfer displacements (19158, 3) of the base mesh to the fine vertices."""
         return np.asarray(self.matrix @ target[self.base])
 
@@ -63,7 +63,7 @@ class Skin:
         return self.number[[FEATURE_POINTS[name] for name in names]]
 
 
-def subdivided(vertices: Float, quads: Index) -> Skin:
+def subdivide(vertices: Float, quads: Index) -> Skin:
     """Subdivide some quads of the base mesh once."""
     base, compact = np.unique(quads, return_inverse=True)
     coarse = compact.reshape(quads.shape)
@@ -195,13 +195,13 @@ class FaceFields:
         moving = np.flatnonzero((chin | lower | floor) & ~away)
         self.jaw = self._geodesics.zone(moving, np.flatnonzero((upper | roof | away) & ~lower))
         lever = np.maximum(z - _HINGE_Z, 0) / (skin.vertices[skin.point("2.1"), 2] - _HINGE_Z)
-        for fap, weight, taken_out in (
+        for fap, weight, subtracted in (
             (3, self.jaw * lever, self.lip_y),
             (14, self.jaw, self.lip_z),
             (15, self.jaw * lever, self.lip_x),
         ):
             left = weight / weight[skin.point("2.1")]
-            for name, field in taken_out.items():
+            for name, field in subtracted.items():
                 left = left - left[skin.point(name)] * field
             if fap == 15:  # the lower lip follows the jaw half
                 for name in ("2.3", "2.8", "2.9", "8.2", "8.7", "8.8"):

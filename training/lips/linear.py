@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from kouxing.services.recognizer.lip_predictor import CLOSURE, LIP_FAPS
-from kouxing.training.lips.positions import Speech, features_of
+from kouxing.training.lips.positions import SpeechStretch, features_of
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ _NUM_FAPS = len(LIP_FAPS)
 
 
 def fit_linear(
-    speech: Sequence[Speech], targets: Sequence[Floats], counts: Sequence[float]
+    speech: Sequence[SpeechStretch], targets: Sequence[Floats], counts: Sequence[float]
 ) -> tuple[Array, Array]:
     """Fit the linear part to stretches of speech, each of which counts ``counts`` times.
 
@@ -45,22 +45,24 @@ def fit_linear(
     of the features, (features, delays, 17), and the bias, (delays, 17): standardized FAPs and the
     log odds of a closure. Those of lip to teeth are 0.
     """
-    features, wanted = features_of(speech), np.concatenate(targets)
+    features, known_targets = features_of(speech), np.concatenate(targets)
     mean, deviation = features.mean(axis=0), features.std(axis=0) + np.float32(_MIN_DEVIATION)
     standard = (features - mean) / deviation
     lengths = [len(stretch.known_s) for stretch in speech]
     count = np.repeat(np.array(counts, dtype=np.float32), lengths)
     speaker = np.repeat([stretch.clip.speaker for stretch in speech], lengths)
-    weights = np.zeros((len(mean), *wanted.shape[1:]))
-    bias = np.zeros(wanted.shape[1:])
-    unknown = np.isnan(wanted[..., :_NUM_FAPS])
+    weights = np.zeros((len(mean), *known_targets.shape[1:]))
+    bias = np.zeros(known_targets.shape[1:])
+    unknown = np.isnan(known_targets[..., :_NUM_FAPS])
     known: NDArray[np.bool_] = np.logical_not(unknown.any(axis=1))  # (positions, 15)
     for columns in _equal_columns(known):
         rows = known[:, columns[0]]
         weights[..., columns] = _fit_faps(
-            standard[rows], wanted[rows][..., columns], count[rows], speaker[rows]
+            standard[rows], known_targets[rows][..., columns], count[rows], speaker[rows]
         )
-    weights[..., CLOSURE], bias[:, CLOSURE] = _fit_closures(standard, wanted[..., CLOSURE], count)
+    weights[..., CLOSURE], bias[:, CLOSURE] = _fit_closures(
+        standard, known_targets[..., CLOSURE], count
+    )
     weights /= deviation[:, None, None]
     return weights, bias - np.tensordot(mean, weights, axes=1)
 
@@ -83,11 +85,11 @@ def _fit_faps(features: Floats, faps: Floats, count: Floats, speaker: NDArray[np
         if rows.sum() < _MIN_POSITIONS:
             continue
         centered = features[rows] - features[rows].mean(axis=0)
-        own = faps[rows] - faps[rows].mean(axis=(0, 1))
-        own /= np.maximum(own.std(axis=(0, 1)), _MIN_DEVIATION)
+        speaker_faps = faps[rows] - faps[rows].mean(axis=(0, 1))
+        speaker_faps /= np.maximum(speaker_faps.std(axis=(0, 1)), _MIN_DEVIATION)
         counted = centered * count[rows, None]
         squares += counted.T @ centered
-        products += counted.T @ own.reshape(len(own), -1)
+        products += counted.T @ speaker_faps.reshape(len(speaker_faps), -1)
         total += float(count[rows].sum())
     ridge = _RIDGE * max(total, 1.0) * np.eye(size)
     weights = np.linalg.solve(squares + ridge, products).reshape(size, *faps.shape[1:])
@@ -99,7 +101,7 @@ def _fit_closures(features: Floats, closure: Floats, count: Floats) -> tuple[Arr
     torch.set_num_threads(1)
     known = ~np.isnan(closure)
     weight = torch.from_numpy(known * count[:, None] / max(float(count.mean()), 1e-9))
-    inputs, wanted = torch.from_numpy(features), torch.from_numpy(np.nan_to_num(closure))
+    inputs, known_targets = torch.from_numpy(features), torch.from_numpy(np.nan_to_num(closure))
     weights = torch.zeros(features.shape[1], closure.shape[1], requires_grad=True)
     bias = torch.zeros(closure.shape[1], requires_grad=True)
     optimizer = torch.optim.LBFGS(
@@ -109,7 +111,7 @@ def _fit_closures(features: Floats, closure: Floats, count: Floats) -> tuple[Arr
     def loss() -> torch.Tensor:
         optimizer.zero_grad()
         entropy = binary_cross_entropy_with_logits(
-            inputs @ weights + bias, wanted, reduction="none"
+            inputs @ weights + bias, known_targets, reduction="none"
         )
         total = (weight * entropy).mean(dim=0).sum() + _CLOSURE_RIDGE * (weights**2).sum()
         total.backward()  # type: ignore[no-untyped-call]

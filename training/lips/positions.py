@@ -28,7 +28,7 @@ _FORMAT = "4"  # raise when the positions change
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Speech:
+class SpeechStretch:
     """A stretch of speech of a clip or of its augmented copy."""
 
     clip: LipClip
@@ -37,7 +37,7 @@ class Speech:
     speed: float  # speed of the copy; above 1 is faster than the clip
 
 
-def speech_of(clips: Iterable[LipClip], copy: int = 0) -> Iterator[list[Speech]]:
+def speech_of(clips: Iterable[LipClip], copy: int = 0) -> Iterator[list[SpeechStretch]]:
     """Yield the speech of each clip (copy 0) or of one of its augmented copies.
 
     A copy is always augmented in the same way.
@@ -49,7 +49,7 @@ def speech_of(clips: Iterable[LipClip], copy: int = 0) -> Iterator[list[Speech]]
         positions = _positions(of_encoder, samples)
         parts = [np.split(positions[name], positions["starts"]) for name in ("features", "known_s")]
         yield [
-            Speech(clip=clip, features=features, known_s=known_s, speed=speed)
+            SpeechStretch(clip=clip, features=features, known_s=known_s, speed=speed)
             for features, known_s in zip(*parts, strict=True)
             if len(known_s)
         ]
@@ -78,12 +78,12 @@ def _positions(of_encoder: hashlib._Hash, samples: Floats) -> dict[str, NDArray[
     return load_or_compute(cache_folder() / f"lip_positions_{key.hexdigest()[:20]}.npz", compute)
 
 
-def features_of(speech: Sequence[Speech]) -> Floats:
+def features_of(speech: Sequence[SpeechStretch]) -> Floats:
     """Return the features of all positions in one array, (positions, features)."""
     return np.concatenate([stretch.features for stretch in speech]).astype(np.float32)
 
 
-def components_of(speech: Speech, mean: Floats, projection: Floats) -> Floats:
+def components_of(speech: SpeechStretch, mean: Floats, projection: Floats) -> Floats:
     """Return the principal components of a stretch of speech, (positions, components)."""
     centered = speech.features.astype(np.float32) - mean
     return (centered @ projection).astype(np.float32, copy=False)

@@ -36,8 +36,8 @@ from kouxing.services.recognizer.lip_predictor import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.training.lips.linear import fit_linear
-from kouxing.training.lips.positions import Speech, components_of, features_of, speech_of
-from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.lips.positions import SpeechStretch, components_of, features_of, speech_of
+from kouxing.training.lips.recurrent import LipNetwork, SpeechExample, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
 from kouxing.training.model_card import write_card
 
@@ -67,7 +67,7 @@ _WIDTH_FAPS = (6, 53)
 
 
 @dataclass(frozen=True, slots=True)
-class Units:
+class FapScale:
     """Mean and extent of each FAP over all training speech, FAP units."""
 
     mean: Floats  # (15,)
@@ -80,7 +80,7 @@ class Basis:
 
     mean: Floats  # (features,)
     projection: Floats  # (features, components)
-    units: Units
+    units: FapScale
 
 
 def train_lips(
@@ -120,7 +120,7 @@ def train_lips(
         for _ in range(count)
     ]
     network, losses = train_network(examples, num_epochs=NUM_EPOCHS, seed=seed)
-    lips = joined(basis, network, *fit_linear(filmed, targets, counts))
+    lips = combine_parts(basis, network, *fit_linear(filmed, targets, counts))
     lips.save(output)
     write_card(
         output,
@@ -133,10 +133,10 @@ def train_lips(
 
 
 def _targets(
-    model: AcousticModel, speech: Sequence[Speech], closed_at: dict[str, float]
+    model: AcousticModel, speech: Sequence[SpeechStretch], closed_at: dict[str, float]
 ) -> list[Floats]:
     """Compute the targets of every stretch, FAP units, (positions, delays, 17)."""
-    phones = label_clips(model, {one.clip.name: one.clip for one in speech}.values())
+    phones = label_clips(model, {stretch.clip.name: stretch.clip for stretch in speech}.values())
     return [
         targets_at(
             stretch.clip,
@@ -149,16 +149,18 @@ def _targets(
     ]
 
 
-def basis_of(unchanged: Sequence[Speech], targets: Sequence[Floats]) -> Basis:
+def basis_of(unchanged: Sequence[SpeechStretch], targets: Sequence[Floats]) -> Basis:
     """Compute the components of speech without augmentation, and the units of targets."""
-    return Basis(*principal_components(features_of(unchanged)), units_of(targets))
+    return Basis(*principal_components(features_of(unchanged)), measure_scale(targets))
 
 
-def examples_of(speech: Sequence[Speech], targets: Sequence[Floats], basis: Basis) -> list[Example]:
+def examples_of(
+    speech: Sequence[SpeechStretch], targets: Sequence[Floats], basis: Basis
+) -> list[SpeechExample]:
     """Make examples from stretches and their targets in FAP units, (positions, delays, 17)."""
     speakers = sorted({stretch.clip.speaker for stretch in speech})
     return [
-        Example(
+        SpeechExample(
             components_of(stretch, basis.mean, basis.projection),
             standardize(target, basis.units),
             speakers.index(stretch.clip.speaker),
@@ -196,24 +198,24 @@ def principal_components(features: Floats) -> tuple[Floats, Floats]:
     return mean, projection
 
 
-def units_of(targets: Sequence[Floats]) -> Units:
+def measure_scale(targets: Sequence[Floats]) -> FapScale:
     """Measure the FAPs; one that no clip tracks gets the extent 0, so it stays at 0."""
     faps = np.concatenate([target[..., :_NUM_FAPS].reshape(-1, _NUM_FAPS) for target in targets])
     known = ~np.isnan(faps)
     count = np.maximum(known.sum(axis=0), 1)
     mean = np.where(known, faps, 0).sum(axis=0) / count
     extent = np.sqrt((np.where(known, faps - mean, 0) ** 2).sum(axis=0) / count)
-    return Units(mean.astype(np.float32), extent.astype(np.float32))
+    return FapScale(mean.astype(np.float32), extent.astype(np.float32))
 
 
-def standardize(target: Floats, units: Units) -> Floats:
+def standardize(target: Floats, units: FapScale) -> Floats:
     """Express the FAPs of targets in units of their extent."""
     scale = np.where(units.extent > 0, units.extent, 1)
     faps = (target[..., :_NUM_FAPS] - units.mean) / scale
     return np.concatenate([faps, target[..., _NUM_FAPS:]], axis=-1).astype(np.float32)
 
 
-def joined(
+def combine_parts(
     basis: Basis, network: LipNetwork, linear_weights: Array, linear_bias: Array
 ) -> LipPredictor:
     """Combine the network with the linear part (see ``fit_linear``) and the encoder's lips.

@@ -19,13 +19,13 @@ from kouxing.services.recognizer.lip_predictor import LIP_FAPS, NUM_OUTPUTS
 
 Floats = NDArray[np.float32]
 
-UNITS = 96
+HIDDEN_WIDTH = 96
 _DROPOUT = 0.3
 _INPUT_NOISE = 0.1  # standard deviation; a component has 1
 _PIECE = 200  # positions
 _MIN_PIECE = 10
 _BATCH = 32  # pieces
-_RATE, _WEIGHT_DECAY = 2e-3, 1e-2
+_LEARNING_RATE, _WEIGHT_DECAY = 2e-3, 1e-2
 _PROBABILITY_WEIGHT = 0.3  # weight of closure and lip to teeth in the loss
 _UNITS_WEIGHT = 0.01  # weight of a speaker's squared scale (log) and offset
 _MAX_GRADIENT = 1.0
@@ -40,9 +40,11 @@ class LipNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.shape = (num_delays, NUM_OUTPUTS)
-        self.entry = nn.Linear(num_components, UNITS)
-        self.recurrent = nn.GRU(UNITS, UNITS, batch_first=True, bidirectional=both_ways)
-        self.output = nn.Linear((3 if both_ways else 2) * UNITS, num_delays * NUM_OUTPUTS)
+        self.entry = nn.Linear(num_components, HIDDEN_WIDTH)
+        self.recurrent = nn.GRU(
+            HIDDEN_WIDTH, HIDDEN_WIDTH, batch_first=True, bidirectional=both_ways
+        )
+        self.output = nn.Linear((3 if both_ways else 2) * HIDDEN_WIDTH, num_delays * NUM_OUTPUTS)
         self.dropout = nn.Dropout(_DROPOUT)
         self.log_scale = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
         self.offset = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
@@ -74,7 +76,7 @@ class LipNetwork(nn.Module):
 
 
 @dataclass(frozen=True, slots=True)
-class Example:
+class SpeechExample:
     """A stretch of speech with its targets."""
 
     components: NDArray[np.floating]  # (positions, components)
@@ -83,7 +85,7 @@ class Example:
 
 
 def train_network(
-    examples: Sequence[Example],
+    examples: Sequence[SpeechExample],
     *,
     num_epochs: int,
     seed: int,
@@ -104,10 +106,12 @@ def train_network(
         1 + max(example.speaker for example in examples),
         both_ways=both_ways,
     )
-    optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_WEIGHT_DECAY)
+    optimizer = torch.optim.AdamW(
+        network.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY
+    )
     num_batches = math.ceil(len(pieces) / _BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, _RATE, total_steps=num_batches * num_epochs
+        optimizer, _LEARNING_RATE, total_steps=num_batches * num_epochs
     )
     losses = []
     network.train()
@@ -128,16 +132,16 @@ def train_network(
     return network.eval(), losses
 
 
-def _cut(examples: Sequence[Example]) -> list[Example]:
+def _cut(examples: Sequence[SpeechExample]) -> list[SpeechExample]:
     return [
-        Example(whole.components[start:end], whole.targets[start:end], whole.speaker)
+        SpeechExample(whole.components[start:end], whole.targets[start:end], whole.speaker)
         for whole in examples
         for start in range(0, len(whole.components), _PIECE)
         if (end := min(start + _PIECE, len(whole.components))) - start >= _MIN_PIECE
     ]
 
 
-def _batch(pieces: Sequence[Example]) -> tuple[Tensor, Tensor, Tensor]:
+def _batch(pieces: Sequence[SpeechExample]) -> tuple[Tensor, Tensor, Tensor]:
     """Stack pieces, padded at their ends: components, targets, speakers."""
     longest = max(len(piece.components) for piece in pieces)
 

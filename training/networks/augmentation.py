@@ -77,12 +77,12 @@ def disturb(samples: Sound, rng: np.random.Generator) -> Samples:
     """Simulate a room, noise, a transmission line and a microphone, each at random."""
     sound = samples
     if rng.random() < _ROOM_PROB:
-        sound = fftconvolve(sound, _room(rng))[: len(sound)]
+        sound = fftconvolve(sound, _room_response(rng))[: len(sound)]
     if rng.random() < _NOISE_PROB:
-        sound = sound + _noise(sound, rng)
-    sound = _transmitted(sound, rng)
+        sound = sound + _colored_noise(sound, rng)
+    sound = _transmit(sound, rng)
     if rng.random() < _COLOR_PROB:
-        sound = _color(sound, rng)
+        sound = _filter_response(sound, rng)
     return sound.astype(np.float32)
 
 
@@ -115,7 +115,7 @@ def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.
     return np.asarray(np.clip(np.rint(source), 0, num_source - 1).astype(np.int64))
 
 
-def _room(rng: np.random.Generator) -> NDArray[np.float64]:
+def _room_response(rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw a room's response; the first echo arrives after 1 to 8 ms."""
     t60_s = rng.uniform(_MIN_T60_S, _MAX_T60_S)
     num_samples = int(SAMPLE_RATE_HZ * min(t60_s, _MAX_ROOM_S))
@@ -128,7 +128,7 @@ def _room(rng: np.random.Generator) -> NDArray[np.float64]:
     return response
 
 
-def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
+def _colored_noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw a noise 3 to 30 dB below a recording."""
     num_samples = len(samples)
     size = next_fast_len(num_samples, real=True)
@@ -155,7 +155,7 @@ def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
     )
 
 
-def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
+def _transmit(samples: Sound, rng: np.random.Generator) -> Sound:
     line = rng.random()
     if line < _TELEPHONE_PROB:
         band = [rng.uniform(200, 400), rng.uniform(3000, 3900)]
@@ -168,7 +168,7 @@ def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
     return np.asarray(sosfilt(filters, samples))
 
 
-def _color(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
+def _filter_response(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
     size = next_fast_len(len(samples), real=True)
     color = _random_curve(np.fft.rfftfreq(size, 1 / SAMPLE_RATE_HZ), 7, (0.1, 0.5), rng)
     return np.asarray(irfft(rfft(samples, size) * color, size)[: len(samples)])

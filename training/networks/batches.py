@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True, slots=True)
-class Targets:
+class FrameTargets:
     """Target distribution of each frame: its likeliest states with their probabilities."""
 
     states: NDArray[np.uint16]  # (frames, k)
@@ -23,41 +23,41 @@ class Targets:
         return len(self.states)
 
     @classmethod
-    def hard(cls, states: NDArray[np.integer[Any]]) -> Targets:
+    def hard(cls, states: NDArray[np.integer[Any]]) -> FrameTargets:
         """Make targets of one state a frame, shape (frames,)."""
         return cls(states[:, None].astype(np.uint16), np.ones((len(states), 1), np.float16))
 
-    def of(self, frames: NDArray[np.int64] | slice) -> Targets:
+    def select(self, frames: NDArray[np.int64] | slice) -> FrameTargets:
         """Select the targets of some frames."""
-        return Targets(self.states[frames], self.probs[frames])
+        return FrameTargets(self.states[frames], self.probs[frames])
 
-    def averaged_with(self, other: Targets) -> Targets:
+    def average_with(self, other: FrameTargets) -> FrameTargets:
         """Average with other targets of the same frames."""
-        return Targets(
+        return FrameTargets(
             np.hstack([self.states, other.states]),
             np.hstack([self.probs, other.probs]) * np.float16(0.5),
         )
 
-    def widened(self, width: int) -> Targets:
+    def pad_states(self, width: int) -> FrameTargets:
         """Add states with the probability 0, up to this number a frame."""
         added = (0, 0), (0, width - self.states.shape[1])
-        return Targets(np.pad(self.states, added), np.pad(self.probs, added))
+        return FrameTargets(np.pad(self.states, added), np.pad(self.probs, added))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recording:
+class LabeledRecording:
     """A recording with its targets."""
 
     samples: NDArray[np.int16]  # (n,) 16 kHz
-    targets: Targets  # targets of its frames
+    targets: FrameTargets  # targets of its frames
     weight: float  # relative to the others', how often it is sampled
 
 
-Sample = tuple[NDArray[np.floating[Any]], Targets]  # inputs of the network, (rows, inputs)
+Sample = tuple[NDArray[np.floating[Any]], FrameTargets]  # inputs of the network, (rows, inputs)
 Batch = tuple[Tensor, Tensor, Tensor]  # inputs; states and probabilities, (batch, frames, k)
 
 
-def sampling_probs(recordings: Sequence[Recording]) -> NDArray[np.float64]:
+def sampling_probs(recordings: Sequence[LabeledRecording]) -> NDArray[np.float64]:
     """Probabilities of sampling each recording, (recordings,)."""
     weights = np.array([recording.weight for recording in recordings])
     weights /= weights.sum()

@@ -31,7 +31,7 @@ from kouxing.services.recognizer.search.forced_path import (
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations
-from kouxing.training.networks.batches import Recording, Targets
+from kouxing.training.networks.batches import FrameTargets, LabeledRecording
 from kouxing.training.networks.teacher import WholeEncoder, train_teacher
 from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_untranscribed
 
@@ -44,7 +44,7 @@ _FULL_FOLDER_MINUTES = 45  # longer folders get the weight of this much speech
 
 
 @dataclass(frozen=True, slots=True)
-class Mix:
+class DataMix:
     """Composition of a training set."""
 
     kinds: Mapping[str, float]  # fraction of each kind of speech with text
@@ -71,13 +71,13 @@ class AlignedExample:
 def label(
     examples: Sequence[Example],
     untranscribed: Sequence[Path],
-    mix: Mix,
+    mix: DataMix,
     *,
     aligner: AcousticModel,
     encoder: WholeEncoder,
     errors: RowErrors,
     seed: int,
-) -> tuple[list[AlignedExample], list[Recording]]:
+) -> tuple[list[AlignedExample], list[LabeledRecording]]:
     """Align and label recordings; those with text come first, in random order.
 
     ``examples`` have text and samples, in the language of ``aligner``. ``untranscribed`` are
@@ -86,21 +86,21 @@ def label(
     rng = np.random.default_rng(seed)
     folders = [load_untranscribed([folder], errors) for folder in untranscribed]
     in_random_order = [examples[index] for index in rng.permutation(len(examples))]
-    aligned = _align_all(aligner, in_random_order)
+    aligned = _align_examples(aligner, in_random_order)
     recordings = _recordings(aligned, mix)
     num_of_kind = dict.fromkeys(mix.kinds, 0)
     teacher_set = []
     num_states = STATES_PER_PHONE * len(aligner.inventory)
-    for one, recording in zip(aligned, recordings, strict=True):
-        num_of_kind[one.example.kind] += 1
-        if num_of_kind[one.example.kind] <= _TEACHER_SET:
+    for aligned_example, recording in zip(aligned, recordings, strict=True):
+        num_of_kind[aligned_example.example.kind] += 1
+        if num_of_kind[aligned_example.example.kind] <= _TEACHER_SET:
             teacher_set.append(recording)
     teacher = train_teacher(encoder, teacher_set, num_states, seed=seed)
     sounds = [sound for pieces in folders for sound in pieces]
     all_sounds = [*(recording.samples for recording in recordings), *sounds]
     labels = teacher.label(all_sounds)
     labeled = [
-        replace(recording, targets=recording.targets.averaged_with(targets))
+        replace(recording, targets=recording.targets.average_with(targets))
         for recording, targets in zip(recordings, labels, strict=False)
     ]
     rest = iter(labels[len(recordings) :])
@@ -110,29 +110,35 @@ def label(
     for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
         for sound, targets in pairs:
             weight = mix.untranscribed * count / sum(counted) * len(targets) / size
-            labeled.append(Recording(samples=sound, targets=targets, weight=weight))
+            labeled.append(LabeledRecording(samples=sound, targets=targets, weight=weight))
     width = max(recording.targets.states.shape[1] for recording in labeled)
     return aligned, [
-        replace(recording, targets=recording.targets.widened(width)) for recording in labeled
+        replace(recording, targets=recording.targets.pad_states(width)) for recording in labeled
     ]
 
 
-def _recordings(aligned: Sequence[AlignedExample], mix: Mix) -> list[Recording]:
+def _recordings(aligned: Sequence[AlignedExample], mix: DataMix) -> list[LabeledRecording]:
     """Weight recordings: a kind of speech has a fixed total weight; rare speakers weigh more."""
     frames = dict.fromkeys(mix.kinds, 0.0)
-    for one in aligned:
-        frames[one.example.kind] += one.example.weight * len(one.alignment.states)
+    for aligned_example in aligned:
+        frames[aligned_example.example.kind] += aligned_example.example.weight * len(
+            aligned_example.alignment.states
+        )
     recordings = []
-    for one in aligned:
-        kind = one.example.kind
-        states = one.alignment.states
-        weight = mix.kinds[kind] * one.example.weight * len(states) / frames[kind]
-        targets = Targets.hard(states)
-        recordings.append(Recording(samples=one.example.samples, targets=targets, weight=weight))
+    for aligned_example in aligned:
+        kind = aligned_example.example.kind
+        states = aligned_example.alignment.states
+        weight = mix.kinds[kind] * aligned_example.example.weight * len(states) / frames[kind]
+        targets = FrameTargets.hard(states)
+        recordings.append(
+            LabeledRecording(
+                samples=aligned_example.example.samples, targets=targets, weight=weight
+            )
+        )
     return recordings
 
 
-def _align_all(aligner: AcousticModel, examples: Sequence[Example]) -> list[AlignedExample]:
+def _align_examples(aligner: AcousticModel, examples: Sequence[Example]) -> list[AlignedExample]:
     """Align each recording with its text; drop recordings that do not fit.
 
     Raises UserError if no recording fits its text.
@@ -172,7 +178,7 @@ def _align_all(aligner: AcousticModel, examples: Sequence[Example]) -> list[Alig
     return aligned
 
 
-def statistics_of(
+def alignment_statistics(
     aligned: Sequence[Alignment], weights: Sequence[float], phone_lm: PhoneLanguageModel
 ) -> tuple[Topology, NDArray[np.float32]]:
     """Count transitions and durations, and the states' log priors, (states,).
@@ -183,13 +189,13 @@ def statistics_of(
     counts = np.ones(num_states)
     occupied, left = np.full(num_states, 2.0), np.ones(num_states)
     durations = PhoneDurations(phone_lm.inventory)
-    for one, weight in zip(aligned, weights, strict=True):
-        in_states = np.bincount(one.states, minlength=num_states)
-        counts += weight * len(aligned) / len(one.states) * in_states
+    for alignment, weight in zip(aligned, weights, strict=True):
+        in_states = np.bincount(alignment.states, minlength=num_states)
+        counts += weight * len(aligned) / len(alignment.states) * in_states
         occupied += in_states
-        ends = np.append(np.flatnonzero(np.diff(one.states)), len(one.states) - 1)
-        np.add.at(left, one.states[ends], 1.0)
-        durations.add(one.phones, one.weight)
+        ends = np.append(np.flatnonzero(np.diff(alignment.states)), len(alignment.states) - 1)
+        np.add.at(left, alignment.states[ends], 1.0)
+        durations.add(alignment.phones, alignment.weight)
     stay = np.clip(1 - left / occupied, _MIN_STAY, _MAX_STAY)
     mean_s, spread_s = durations.mean_and_spread_s()
     topology = Topology(

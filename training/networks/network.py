@@ -37,7 +37,7 @@ PADDING_FRAMES = 2  # zeros before a segment's first frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Shape:
+class EncoderShape:
     """Sizes of a network; the defaults match Whisper base."""
 
     width: int = 512
@@ -46,10 +46,10 @@ class Shape:
     inner: int = 2048  # width inside a layer's second half
 
 
-class Layer(nn.Module):
+class EncoderLayer(nn.Module):
     """Attention, then two linear layers; both parts have residual connections."""
 
-    def __init__(self, shape: Shape, dropout: float) -> None:
+    def __init__(self, shape: EncoderShape, dropout: float) -> None:
         super().__init__()
         self.heads = shape.heads
         self.attention_norm = nn.LayerNorm(shape.width)
@@ -60,10 +60,10 @@ class Layer(nn.Module):
         self.outer = nn.Linear(shape.inner, shape.width)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, hidden: Tensor, may_attend: Tensor | None = None) -> Tensor:
+    def forward(self, hidden: Tensor, attention_mask: Tensor | None = None) -> Tensor:
         """Compute (batch, positions, width) from the same shape.
 
-        ``may_attend`` is a mask, (positions, positions); with None all positions attend to all.
+        ``attention_mask`` is a mask, (positions, positions); with None all positions attend to all.
         """
         batch, num_positions, width = hidden.shape
         query, key, value = (
@@ -71,7 +71,7 @@ class Layer(nn.Module):
             .view(batch, num_positions, 3, self.heads, width // self.heads)
             .permute(2, 0, 3, 1, 4)
         )
-        attended = scaled_dot_product_attention(query, key, value, attn_mask=may_attend)
+        attended = scaled_dot_product_attention(query, key, value, attn_mask=attention_mask)
         attended = attended.transpose(1, 2).reshape(batch, num_positions, width)
         hidden = hidden + self.dropout(self.attended(attended))
         inner = gelu(self.inner(self.inner_norm(hidden)))
@@ -87,7 +87,7 @@ class Encoder(nn.Module):
 
     positions: Tensor  # (1500, width)
 
-    def __init__(self, shape: Shape, *, dropout: float, padding: int) -> None:
+    def __init__(self, shape: EncoderShape, *, dropout: float, padding: int) -> None:
         super().__init__()
         self.shape = shape
         self.first = nn.Conv1d(NUM_MELS, shape.width, 3, padding=padding)
@@ -95,7 +95,7 @@ class Encoder(nn.Module):
         self.register_buffer(
             "positions", torch.from_numpy(position_table(shape.width)), persistent=False
         )
-        self.layers = nn.ModuleList(Layer(shape, dropout) for _ in range(shape.layers))
+        self.layers = nn.ModuleList(EncoderLayer(shape, dropout) for _ in range(shape.layers))
 
     def embed(self, bands: Tensor, start: int = 0) -> Tensor:
         """Compute the first layer's input: (batch, 80, frames) to (batch, positions, width).

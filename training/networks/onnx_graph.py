@@ -195,7 +195,7 @@ class Graph:
         return self.node("Reshape", [joined, self.integers(f"three_{size}", -1, 3 * size)])
 
 
-def arrays_of(module: nn.Module, prefix: str = "") -> dict[str, Floats]:
+def module_arrays(module: nn.Module, prefix: str = "") -> dict[str, Floats]:
     """Return a module's parameters and buffers, with ``prefix`` before their names."""
     return {prefix + name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}
 

@@ -36,7 +36,7 @@ def optimize(
     *,
     num_steps: int,
     warm_up_steps: int,
-    falling: float,
+    decay_fraction: float,
     seed: int,
     weight_decay: float = 0.01,
     max_norm: float = 2.0,
@@ -45,9 +45,9 @@ def optimize(
     """Train a network in place; return one with the running mean of the weights.
 
     ``groups`` are parameter groups with their learning rates, as for ``torch.optim``. ``loss_of``
-    computes the loss of a step. It may itself add gradients of parts of the loss. ``falling`` is
-    the fraction of the steps, at the end, over which the rates fall. Each step has its own random
-    state. The state is saved in ``checkpoint``, and training resumes from this file if it exists.
+    computes the loss of a step. It may itself add gradients of parts of the loss. The rates fall
+    during ``decay_fraction`` of the steps, at the end. Each step has its own random state. The
+    state is saved in ``checkpoint``, and training resumes from this file if it exists.
     """
     averaged = AveragedModel(network, multi_avg_fn=_average)
     averaged.eval()
@@ -64,7 +64,7 @@ def optimize(
         adam.zero_grad()
         loss = loss_of(step)
         rise = min(1.0, (step + 1) / warm_up_steps)
-        factor = rise * min(1.0, (num_steps - step) / (falling * num_steps))
+        factor = rise * min(1.0, (num_steps - step) / (decay_fraction * num_steps))
         for group, rate in zip(adam.param_groups, rates, strict=True):
             group["lr"] = factor * rate
         loss.backward()  # type: ignore[no-untyped-call]

@@ -41,13 +41,13 @@ from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_S
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.batches import (
-    Recording,
+    FrameTargets,
+    LabeledRecording,
     Sample,
-    Targets,
     padded_batch,
     sampling_probs,
 )
-from kouxing.training.networks.network import Encoder, Readout, ReadoutShape, Shape
+from kouxing.training.networks.network import Encoder, EncoderShape, Readout, ReadoutShape
 from kouxing.training.networks.optimizer import cross_entropy, optimize
 
 NUM_LAYERS = 6  # layers of Whisper base's encoder
@@ -67,14 +67,14 @@ _NUM_STANDARDIZED = 250  # recordings that mean and deviation are computed from
 
 _NUM_CROPS = 14  # in a batch
 _CROP_POSITIONS = 250
-_RATE, _WARM_UP_STEPS = 2e-3, 30
-_FALLING = 0.5  # fraction of the steps, at the end, over which the rate falls to 0
+_LEARNING_RATE, _WARM_UP_STEPS = 2e-3, 30
+_DECAY_FRACTION = 0.5  # fraction of the steps, at the end, over which the rate falls to 0
 
 
 class WholeEncoder(Encoder):
     """Whisper's encoder: every position attends to the whole recording."""
 
-    def __init__(self, shape: Shape, kept_layers: Sequence[int] = KEPT_LAYERS) -> None:
+    def __init__(self, shape: EncoderShape, kept_layers: Sequence[int] = KEPT_LAYERS) -> None:
         super().__init__(shape, dropout=0.0, padding=1)
         self.kept_layers = kept_layers
 
@@ -118,12 +118,12 @@ class Teacher:
     readout: Readout
 
     @torch.no_grad()
-    def label(self, sounds: Sequence[NDArray[np.int16]]) -> list[Targets]:
+    def label(self, sounds: Sequence[NDArray[np.int16]]) -> list[FrameTargets]:
         """Find the likeliest states of the frames of recordings, (n,) at 16 kHz, 25 ms or longer.
 
         Recordings of similar lengths are computed together.
         """
-        labels: dict[int, Targets] = {}
+        labels: dict[int, FrameTargets] = {}
         order = sorted(range(len(sounds)), key=lambda number: len(sounds[number]))
         batch: list[int] = []
         for number in track(order, "labeled recordings"):
@@ -134,7 +134,7 @@ class Teacher:
                 batch = []
         return [labels[number] for number in range(len(sounds))]
 
-    def _targets_of(self, sounds: Sequence[NDArray[np.int16]]) -> Iterator[Targets]:
+    def _targets_of(self, sounds: Sequence[NDArray[np.int16]]) -> Iterator[FrameTargets]:
         """Yield the targets of recordings. The last recording must be the longest."""
         longest = frames_in(len(sounds[-1]))
         if longest > _PIECE_FRAMES:  # each alone, in pieces
@@ -150,11 +150,11 @@ class Teacher:
             rows = zip(states.cpu().numpy(), best.softmax(dim=-1).cpu().numpy(), strict=True)
             for (row, probs), sound in zip(rows, sounds, strict=False):
                 window = slice(frames_in(len(sound)))
-                yield Targets(row[window].astype(np.uint16), probs[window].astype(np.float16))
+                yield FrameTargets(row[window].astype(np.uint16), probs[window].astype(np.float16))
 
 
 def train_teacher(
-    encoder: WholeEncoder, recordings: Sequence[Recording], num_states: int, *, seed: int
+    encoder: WholeEncoder, recordings: Sequence[LabeledRecording], num_states: int, *, seed: int
 ) -> Teacher:
     """Train a readout on recordings whose targets are the states of an alignment.
 
@@ -170,12 +170,12 @@ def train_teacher(
         max_start = max(0, len(features[number]) - _CROP_POSITIONS)
         start = int(rng.integers(max_start + 1))
         end = start + _CROP_POSITIONS
-        targets = recordings[number].targets.of(slice(2 * start, 2 * end))
+        targets = recordings[number].targets.select(slice(2 * start, 2 * end))
         return features[number][start:end], targets
 
     readout = Readout(features[0].shape[1], num_states, READOUT).to(DEVICE)
     drawn = rng.choice(len(sampling), size=_NUM_STANDARDIZED, p=sampling)
-    readout.standardize(torch.cat([torch.from_numpy(features[one]).float() for one in drawn]))
+    readout.standardize(torch.cat([torch.from_numpy(features[number]).float() for number in drawn]))
 
     def loss(_step: int) -> Tensor:
         batch = padded_batch([draw() for _ in range(_NUM_CROPS)])
@@ -184,11 +184,11 @@ def train_teacher(
 
     trained = optimize(
         readout,
-        [{"params": list(readout.parameters()), "lr": _RATE}],
+        [{"params": list(readout.parameters()), "lr": _LEARNING_RATE}],
         loss,
         num_steps=_NUM_STEPS,
         warm_up_steps=_WARM_UP_STEPS,
-        falling=_FALLING,
+        decay_fraction=_DECAY_FRACTION,
         seed=seed,
         weight_decay=0.02,
     )

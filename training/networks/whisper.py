@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import open_file
 from kouxing.training.device import DEVICE
-from kouxing.training.networks.network import Encoder, Shape
+from kouxing.training.networks.network import Encoder, EncoderShape
 from kouxing.training.networks.teacher import KEPT_LAYERS, NUM_LAYERS, WholeEncoder
 
 _FILE_NAME = "model.bin"
@@ -45,7 +45,7 @@ _MIN_VERSION = 4
 _MAX_RANK = 4
 _MAX_BYTES = 4 << 30
 _KINDS = {0: "<f4", 1: "<i1", 2: "<i2", 3: "<i4", 4: "<f2"}  # elements of an array
-_OF_LAYER = {
+_LAYER_NAMES = {
     "attention_norm": "self_attention/layer_norm",
     "query_key_value": "self_attention/linear_0",
     "attended": "self_attention/linear_1",
@@ -65,8 +65,8 @@ def load_whisper(network: Encoder, folder: Path) -> None:
     try:
         arrays = _encoder_arrays(path)
         weights = {
-            ours: torch.from_numpy(_floats(arrays, theirs))
-            for ours, theirs in _names(network.shape.layers).items()
+            ours: torch.from_numpy(_float_array(arrays, theirs))
+            for ours, theirs in _weight_names(network.shape.layers).items()
         }
     except OSError as error:
         raise UserError(
@@ -83,17 +83,18 @@ def load_whisper(network: Encoder, folder: Path) -> None:
         if array.shape != wanted[name].shape:
             sizes = (" x ".join(map(str, shape)) for shape in (array.shape, wanted[name].shape))
             raise UserError(
-                f"{path}: {_names(network.shape.layers)[name]} is {' instead of '.join(sizes)}; "
-                f"use the folder of a Whisper model of width {network.shape.width}, such as base"
+                f"{path}: {_weight_names(network.shape.layers)[name]} is"
+                f" {' instead of '.join(sizes)}; use the folder of a Whisper model "
+                f"of width {network.shape.width}, such as base"
             )
     network.load_state_dict(wanted | weights)
 
 
-def _names(num_layers: int) -> dict[str, str]:
+def _weight_names(num_layers: int) -> dict[str, str]:
     parts = {"first": "encoder/conv1", "second": "encoder/conv2"} | {
         f"layers.{layer}.{ours}": f"encoder/layer_{layer}/{theirs}"
         for layer in range(num_layers)
-        for ours, theirs in _OF_LAYER.items()
+        for ours, theirs in _LAYER_NAMES.items()
     }
     names = {}
     for ours, theirs in parts.items():
@@ -103,7 +104,7 @@ def _names(num_layers: int) -> dict[str, str]:
     return names
 
 
-def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
+def _float_array(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
     """Return an array as 32-bit floats; ValueError if it cannot be used."""
     if name not in arrays:
         raise ValueError(f"it lacks {name}")
@@ -119,43 +120,43 @@ def _encoder_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the encoder's arrays; ValueError if the file is invalid."""
     with open_file(path, _MAX_BYTES) as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)  # ValueError if it is empty
-    version = _number(content, "<I")
+    version = _read_number(content, "<I")
     if version < _MIN_VERSION:
         raise ValueError(f"its version {version} is too old")
-    name = _string(content)
+    name = _read_string(content)
     if name != "WhisperSpec":
         raise ValueError(f"it contains a {name[:40]!r}")
-    _number(content, "<I")  # revision
+    _read_number(content, "<I")  # revision
     arrays = {}
-    for _ in range(_number(content, "<I")):
-        name, array = _array(content)
+    for _ in range(_read_number(content, "<I")):
+        name, array = _read_array(content)
         if name.startswith("encoder/"):
             arrays[name] = array
     return arrays
 
 
-def _number(content: mmap.mmap, form: str) -> int:
+def _read_number(content: mmap.mmap, form: str) -> int:
     """Read the next number; struct.error at the end of the file."""
     (value,) = struct.unpack(form, content.read(struct.calcsize(form)))
     return int(value)
 
 
-def _string(content: mmap.mmap) -> str:
-    return content.read(_number(content, "<H")).rstrip(b"\0").decode()
+def _read_string(content: mmap.mmap) -> str:
+    return content.read(_read_number(content, "<H")).rstrip(b"\0").decode()
 
 
-def _array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
+def _read_array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
     """Read the next array and its name."""
-    name = _string(content)
-    rank = _number(content, "<B")
+    name = _read_string(content)
+    rank = _read_number(content, "<B")
     if rank > _MAX_RANK:
         raise ValueError(f"{name[:80]!r} has {rank} dimensions")
-    shape = tuple(_number(content, "<I") for _ in range(rank))
-    kind = _number(content, "<B")
+    shape = tuple(_read_number(content, "<I") for _ in range(rank))
+    kind = _read_number(content, "<B")
     if kind not in _KINDS:
         raise ValueError(f"{name[:80]!r} has the type {kind}")
     element = np.dtype(_KINDS[kind])
-    num_bytes = _number(content, "<I")
+    num_bytes = _read_number(content, "<I")
     if num_bytes != math.prod(shape) * element.itemsize:
         raise ValueError(f"{name[:80]!r} has {num_bytes} bytes for the sizes {shape}")
     array = np.frombuffer(content.read(num_bytes), element, math.prod(shape)).reshape(shape)
@@ -164,6 +165,6 @@ def _array(content: mmap.mmap) -> tuple[str, NDArray[np.generic]]:
 
 def init_encoder(whisper: Path, kept_layers: Sequence[int] = KEPT_LAYERS) -> WholeEncoder:
     """Make the teacher's encoder, with Whisper's weights."""
-    encoder = WholeEncoder(Shape(layers=NUM_LAYERS), kept_layers)
+    encoder = WholeEncoder(EncoderShape(layers=NUM_LAYERS), kept_layers)
     load_whisper(encoder, whisper)
     return encoder.eval().to(DEVICE)

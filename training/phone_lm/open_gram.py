@@ -21,7 +21,7 @@ from rich.progress import track
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.user_file import open_file, read_file
-from kouxing.training.phone_lm.recipe import Stream, phones_of_text
+from kouxing.training.phone_lm.recipe import PhoneStream, phones_of_text
 
 NGRAMS, DICTIONARY = "ngrams.txt", "pydict_sc.bin"  # files of a word model
 _MAX_BYTES = 4 << 30
@@ -63,15 +63,15 @@ def draw_phones(
     *,
     num_words: int = 30_000_000,
     seed: int = 0,
-) -> Stream:
+) -> PhoneStream:
     """Draw about ``num_words`` words; return their phones, with pauses between sentences.
 
     ``folder`` has ``ngrams.txt``, the output of ``tslminfo -v``, and ``pydict_sc.bin``. The same
     seed draws the same words. Raises UserError if a file is missing or invalid.
     """
     ngrams, dictionary = folder / NGRAMS, folder / DICTIONARY
-    words = _words(dictionary)
-    levels = _levels(ngrams)
+    words = _read_words(dictionary)
+    levels = _read_levels(ngrams)
     if max(int((level.code % _BASE).max()) for level in levels) >= len(words):
         raise UserError(
             f"{ngrams} has words that {dictionary} lacks; use files of the same version"
@@ -86,17 +86,19 @@ def draw_phones(
     return _stream(drawn.ravel(), words, inventory)  # word 0, before each chain, is a pause
 
 
-def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory) -> Stream:
+def _stream(
+    drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory
+) -> PhoneStream:
     silence = inventory.index[inventory.silence]
     phones = [
         (inventory.readable.fullmatch(word) and phones_of_text(word, inventory)) or (silence,)
         for word in words
     ]
-    lengths = np.array([len(one) for one in phones])
+    lengths = np.array([len(word_phones) for word_phones in phones])
     starts = np.cumsum(lengths) - lengths
     ends = np.cumsum(lengths[drawn])
     shift = np.repeat(ends - lengths[drawn] - starts[drawn], lengths[drawn])
-    all_phones = np.concatenate([np.array(one, np.uint8) for one in phones])
+    all_phones = np.concatenate([np.array(word_phones, np.uint8) for word_phones in phones])
     stream = all_phones[np.arange(ends[-1]) - shift]
     repeated = (stream[1:] == silence) & (stream[:-1] == silence)
     return np.asarray(stream[np.concatenate([[True], ~repeated])])
@@ -119,7 +121,7 @@ def _next_words(
     return word
 
 
-def _levels(path: Path) -> list[_Level]:
+def _read_levels(path: Path) -> list[_Level]:
     rows: list[list[tuple[int, float]]] = []
     try:
         with open_file(path, _MAX_BYTES) as lines:
@@ -144,7 +146,7 @@ def _levels(path: Path) -> list[_Level]:
     return levels
 
 
-def _words(path: Path) -> list[str]:
+def _read_words(path: Path) -> list[str]:
     try:
         content = read_file(path, _MAX_BYTES)
         (start,) = struct.unpack("<I", content[_WORDS_OFFSET])

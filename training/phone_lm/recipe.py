@@ -41,18 +41,18 @@ from kouxing.shared.terminal import print_message
 from kouxing.shared.user_file import read_text
 from kouxing.training.training_set import MAX_WORD_PHONES, Example
 
-Stream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
+PhoneStream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
 
 _MAX_TEXT_BYTES = 1 << 30
 _UNSEEN_COUNT = 0.5  # added to the count of each single phone
 _MIN_REMAINDER = 1e-4
 _MAX_CODE = np.iinfo(np.int64).max
 
-_Grams = dict[int, NDArray[np.int64]]  # by n, ascending
+_NgramCodes = dict[int, NDArray[np.int64]]  # by n, ascending
 _Probs = dict[int, NDArray[np.float64]]  # by n
 
 
-def stream_of(sentences: Sequence[Sequence[int]], inventory: PhoneInventory) -> Stream:
+def join_sentences(sentences: Sequence[Sequence[int]], inventory: PhoneInventory) -> PhoneStream:
     """Join sentences, given as indices of phones, with a pause before each."""
     silence = inventory.index[inventory.silence]
     phones = [phone for sentence in sentences for phone in (silence, *sentence)]
@@ -60,7 +60,7 @@ def stream_of(sentences: Sequence[Sequence[int]], inventory: PhoneInventory) -> 
 
 
 def estimate_phone_lm(
-    streams: Sequence[Stream],
+    streams: Sequence[PhoneStream],
     inventory: PhoneInventory,
     *,
     order: int = 6,
@@ -76,7 +76,7 @@ def estimate_phone_lm(
     if num_phones**order > _MAX_CODE:
         raise UserError(f"order {order} is too high for {num_phones} phones; use a lower one")
     silence = inventory.index[inventory.silence]
-    grams, counts = _count(np.concatenate(streams), order, silence, num_phones)
+    grams, counts = _count_ngrams(np.concatenate(streams), order, silence, num_phones)
     unigram_counts = np.full(num_phones, _UNSEEN_COUNT)
     unigram_counts[grams[1]] += counts[1]
     probs: _Probs = {1: unigram_counts / unigram_counts.sum()}
@@ -91,12 +91,12 @@ def estimate_phone_lm(
         probs[n] = counts[n] / (total + distinct)[context] + backoff
         gains[n] = counts[n] * np.log(probs[n] / backoff)
     _prune(grams, probs, gains, max_ngrams, num_phones)
-    return _Tree(grams, probs, inventory).phone_lm()
+    return _NgramTree(grams, probs, inventory).phone_lm()
 
 
-def _count(
-    stream: Stream, order: int, silence: int, num_phones: int
-) -> tuple[_Grams, dict[int, NDArray[np.int64]]]:
+def _count_ngrams(
+    stream: PhoneStream, order: int, silence: int, num_phones: int
+) -> tuple[_NgramCodes, dict[int, NDArray[np.int64]]]:
     """Count n-grams of 1 to ``order`` phones; a pause may only be the first or the last phone."""
     phones = stream.astype(np.int64)
     last = np.arange(1, len(phones))  # where n-grams end; the first pause is only context
@@ -114,7 +114,7 @@ def _count(
 
 
 def _prune(
-    grams: _Grams,
+    grams: _NgramCodes,
     probs: _Probs,
     gains: dict[int, NDArray[np.float64]],
     max_ngrams: int,
@@ -134,10 +134,10 @@ def _prune(
 
 
 @dataclass(frozen=True, slots=True)
-class _Tree:
+class _NgramTree:
     """Arranges n-grams as a tree with back-off weights."""
 
-    grams: _Grams
+    grams: _NgramCodes
     probs: _Probs
     inventory: PhoneInventory
 
@@ -147,7 +147,7 @@ class _Tree:
         backoffs: _Probs = {}
         for n in range(1, order):
             parent = np.searchsorted(self.grams[n], self.grams[n + 1] // num_phones)
-            shorter = self._prob(self.grams[n + 1] % num_phones**n, n, backoffs)
+            shorter = self._smoothed_prob(self.grams[n + 1] % num_phones**n, n, backoffs)
             num_parents = len(self.grams[n])
             counted = np.bincount(parent, weights=self.probs[n + 1], minlength=num_parents)
             replaced = np.bincount(parent, weights=shorter, minlength=num_parents)
@@ -165,11 +165,13 @@ class _Tree:
             inventory=self.inventory,
             num_children=num_children.astype(np.uint8),
             phone=phone.astype(np.uint8),
-            log_prob=_logs(self.probs),
-            log_backoff=_logs(backoffs),
+            log_prob=_log_probs(self.probs),
+            log_backoff=_log_probs(backoffs),
         )
 
-    def _prob(self, wanted: NDArray[np.int64], n: int, backoffs: _Probs) -> NDArray[np.float64]:
+    def _smoothed_prob(
+        self, wanted: NDArray[np.int64], n: int, backoffs: _Probs
+    ) -> NDArray[np.float64]:
         num_phones = len(self.inventory)
         index = np.minimum(np.searchsorted(self.grams[n], wanted), len(self.grams[n]) - 1)
         probs = self.probs[n][index]
@@ -179,7 +181,7 @@ class _Tree:
             context, contexts = pruned // num_phones, self.grams[n - 1]
             index = np.minimum(np.searchsorted(contexts, context), len(contexts) - 1)
             weight = np.where(contexts[index] == context, backoffs[n - 1][index], 1.0)
-            shorter = self._prob(pruned % num_phones ** (n - 1), n - 1, backoffs)
+            shorter = self._smoothed_prob(pruned % num_phones ** (n - 1), n - 1, backoffs)
             probs[missing] = weight * shorter
         return probs
 
@@ -189,7 +191,7 @@ def _remainder(total: NDArray[Any]) -> NDArray[np.float64]:
     return np.asarray(np.maximum(1 - total, _MIN_REMAINDER))
 
 
-def _logs(values: _Probs) -> NDArray[np.float32]:
+def _log_probs(values: _Probs) -> NDArray[np.float32]:
     """Return the logarithms of all levels in order, the root's (0) first."""
     logs = np.log(np.concatenate([[1.0], *(values[n] for n in range(1, len(values) + 1))]))
     return np.asarray(logs.astype(np.float32))
@@ -204,7 +206,7 @@ def train_phone_lm(
     output: Path,
     inventory: PhoneInventory,
     *,
-    drawn: Stream | None = None,
+    drawn: PhoneStream | None = None,
 ) -> None:
     """Estimate a phone language model, and write it to a file.
 
@@ -213,7 +215,7 @@ def train_phone_lm(
     if a file cannot be read, or there is nothing to count.
     """
     errors = RowErrors()
-    streams = [stream_of(_sentences(text, inventory), inventory) for text in texts]
+    streams = [join_sentences(_read_sentences(text, inventory), inventory) for text in texts]
     if drawn is not None:
         streams.append(drawn)
     sentences = {
@@ -222,7 +224,7 @@ def train_phone_lm(
         for row in read_corpus(corpus, errors, inventory, split="train")
         if len(row.phones) > MAX_WORD_PHONES and not is_synthetic(row.license)
     }
-    corpus_stream = stream_of(sorted(sentences), inventory)
+    corpus_stream = join_sentences(sorted(sentences), inventory)
     num_text = sum(map(len, streams))
     if len(corpus_stream):
         streams += [corpus_stream] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus_stream)))
@@ -239,7 +241,7 @@ def train_phone_lm(
 
 def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> PhoneLanguageModel:
     """Estimate a phone language model from the recordings' own texts."""
-    stream = stream_of([example.phones for example in examples], inventory)
+    stream = join_sentences([example.phones for example in examples], inventory)
     return estimate_phone_lm([stream], inventory)
 
 
@@ -262,7 +264,7 @@ def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
     return phone_lm
 
 
-def _sentences(text: Path, inventory: PhoneInventory) -> list[tuple[int, ...]]:
+def _read_sentences(text: Path, inventory: PhoneInventory) -> list[tuple[int, ...]]:
     lines = read_text(text, _MAX_TEXT_BYTES).splitlines()
     sentences = []
     for line in track(lines, description=text.name):

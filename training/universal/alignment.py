@@ -35,7 +35,7 @@ from kouxing.training.networks.labels import STATES_PER_PHONE
 from kouxing.training.universal.features import Features
 
 _NUM_COMPONENTS, _INNER = 192, 384
-_NUM_ROUNDS, _STEPS, _BATCH, _RATE = 3, 700, 512, 2e-3
+_NUM_ROUNDS, _STEPS, _BATCH, _LEARNING_RATE = 3, 700, 512, 2e-3
 _NUM_FOR_COMPONENTS = 400  # recordings
 _PRIOR_SCALE = 0.6
 _STAY, _LEAVE = 0.75, 0.25  # probabilities of a position's and a frame's state
@@ -63,7 +63,7 @@ class Aligner:
         """
         torch.manual_seed(seed)
         components = _components(stored, seed)
-        labels = [self._by_hand(one) for one in stored]
+        labels = [self._hand_labels(features) for features in stored]
         by_hand = [len(phones) > 0 for phones in labels]
         if not any(by_hand):
             raise UserError("no recording has hand-made labels; add the Berlin EmoDB")
@@ -74,7 +74,7 @@ class Aligner:
                 [labels[index] for index in known],
                 self.num_phones,
             )
-            similar = self._similar(labels) if number == 0 else None
+            similar = self._similarity_weights(labels) if number == 0 else None
             for index, rows in enumerate(track(components, f"alignment, round {number + 1}")):
                 if by_hand[index]:
                     continue
@@ -87,8 +87,8 @@ class Aligner:
                 graph = self._graph(stored[index].name, 1)
                 labels[index] = _states_on_path(scores.astype(np.float32), graph)
         return {
-            one.name: _thirds(phones.repeat(2))
-            for one, phones in zip(stored, labels, strict=True)
+            features.name: _split_into_states(phones.repeat(2))
+            for features, phones in zip(stored, labels, strict=True)
             if len(phones)
         }
 
@@ -102,7 +102,7 @@ class Aligner:
             silence=self.inventory.index[self.inventory.silence],
         )
 
-    def _by_hand(self, stored: Features) -> NDArray[np.int64]:
+    def _hand_labels(self, stored: Features) -> NDArray[np.int64]:
         """Return the phones of a recording's positions; empty without hand-made labels."""
         table = self.recordings[stored.name].labels
         if table is None:
@@ -112,7 +112,7 @@ class Aligner:
         phones = np.array([self.inventory.index[symbol] for symbol in symbols])
         return np.asarray(phones[np.minimum(np.searchsorted(ends_s, time_s), len(phones) - 1)])
 
-    def _similar(self, labels: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
+    def _similarity_weights(self, labels: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
         """Return w, (phones, phones)."""
         counts = np.bincount(np.concatenate(labels), minlength=self.num_phones)
         is_known = counts >= _MIN_LABELED
@@ -131,12 +131,15 @@ def _components(stored: Sequence[Features], seed: int) -> list[Tensor]:
     rng = np.random.default_rng(seed)
     size = min(_NUM_FOR_COMPONENTS, len(stored))
     some = np.concatenate(
-        [stored[index].settled() for index in rng.choice(len(stored), size, replace=False)]
+        [
+            stored[index].position_features()
+            for index in rng.choice(len(stored), size, replace=False)
+        ]
     )
     mean = some.mean(axis=0)
     variance, axes = np.linalg.eigh(np.cov((some - mean).T))
     axes = (axes / np.sqrt(variance + 1e-3))[:, -_NUM_COMPONENTS:].astype(np.float32)
-    return [torch.from_numpy((one.settled() - mean) @ axes) for one in stored]
+    return [torch.from_numpy((features.position_features() - mean) @ axes) for features in stored]
 
 
 def _classifier(
@@ -152,7 +155,7 @@ def _classifier(
     )
     optimizer = torch.optim.AdamW(classifier.parameters(), weight_decay=0.02)
     for step in range(_STEPS):
-        optimizer.param_groups[0]["lr"] = _RATE * (1 - step / _STEPS)
+        optimizer.param_groups[0]["lr"] = _LEARNING_RATE * (1 - step / _STEPS)
         batch = torch.randint(len(inputs), (_BATCH,))
         noisy = inputs[batch] + 0.2 * torch.randn(_BATCH, _NUM_COMPONENTS)
         loss = cross_entropy(classifier(noisy), targets[batch], label_smoothing=0.05)
@@ -171,7 +174,7 @@ def _states_on_path(scores: NDArray[np.float32], graph: UtteranceGraph) -> NDArr
     return np.asarray(graph.states[path])
 
 
-def _thirds(phones: NDArray[np.int64]) -> NDArray[np.int64]:
+def _split_into_states(phones: NDArray[np.int64]) -> NDArray[np.int64]:
     """Divide each phone's frames equally among its states."""
     starts = np.flatnonzero(np.diff(phones, prepend=-1))
     lengths = np.diff(np.append(starts, len(phones)))

@@ -18,7 +18,7 @@ from kouxing.services.recognizer.acoustic.network import (
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
 from kouxing.training.blocks.export import BlockGraph, cache_names
-from kouxing.training.blocks.exported import encoder_of
+from kouxing.training.blocks.exported import rebuild_encoder
 from kouxing.training.blocks.network import BlockEncoder
 from kouxing.training.networks.network import PADDING_FRAMES
 from kouxing.training.networks.onnx_graph import halves
@@ -32,7 +32,7 @@ class FeatureEncoder:
     """Computes hidden layers of recordings, in blocks with their right contexts."""
 
     def __init__(self, model: BlockModel, layers: Sequence[int]) -> None:
-        encoder = encoder_of(model)
+        encoder = rebuild_encoder(model)
         self._shape = encoder.shape
         self._session = open_session(_FeatureGraph(encoder, layers).file_of_features())
         unused = np.zeros((LENGTH, self._shape.width), np.float32)

@@ -17,7 +17,7 @@ from kouxing.training.blocks.network import BlockReadout
 from kouxing.training.networks.teacher import KEPT_LAYERS
 
 
-def extension_of(
+def export_extension(
     readout: BlockReadout, model: BlockModel, layers: Sequence[int]
 ) -> NDArray[np.uint8]:
     """Export a readout of some layers, which must be among those that the model's readout reads."""

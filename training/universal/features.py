@@ -45,7 +45,7 @@ class Features:
     num_frames: int
     rows: NDArray[np.int8]  # (blocks, B + R, 1024)
 
-    def settled(self) -> NDArray[np.float32]:
+    def position_features(self) -> NDArray[np.float32]:
         """Return the features of the positions, (positions, 1024)."""
         rows = self.rows[:, :BLOCK_LENGTH].reshape(-1, WIDTH)[: -(-self.num_frames // 2)]
         return rows.astype(np.float32) * np.float32(STEP)
@@ -85,11 +85,13 @@ class FeatureStore:
                 known.add(features.name)
                 if features.name in wanted:
                     yield features
-        missing = [one for one in recordings if one.utterance_id not in known]
+        missing = [recording for recording in recordings if recording.utterance_id not in known]
         missing.sort(key=lambda recording: recording.seconds)
         for start in track(range(0, len(missing), _SHARD), "features"):
             shard = missing[start : start + _SHARD]
-            digest = hashlib.sha256(" ".join(one.utterance_id for one in shard).encode())
+            digest = hashlib.sha256(
+                " ".join(recording.utterance_id for recording in shard).encode()
+            )
             index = self._folder / f"{digest.hexdigest()[:8]}.json"
             self._write(shard, index)
             yield from _read_shard(index)
@@ -99,13 +101,13 @@ class FeatureStore:
         with index.with_suffix(".i8").open("wb") as file:
             for start in range(0, len(recordings), _BATCH):
                 batch = recordings[start : start + _BATCH]
-                frames = [_frames_of(one) for one in batch]
+                frames = [_frames_of(recording) for recording in batch]
                 encoded = self._encoder.encode(frames)
-                for one, some, rows in zip(batch, frames, encoded, strict=True):
+                for recording, some, rows in zip(batch, frames, encoded, strict=True):
                     standard = (rows.astype(np.float32) - self.mean) / self.deviation
                     integers = np.clip(np.rint(standard * (1 / STEP)), -127, 127).astype(np.int8)
                     file.write(integers.tobytes())
-                    entries.append((one.utterance_id, len(some), first, len(rows)))
+                    entries.append((recording.utterance_id, len(some), first, len(rows)))
                     first += len(rows)
         write_text(index, json.dumps(entries))
 

@@ -22,11 +22,11 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.model_card import write_card
-from kouxing.training.networks.labels import STATES_PER_PHONE, Alignment, statistics_of
-from kouxing.training.phone_lm.recipe import estimate_phone_lm, stream_of
+from kouxing.training.networks.labels import STATES_PER_PHONE, Alignment, alignment_statistics
+from kouxing.training.phone_lm.recipe import estimate_phone_lm, join_sentences
 from kouxing.training.universal.alignment import Aligner
 from kouxing.training.universal.encoder import FeatureEncoder
-from kouxing.training.universal.export import extension_of
+from kouxing.training.universal.export import export_extension
 from kouxing.training.universal.features import LAYERS, Features, FeatureStore
 from kouxing.training.universal.recordings import TrainingSet, read_training_set
 from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
@@ -45,7 +45,7 @@ def train_universal(
     clips: Path | None = None,
     seed: int = 0,
     num_steps: int = 2000,
-    shipping: bool = True,
+    only_distributable: bool = True,
 ) -> None:
     """Train the universal readout of the shipped block model, and write it with its card.
 
@@ -59,27 +59,30 @@ def train_universal(
     torch.manual_seed(seed)
     errors = RowErrors()
     inventory = load_inventory(UNIVERSAL)
-    data = read_training_set(mandarin, learners, languages, clips, errors, shipping=shipping)
+    data = read_training_set(
+        mandarin, learners, languages, clips, errors, only_distributable=only_distributable
+    )
     folder, states_file, checkpoint = (
         output.with_suffix(end) for end in (".features", ".states.npz", ".readout.pt")
     )
     store = FeatureStore(folder, FeatureEncoder(model, LAYERS))
     store.standardize(data.recordings)
     stored = list(store.read(data.recordings))
-    by_name = {one.utterance_id: one for one in data.recordings}
+    by_name = {recording.utterance_id: recording for recording in data.recordings}
     weight_of = {
-        one.utterance_id: weight for one, weight in zip(data.recordings, data.weights, strict=True)
+        recording.utterance_id: weight
+        for recording, weight in zip(data.recordings, data.weights, strict=True)
     }
     aligner = Aligner(by_name, inventory)
     saved = load_or_compute(states_file, partial(_aligned_states, aligner, stored, seed))
     pieces = np.split(saved["states"].astype(np.int64), np.cumsum(saved["lengths"])[:-1])
     states = dict(zip(saved["names"].tolist(), pieces, strict=True))
-    aligned = [one for one in stored if one.name in states]
+    aligned = [features for features in stored if features.name in states]
     readout = train_readout(
         new_readout(STATES_PER_PHONE * len(inventory)),
         aligned,
         states,
-        [weight_of[one.name] for one in aligned],
+        [weight_of[features.name] for features in aligned],
         seed=seed,
         num_steps=num_steps,
         checkpoint=checkpoint,
@@ -87,7 +90,7 @@ def train_universal(
     topology, log_prior = _statistics(by_name, states, weight_of, inventory)
     readout.mean[:] = torch.from_numpy(store.mean)
     readout.deviation[:] = torch.from_numpy(store.deviation)
-    extension = extension_of(readout, model, LAYERS)
+    extension = export_extension(readout, model, LAYERS)
     universal = replace(
         model,
         topology=replace(
@@ -115,7 +118,7 @@ def _aligned_states(
     states = aligner.align(stored, seed)
     return {
         "names": np.array(list(states)),
-        "lengths": np.array([len(one) for one in states.values()]),
+        "lengths": np.array([len(path) for path in states.values()]),
         "states": np.concatenate(list(states.values())).astype(np.int16),
     }
 
@@ -131,10 +134,10 @@ def _statistics(
         Alignment(states=path, phones=_phones_of(path), weight=weight_of[name])
         for name, path in states.items()
     ]
-    stream = stream_of([recordings[name].phones for name in states], inventory)
+    stream = join_sentences([recordings[name].phones for name in states], inventory)
     phone_lm = estimate_phone_lm([stream], inventory, order=_LM_ORDER, max_ngrams=_LM_NGRAMS)
     weights = [weight_of[name] for name in states]
-    return statistics_of(aligned, list(np.array(weights) / sum(weights)), phone_lm)
+    return alignment_statistics(aligned, list(np.array(weights) / sum(weights)), phone_lm)
 
 
 def _phones_of(states: NDArray[np.int64]) -> list[PathSegment]:

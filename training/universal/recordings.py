@@ -15,7 +15,7 @@ from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
     is_synthetic,
-    may_ship,
+    may_distribute,
     read_corpus,
 )
 from kouxing.shared.errors import UserError
@@ -53,7 +53,7 @@ def read_training_set(
     clips: Path | None,
     errors: RowErrors,
     *,
-    shipping: bool = True,
+    only_distributable: bool = True,
 ) -> TrainingSet:
     """Read the recordings that are not held out.
 
@@ -64,22 +64,30 @@ def read_training_set(
     """
     groups: dict[str, list[Utterance]] = defaultdict(list)
     for corpus in mandarin:
-        groups["mandarin"] += _some_mandarin(corpus, errors, shipping=shipping)
+        groups["mandarin"] += _sample_mandarin(
+            corpus, errors, only_distributable=only_distributable
+        )
     for corpus in learners:
-        groups["learners"] += _some_of_each_speaker(corpus, errors)
+        groups["learners"] += _sample_speakers(corpus, errors)
     universal = load_inventory(UNIVERSAL)
     for corpus in languages:
-        for one in read_corpus(corpus, errors, universal):
-            groups["emodb" if one.speaker.startswith("emodb_") else _group_of(one)].append(one)
+        for recording in read_corpus(corpus, errors, universal):
+            groups[
+                "emodb" if recording.speaker.startswith("emodb_") else _group_of(recording)
+            ].append(recording)
     if clips:
         groups["grid"] += _grid_clips(clips, errors)
     recordings, weights = [], []
     for name, group in sorted(groups.items()):
-        usable = [one for one in group if _may_train(one, shipping=shipping)]
-        minutes = sum(one.seconds for one in usable)
+        usable = [
+            recording
+            for recording in group
+            if _may_train(recording, only_distributable=only_distributable)
+        ]
+        minutes = sum(recording.seconds for recording in usable)
         recordings += usable
         fraction = _FRACTIONS.get(name, _SYNTHETIC_FRACTION)
-        weights += [fraction * one.seconds / minutes for one in usable]
+        weights += [fraction * recording.seconds / minutes for recording in usable]
     if not recordings:
         raise errors.no_recording_error("in the corpora")
     return TrainingSet(recordings, weights)
@@ -89,9 +97,9 @@ def _group_of(recording: Utterance) -> str:
     return "synthetic" if is_synthetic(recording.license) else recording.language
 
 
-def _may_train(recording: Utterance, *, shipping: bool) -> bool:
+def _may_train(recording: Utterance, *, only_distributable: bool) -> bool:
     return (
-        (may_ship(recording.license) or not shipping)
+        (may_distribute(recording.license) or not only_distributable)
         and recording.seconds <= _MAX_S
         and recording.language not in _HELD_OUT_LANGUAGES
         and recording.speaker not in _HELD_OUT_SPEAKERS
@@ -99,13 +107,15 @@ def _may_train(recording: Utterance, *, shipping: bool) -> bool:
     )
 
 
-def _some_mandarin(corpus: Path, errors: RowErrors, *, shipping: bool) -> list[Utterance]:
+def _sample_mandarin(
+    corpus: Path, errors: RowErrors, *, only_distributable: bool
+) -> list[Utterance]:
     """Draw some recordings of each kind, with universal phones."""
     mandarin, universal = load_inventory(), load_inventory(UNIVERSAL)
     rows = [
-        one
-        for one in read_corpus(corpus, errors, mandarin, split="train")
-        if may_ship(one.license) or not shipping
+        row
+        for row in read_corpus(corpus, errors, mandarin, split="train")
+        if may_distribute(row.license) or not only_distributable
     ]
     random.Random(3).shuffle(rows)  # noqa: S311 - reproducible
     by_kind: dict[str, list[Utterance]] = defaultdict(list)
@@ -125,7 +135,7 @@ def _some_mandarin(corpus: Path, errors: RowErrors, *, shipping: bool) -> list[U
     return converted
 
 
-def _some_of_each_speaker(corpus: Path, errors: RowErrors) -> list[Utterance]:
+def _sample_speakers(corpus: Path, errors: RowErrors) -> list[Utterance]:
     by_speaker: dict[str, list[Utterance]] = defaultdict(list)
     for row in read_corpus(corpus, errors, load_inventory(UNIVERSAL)):
         by_speaker[row.speaker].append(row)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import nll_loss
 
-from kouxing.training.blocks.network import BlockReadout, Layout, layout
+from kouxing.training.blocks.network import BlockLayout, BlockReadout, block_layout
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.networks.optimizer import optimize
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, RIGHT_CONTEXT
@@ -32,7 +32,7 @@ READOUT = ReadoutShape(
 _NUM_CROPS, _CROP_BLOCKS = 8, 12  # in a batch, in a crop
 _CROP_POSITIONS = _CROP_BLOCKS * BLOCK_LENGTH
 CROPS_S = _NUM_CROPS * _CROP_POSITIONS * 0.02
-_RATE, _WARM_UP_STEPS, _FALLING = 2e-3, 40, 0.6
+_LEARNING_RATE, _WARM_UP_STEPS, _DECAY_FRACTION = 2e-3, 40, 0.6
 _RIGHT_WEIGHT = 0.5
 _NO_STATE = -1
 
@@ -53,16 +53,16 @@ def train_readout(
     sampling weights of the recordings.
     """
     probs = np.cumsum(weights) / np.sum(weights)
-    laid = layout(_CROP_POSITIONS, BLOCK_LENGTH, RIGHT_CONTEXT)
+    layout = block_layout(_CROP_POSITIONS, BLOCK_LENGTH, RIGHT_CONTEXT)
     readout.train()
 
     def loss(step: int) -> Tensor:
         rng = np.random.default_rng([seed, step])
         drawn = [recordings[int(np.searchsorted(probs, rng.random()))] for _ in range(_NUM_CROPS)]
-        crops = [_crop(one, states[one.name], laid, rng) for one in drawn]
+        crops = [_crop(recording, states[recording.name], layout, rng) for recording in drawn]
         features, targets = (torch.from_numpy(np.stack(part)) for part in zip(*crops, strict=True))
         with torch.autocast("cpu", torch.bfloat16):
-            log_posteriors = readout.read(features.float() * STEP, laid).float()
+            log_posteriors = readout.read(features.float() * STEP, layout).float()
         losses = [
             nll_loss(
                 log_posteriors[:, part].flatten(0, 2),
@@ -76,11 +76,11 @@ def train_readout(
 
     return optimize(
         readout,
-        [{"params": list(readout.parameters()), "lr": _RATE}],
+        [{"params": list(readout.parameters()), "lr": _LEARNING_RATE}],
         loss,
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
-        falling=_FALLING,
+        decay_fraction=_DECAY_FRACTION,
         seed=seed,
         checkpoint=checkpoint,
     )
@@ -92,7 +92,7 @@ def new_readout(num_states: int) -> BlockReadout:
 
 
 def _crop(
-    recording: Features, states: NDArray[np.int64], laid: Layout, rng: np.random.Generator
+    recording: Features, states: NDArray[np.int64], layout: BlockLayout, rng: np.random.Generator
 ) -> tuple[NDArray[np.int8], NDArray[np.int64]]:
     """Draw blocks of a recording; return features, (n, 1024), and states, (n, 2)."""
     num_more = len(recording.rows) - _CROP_BLOCKS
@@ -103,13 +103,13 @@ def _crop(
     targets = np.full(2 * _CROP_POSITIONS, _NO_STATE)
     kept = states[2 * BLOCK_LENGTH * first :][: len(targets)]
     targets[: len(kept)] = kept
-    by_place = targets.reshape(-1, 2)[laid.places.numpy()]
-    return rows.reshape(-1, WIDTH)[_in_cache(laid)], by_place
+    by_place = targets.reshape(-1, 2)[layout.places.numpy()]
+    return rows.reshape(-1, WIDTH)[_in_cache(layout)], by_place
 
 
-def _in_cache(laid: Layout) -> NDArray[np.int64]:
+def _in_cache(layout: BlockLayout) -> NDArray[np.int64]:
     """Return the row of each place in the stored blocks, (n,)."""
-    own = np.arange(laid.num_positions)
+    own = np.arange(layout.num_positions)
     rows = own // BLOCK_LENGTH * LENGTH + own % BLOCK_LENGTH
-    copied = (laid.blocks >= laid.num_positions).numpy().flatten().nonzero()[0]
+    copied = (layout.blocks >= layout.num_positions).numpy().flatten().nonzero()[0]
     return np.concatenate([rows, copied])

@@ -63,7 +63,7 @@ _FAR_S = 60.0  # a viseme this far away has no weight
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class FrameTable:
     """Frames of all clips, with the nearest visemes and silences of each."""
 
     viseme: NDArray[np.intp]  # (num_frames, near)
@@ -74,9 +74,9 @@ class Frames:
     faps: Array  # (num_frames, num_mouth_faps)
 
 
-def frames_of(
+def collect_frames(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
-) -> Frames:
+) -> FrameTable:
     """Find the nearest visemes and silences of each frame; UserError if no clip contains speech."""
     parts = []
     for clip, phones in zip(clips, labels, strict=True):
@@ -103,7 +103,7 @@ def frames_of(
         )
     if not parts:
         raise UserError("the training clips contain no speech")
-    return Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return FrameTable(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _padded(timeline: Timeline) -> Timeline:
@@ -136,7 +136,7 @@ class _FapFit:
     Decays and dominances are logarithms, so that they stay positive.
     """
 
-    def __init__(self, start: VisemeParameters, frames: Frames, column: int) -> None:
+    def __init__(self, start: VisemeParameters, frames: FrameTable, column: int) -> None:
         known = ~np.isnan(frames.faps[:, column])
         self.c = start.c
         self._viseme = frames.viseme[known]
@@ -185,7 +185,7 @@ class _FapFit:
         """Minimize the loss over the unknowns of some visemes and of the silences; return it."""
         num = 5 * len(rows)
 
-        def place(z: Array) -> tuple[Array, Array]:
+        def unpack(z: Array) -> tuple[Array, Array]:
             visemes, silences = self.visemes.copy(), self.silences.copy()
             visemes[:, rows] = self._start[:, rows] + self._spread * z[:num].reshape(5, -1)
             if with_silences:
@@ -193,7 +193,7 @@ class _FapFit:
             return visemes, silences
 
         def loss(z: Array) -> tuple[float, Array]:
-            visemes, silences = place(z)
+            visemes, silences = unpack(z)
             silent = self._log_silences(silences)
             curve, slopes = self._blend(visemes, silent)
             error = (curve - self._measured) / self._scale
@@ -229,7 +229,7 @@ class _FapFit:
             z = np.append(z, (self.silences - self._silence_start) / self._silence_spread)
             bounds += [(-2.0, 2.0)] * len(self.silences)
         result = minimize(loss, z, jac=True, method="L-BFGS-B", bounds=bounds)
-        self.visemes, self.silences = place(result.x)
+        self.visemes, self.silences = unpack(result.x)
         return float(result.fun)
 
     def _log_silences(self, silences: Array) -> Array:
@@ -278,7 +278,7 @@ _VOWEL_ROWS = np.array(
 )
 
 
-def estimate(frames: Frames) -> VisemeParameters:
+def fit_parameters(frames: FrameTable) -> VisemeParameters:
     """Fit all measured FAPs in the two stages of Wang & Cai 2003."""
     measured = [
         column

@@ -30,12 +30,12 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import write_text
-from kouxing.training.visemes.fit import Array, estimate, frames_of
+from kouxing.training.visemes.fit import Array, collect_frames, fit_parameters
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
 _SPOKEN_DB = 25.0  # audio this far below the loudest is not speech
 _CLOSURE_REACHES_S = (0.05, 0.06, 0.07, 0.08, 0.1)  # shorter closures are hardly visible
-_CLOSURE_WINDOW_S, _CLOSURE_NEIGHBOURS_S = 0.12, 1.0
+_CLOSURE_WINDOW_S, _CLOSURE_NEIGHBORS_S = 0.12, 1.0
 # The fit uses exact phone onsets, but live phones arrive late. Of 0, 10, 15, 20 and 40 ms, this
 # lead removes most of the lag on clips of the part "choice" at a delay of 160 ms, and keeps long
 # vowels open.
@@ -43,7 +43,7 @@ _LEAD_S = 0.015
 _SOURCE = "start and tongue: targets of Crystal.TTVS (Tsinghua University), Apache-2.0"
 
 
-def usual_levels(
+def measure_levels(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
 ) -> Array:
     """Measure the level of each viseme relative to its speaker's mean, dB, (num_visemes,)."""
@@ -85,7 +85,7 @@ def closure_reach(
             for row in rows:
                 apex_s = timeline.apex_start_s[row]
                 frames = np.flatnonzero(np.abs(clip.time_s - apex_s) < _CLOSURE_WINDOW_S)
-                near = np.abs(timeline.apex_start_s - apex_s) < _CLOSURE_NEIGHBOURS_S
+                near = np.abs(timeline.apex_start_s - apex_s) < _CLOSURE_NEIGHBORS_S
                 curve = blend(
                     replace(parameters, closure_reach_s=reach_s),
                     timeline.select(near),
@@ -109,8 +109,8 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
     model = load_model()
     inventory = model.inventory
     labels = [label_clip(model, clip) for clip in used]
-    parameters = estimate(frames_of(used, labels, inventory))
-    parameters = replace(parameters, level_db=usual_levels(used, labels, inventory))
+    parameters = fit_parameters(collect_frames(used, labels, inventory))
+    parameters = replace(parameters, level_db=measure_levels(used, labels, inventory))
     reach_s = closure_reach(parameters, used, labels, inventory)
     parameters = replace(
         parameters,

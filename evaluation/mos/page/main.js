@@ -11,7 +11,7 @@ const element = (name) => document.getElementById(name);
 const secrets = new URLSearchParams(location.hash.slice(1)); // a fragment is never sent
 const scales = [...document.querySelectorAll("fieldset[data-scale]")];
 const address = (path) => `${path}?${secrets}`;
-const say = (en, zh) => (document.documentElement.lang === "zh" ? zh : en);
+const translate = (en, zh) => (document.documentElement.lang === "zh" ? zh : en);
 let place = null;
 
 /** Send a request; return the answer, or show the error and throw it. */
@@ -22,8 +22,8 @@ async function request(path, body) {
     notify("");
     return await answer.json();
   } catch (error) {
-    if (error.status === 404) showPart("welcome"); // this study does not know the judge
-    notify(`${say("This did not work. Please try again.", "未能送达，请重试。")} (${error.message})`);
+    if (error.status === 404) showPart("welcome"); // the study has no such judge
+    notify(`${translate("This did not work. Please try again.", "未能送达，请重试。")} (${error.message})`);
     throw error;
   }
 }
@@ -55,12 +55,12 @@ function show(state) {
 
 function chooseLanguage(language) {
   document.documentElement.lang = language;
-  element("progress").ariaLabel = say("rated videos", "已评视频");
-  element("language").textContent = say("中文", "English");
+  element("progress").ariaLabel = translate("rated videos", "已评视频");
+  element("language").textContent = translate("中文", "English");
 }
 
 /** Run an action with its button disabled, so that a second click does nothing. */
-async function once(button, action) {
+async function runOnce(button, action) {
   element(button).disabled = true;
   try {
     await action();
@@ -78,13 +78,13 @@ for (const scale of scales) {
     scale.insertAdjacentHTML("beforeend", `<label>${input}${texts}</label>`);
   }
 }
-element("language").addEventListener("click", () => chooseLanguage(say("zh", "en")));
-element("begin").addEventListener("click", () => once("begin", async () => {
+element("language").addEventListener("click", () => chooseLanguage(translate("zh", "en")));
+element("begin").addEventListener("click", () => runOnce("begin", async () => {
   secrets.set("judge", (await request("judges", {})).judge);
   history.replaceState(null, "", `#${secrets}`);
   show(await request("state"));
 }));
-element("play").addEventListener("click", () => once("play", async () => {
+element("play").addEventListener("click", () => runOnce("play", async () => {
   element("video").currentTime = 0;
   await element("video").play();
 }));
@@ -95,7 +95,7 @@ element("video").addEventListener("ended", () => {
   for (const scale of scales) scale.disabled = false;
 });
 element("video").addEventListener("error", () => {
-  notify(say("The video did not load. Please reload the page.", "视频未能加载，请刷新页面。"));
+  notify(translate("The video did not load. Please reload the page.", "视频未能加载，请刷新页面。"));
 });
 element("scores").addEventListener("change", () => {
   element("send").disabled = scales.some((scale) => !scale.querySelector(":checked"));
@@ -104,7 +104,7 @@ element("scores").addEventListener("submit", (event) => {
   event.preventDefault();
   const scores = [...new FormData(event.target)].map(([name, value]) => [name, Number(value)]);
   const answer = { place, ...Object.fromEntries(scores), language: document.documentElement.lang };
-  once("send", async () => show(await request("answers", answer)));
+  runOnce("send", async () => show(await request("answers", answer)));
 });
 addEventListener("hashchange", () => location.reload()); // another judge's address
 chooseLanguage(languageFor(navigator.languages));

@@ -44,7 +44,7 @@ def match_extrema(predicted: Array, real: Array) -> list[int]:
     >>> match_extrema(np.array([0.0, 0, 1, 4, 1, 0, 2, 2]), np.array([0.0, 1, 4, 1, 0, 2, 2, 1]))
     [1, 1]
     """
-    kinds = [_extrema(curve) for curve in (predicted, real)]
+    kinds = [_find_extrema(curve) for curve in (predicted, real)]
     real_extrema = np.flatnonzero(kinds[1])
     offsets = []
     for j, i in warping_path(*(np.diff(curve, prepend=curve[:1]) for curve in (predicted, real))):
@@ -57,7 +57,7 @@ def match_extrema(predicted: Array, real: Array) -> list[int]:
     return offsets
 
 
-def _extrema(curve: Array) -> NDArray[np.int_]:
+def _find_extrema(curve: Array) -> NDArray[np.int_]:
     """Return 1 for maxima, -1 for minima, 0 otherwise. A plateau counts once, at its middle."""
     kind = np.zeros(len(curve), dtype=int)
     steps = np.flatnonzero(np.diff(curve))

@@ -20,18 +20,18 @@ from kouxing.shared.wire.session import Error, OpenSession
 from tests.system import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
-PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
+ENDPOINTS_BY_SERVICE = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 
 
-def beat(kind: str, address: str = "tcp://127.0.0.1:1", **fields: object) -> Heartbeat:
+def make_heartbeat(kind: str, address: str = "tcp://127.0.0.1:1", **fields: object) -> Heartbeat:
     """Return the heartbeat of a service whose sockets all have one address."""
     return Heartbeat(
         service=kind, instance=kind, role="worker", state="ready", sent_ns=0,
-        endpoints=dict.fromkeys(PROVIDED[kind], address), **fields,  # type: ignore[arg-type]
+        endpoints=dict.fromkeys(ENDPOINTS_BY_SERVICE[kind], address), **fields,  # type: ignore[arg-type]
     )  # fmt: skip
 
 
-class Stage:
+class ControlHarness:
     """Control and two services that start every session."""
 
     def __init__(self, *, insecure: bool) -> None:
@@ -43,10 +43,10 @@ class Stage:
         self.refusal: Error | None = None  # of the services, instead of starting a session
         self.buses = []
         self.services = []
-        for kind in PROVIDED:
+        for kind in ENDPOINTS_BY_SERVICE:
             bus = Bus(None if insecure else load_key(kind, (f"service:{kind}",)))
             service = bus.connect_dealer(self.control.endpoints["commands"])
-            service.send(beat(kind))
+            service.send(make_heartbeat(kind))
             self.buses.append(bus)
             self.services.append(service)
         self.clients: list[zmq.Socket[bytes]] = []

@@ -1,4 +1,4 @@
-"""Programs that know only PROTOCOL.md: strangers, and the examples."""
+"""Programs that know only PROTOCOL.md: independent ones, and the examples."""
 
 import os
 import shutil
@@ -21,7 +21,7 @@ from kouxing_client.keys import Key
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.keys import load_key, user_key
 from tests.documents import code_blocks
-from tests.e2e.following import Stream
+from tests.e2e.streaming import Stream
 from tests.system import (
     LIMIT_S,
     NODE,
@@ -33,18 +33,18 @@ from tests.system import (
 )
 
 
-class Stranger:
+class IndependentProgram:
     """A program that implements the protocol with pyzmq and msgpack."""
 
     def __init__(self) -> None:
         self.context = zmq.Context()
 
     def socket(self, kind: int, endpoint: str, key: Key | None = None) -> zmq.Socket[bytes]:
-        made = self.context.socket(kind)
-        made.setsockopt(zmq.LINGER, 1000)
-        made.setsockopt(zmq.RCVTIMEO, 60000)
-        connect(made, endpoint, key or user_key())
-        return made
+        new_socket = self.context.socket(kind)
+        new_socket.setsockopt(zmq.LINGER, 1000)
+        new_socket.setsockopt(zmq.RCVTIMEO, 60000)
+        connect(new_socket, endpoint, key or user_key())
+        return new_socket
 
     def close(self) -> None:
         self.context.destroy()
@@ -60,15 +60,15 @@ def receive(socket: zmq.Socket[bytes]) -> tuple[str, dict[str, Any]]:
     return topic.decode().split("/")[0], msgpack.unpackb(body)
 
 
-def test_a_stranger_streams_audio_and_another_reads_the_faps(system: System) -> None:
-    speaker, watcher = Stranger(), Stranger()
+def test_one_program_streams_audio_and_another_receives_the_faps(system: System) -> None:
+    speaker, watcher = IndependentProgram(), IndependentProgram()
     control = speaker.socket(zmq.DEALER, system.control)
-    send(control, "open-session", "stranger", request="1", encoding="s16le", paced=False)
+    send(control, "open-session", "independent", request="1", encoding="s16le", paced=False)
     kind, opened = receive(control)
     assert kind == "session-opened", opened
     faps = watcher.socket(zmq.SUB, opened["faps"])
     for wanted in ("fap-frame", "end-of-faps", "joined"):
-        faps.setsockopt(zmq.SUBSCRIBE, f"{wanted}/stranger/".encode())
+        faps.setsockopt(zmq.SUBSCRIBE, f"{wanted}/independent/".encode())
     assert receive(faps)[0] == "joined"
 
     samples = samples_of_file(VOWELS_FILE)
@@ -78,13 +78,13 @@ def test_a_stranger_streams_audio_and_another_reads_the_faps(system: System) -> 
         send(
             audio,
             "audio-chunk",
-            "stranger",
+            "independent",
             token=opened["token"],
             sequence=number,
             media_time=begin // 2,
             pcm=pcm[begin : begin + 1280],
         )
-    send(audio, "audio-chunk", "stranger", token=opened["token"], sequence=10**6, last=True)
+    send(audio, "audio-chunk", "independent", token=opened["token"], sequence=10**6, last=True)
 
     jaw: list[float] = []
     while (frame := receive(faps))[0] != "end-of-faps":
@@ -97,15 +97,15 @@ def test_a_stranger_streams_audio_and_another_reads_the_faps(system: System) -> 
     assert max(jaw) > 200, "/a/ opens the jaw"
     assert abs(jaw[-1]) < 1
 
-    send(control, "close-session", "stranger", request="2", token=opened["token"])
+    send(control, "close-session", "independent", request="2", token=opened["token"])
     assert receive(control)[0] == "done"
     speaker.close()
     watcher.close()
 
 
 def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(system: System) -> None:
-    stranger = Stranger()
-    lamp = stranger.socket(zmq.DEALER, system.control, load_key("lamp", ("service:lamp",)))
+    program = IndependentProgram()
+    lamp = program.socket(zmq.DEALER, system.control, load_key("lamp", ("service:lamp",)))
     heartbeat: dict[str, Any] = {
         "service": "lamp",
         "instance": "lamp-1",
@@ -117,7 +117,7 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(system: Sys
     send(lamp, "heartbeat", "", **heartbeat)
     assert receive(lamp)[0] == "heartbeat-reply"
 
-    client = stranger.socket(zmq.DEALER, system.control)
+    client = program.socket(zmq.DEALER, system.control)
     send(client, "open-session", "lit", request="1", paced=False)
     kind, start = receive(lamp)
     assert kind == "start-session"
@@ -138,17 +138,17 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(system: Sys
     assert receive(lamp)[0] == "close-session"
     send(lamp, "heartbeat", "", **{**heartbeat, "state": "draining"})
     assert receive(lamp)[0] == "heartbeat-reply"
-    stranger.close()
+    program.close()
 
 
 def test_a_client_of_another_version_is_answered_in_its_version(system: System) -> None:
-    stranger = Stranger()
-    control = stranger.socket(zmq.DEALER, system.control)
+    program = IndependentProgram()
+    control = program.socket(zmq.DEALER, system.control)
     control.send_multipart([b"open//", msgpack.packb({"version": 1, "request": "r"})])
     kind, answer = receive(control)
     assert (kind, answer["version"], answer["code"]) == ("error", 1, "bad-message")
     assert "upgrade" in answer["text"]
-    stranger.close()
+    program.close()
 
 
 def test_the_example_in_the_readme_follows_a_face(system: System) -> None:

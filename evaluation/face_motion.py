@@ -28,7 +28,7 @@ from scipy.stats import spearmanr
 
 from kouxing.corpora.emotions import FEELINGS, EmotionRecording, speakers_of
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.evaluation.lips.effort import opening_range
+from kouxing.evaluation.lips.effort_measures import opening_range
 from kouxing.evaluation.tables import format_number, percent
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -69,7 +69,7 @@ _ANGLES = [
 
 
 @dataclass(frozen=True, slots=True)
-class Movements:
+class MovementStats:
     """Rate of a movement, and how often it matches a stressed vowel."""
 
     per_minute: float  # rate per minute of speech
@@ -82,8 +82,8 @@ class FaceFigures:
     """Metrics of a face."""
 
     correlations: Mapping[str, float]
-    nods: Movements
-    brow_raises: Movements
+    nods: MovementStats
+    brow_raises: MovementStats
     chance: float | None  # probability of matching a stressed vowel by chance
     blinks_per_minute: float
     blink_s: float  # median duration
@@ -105,10 +105,10 @@ class _Session:
 def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -> FaceFigures:
     """Animate all recordings that name an emotion, and a face at rest."""
     config = SynthesizerConfig()
-    spoken = [recording for recording in recordings if recording.emotion]
+    labeled = [recording for recording in recordings if recording.emotion]
     by_speaker = [
-        [recording for recording in spoken if recording.speaker == speaker]
-        for speaker in speakers_of(spoken)
+        [recording for recording in labeled if recording.speaker == speaker]
+        for speaker in speakers_of(labeled)
     ]
     sessions = [
         _animate(model, speech, config)
@@ -127,20 +127,23 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
         idle_motion_seed=config.idle_motion_seed,
     )
     rest = np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
-    blinks_s = _blinks(frames, config.frame_rate_hz)
+    blinks_s = _blink_durations_s(frames, config.frame_rate_hz)
     nods = [
-        _peaks(session, _PITCH, _NOD_DEG * _DEGREE, config.frame_rate_hz) for session in sessions
+        _find_peaks(session, _PITCH, _NOD_DEG * _DEGREE, config.frame_rate_hz)
+        for session in sessions
     ]
-    raises = [_peaks(session, _BROW, _BROW_UNITS, config.frame_rate_hz) for session in sessions]
-    grid = [
+    brow_raises_s = [
+        _find_peaks(session, _BROW, _BROW_UNITS, config.frame_rate_hz) for session in sessions
+    ]
+    all_times_s = [
         np.concatenate([np.arange(*span, 0.02) for span in session.spans]) for session in sessions
     ]
     still = [_is_still(session.faps) for session in sessions]
     return FaceFigures(
         correlations=_correlations(sessions, labels, config.frame_rate_hz),
-        nods=_movements(nods, sessions, minutes),
-        brow_raises=_movements(raises, sessions, minutes),
-        chance=_matched(grid, sessions),
+        nods=_movement_stats(nods, sessions, minutes),
+        brow_raises=_movement_stats(brow_raises_s, sessions, minutes),
+        chance=_match_rate(all_times_s, sessions),
         blinks_per_minute=60 * config.frame_rate_hz * len(blinks_s) / len(frames),
         blink_s=float(np.median(blinks_s)) if len(blinks_s) else 0.0,
         still_speaking=float(np.concatenate(still).mean()),
@@ -190,7 +193,8 @@ def _correlations(
         openings = [
             opening_range(-(part[:, _UPPER] + part[:, _LOWER]).astype(np.float64)) for part in parts
         ]
-        brows = [part[len(part) // 2 :, _BROW].mean() for part in parts]  # feelings act slowly
+        # Expressions build up slowly, so only the second half counts.
+        brows = [part[len(part) // 2 :, _BROW].mean() for part in parts]
         arousal, valence = np.array(session.feelings).T
         for name, values, column in (
             ("arousal", arousal, 0),
@@ -203,41 +207,48 @@ def _correlations(
     return {name: float(np.nanmean(values)) for name, values in correlations.items()}
 
 
-def _peaks(session: _Session, fap: int, prominence: float, rate_hz: float) -> Times:
+def _find_peaks(session: _Session, fap: int, prominence: float, rate_hz: float) -> Times:
     """Return the times of the peaks of a FAP while the speaker speaks."""
     peaks, _ = find_peaks(session.faps[:, fap], prominence=prominence)
     times_s = peaks / rate_hz
-    spoken = [(start <= times_s) & (times_s < end + _PAUSE_S) for start, end in session.spans]
-    chosen: Times = times_s[np.any(spoken, axis=0)]
+    is_spoken = [(start <= times_s) & (times_s < end + _PAUSE_S) for start, end in session.spans]
+    chosen: Times = times_s[np.any(is_spoken, axis=0)]
     return chosen
 
 
-def _movements(times: Sequence[Times], sessions: Sequence[_Session], minutes: float) -> Movements:
+def _movement_stats(
+    times: Sequence[Times], sessions: Sequence[_Session], minutes: float
+) -> MovementStats:
     num_movements = sum(map(len, times))
     within = [
-        one_s[np.any([(start <= one_s) & (one_s < end) for start, end in session.spans], axis=0)]
-        for one_s, session in zip(times, sessions, strict=True)
+        times_s[
+            np.any(
+                [(start <= times_s) & (times_s < end) for start, end in session.spans],
+                axis=0,
+            )
+        ]
+        for times_s, session in zip(times, sessions, strict=True)
     ]
     at_end = 1.0 - sum(map(len, within)) / max(num_movements, 1)
-    return Movements(num_movements / minutes, at_end, _matched(within, sessions))
+    return MovementStats(num_movements / minutes, at_end, _match_rate(within, sessions))
 
 
-def _matched(times: Sequence[Times], sessions: Sequence[_Session]) -> float | None:
+def _match_rate(times: Sequence[Times], sessions: Sequence[_Session]) -> float | None:
     """Return the fraction of times that follow the start of a stressed vowel."""
     shortest_s, longest_s = _MATCH_S
     lags_s = []
-    for one_s, session in zip(times, sessions, strict=True):
+    for times_s, session in zip(times, sessions, strict=True):
         starts_s = np.array([-np.inf, *session.stressed_s])
         if len(starts_s) > 1:
             lags_s += (
-                one_s - starts_s[np.searchsorted(starts_s, one_s, side="right") - 1]
+                times_s - starts_s[np.searchsorted(starts_s, times_s, side="right") - 1]
             ).tolist()
     lag_s = np.array(lags_s)
     matches = (lag_s >= shortest_s) & (lag_s <= longest_s)
     return float(matches.mean()) if len(matches) else None
 
 
-def _blinks(faps: Floats, rate_hz: float) -> Times:
+def _blink_durations_s(faps: Floats, rate_hz: float) -> Times:
     """Return the durations of the blinks, seconds."""
     closed = np.pad((faps[:, _LID] > _CLOSED_LID).astype(int), 1)
     changes = np.diff(closed)

@@ -50,13 +50,18 @@ _MIN_DEVIATION = 1e-3
 
 
 def train_traits(
-    recordings: Path, sounds: Sequence[Path], output: Path, *, seed: int = 0, shipping: bool
+    recordings: Path,
+    sounds: Sequence[Path],
+    output: Path,
+    *,
+    seed: int = 0,
+    only_distributable: bool,
 ) -> None:
     """Train the readout, and write it with its card; ``UserError`` if a file cannot be read."""
     rng = np.random.default_rng(seed)
-    speech = read_emotions(recordings, shipping=shipping)
-    spoken = [recording for recording in speech if recording.emotion]
-    means, targets, owners = [], [], []  # one entry per recording with an emotion
+    speech = read_emotions(recordings, only_distributable=only_distributable)
+    labeled = [recording for recording in speech if recording.emotion]
+    means, targets, speaker_names = [], [], []  # one entry per recording with an emotion
     rows, labels = [], []  # positions
     for recording in track(speech, description="speech"):
         for positions in _encoder_outputs(read_audio(recording.path), rng):
@@ -66,19 +71,21 @@ def train_traits(
             if recording.emotion:
                 means.append(_mean_state(positions, states))
                 targets.append(FEELINGS[recording.emotion])
-                owners.append(recording.speaker)
-    for sound in track(read_sounds(sounds, shipping=shipping), description="sounds"):
+                speaker_names.append(recording.speaker)
+    for sound in track(
+        read_sounds(sounds, only_distributable=only_distributable), description="sounds"
+    ):
         if not sound.is_held_out:
             is_trait = [sound.kind == trait for trait in _TRAITS]
             for positions in _encoder_outputs(as_floats(sound.samples), rng):
                 states = np.stack([position.state for position in positions])
                 rows.append(states if any(is_trait) else states[::_OTHER_STEP])
                 labels.append(np.tile(np.array(is_trait, np.float32), (len(rows[-1]), 1)))
-    voice, feelings, speakers = np.stack(means), np.array(targets), np.array(owners)
-    heard = np.concatenate(labels)
-    weight = np.where(heard.any(axis=1), _SOUND_WEIGHT, 1.0)
+    voice, feelings, speakers = np.stack(means), np.array(targets), np.array(speaker_names)
+    sound_labels = np.concatenate(labels)
+    weight = np.where(sound_labels.any(axis=1), _SOUND_WEIGHT, 1.0)
     feeling_fit = _ridge(voice, feelings, np.ones(len(voice)), _FEELING_RIDGE)
-    sound_fit = _ridge(np.concatenate(rows), heard, weight, _SOUND_RIDGE)
+    sound_fit = _ridge(np.concatenate(rows), sound_labels, weight, _SOUND_RIDGE)
     weights, bias = (
         np.concatenate(parts, axis=-1).astype(np.float32)
         for parts in zip(feeling_fit, sound_fit, strict=True)
@@ -92,7 +99,7 @@ def train_traits(
         details=f"a linear readout of the audio encoder's state, seed {seed}",
         recordings=speech,
         notes=(
-            f"{len(spoken)} recordings of {len(speakers_of(spoken))} actors name an emotion "
+            f"{len(labeled)} recordings of {len(speakers_of(labeled))} actors name an emotion "
             "(EmoDB: Burkhardt et al. 2005). Arousal and valence of each emotion were placed by "
             "hand on the circumplex of Russell 1980. Each recording is used twice, unchanged and "
             "augmented. All laughter and breaths are from one man.\n\n"
@@ -138,13 +145,18 @@ def _ridge(
 
 def _test_speakers(states: Floats, feelings: Array, speakers: NDArray[Any]) -> tuple[float, float]:
     """Return the mean rank correlations of arousal and valence over held-out speakers."""
-    found = []
+    correlations = []
     for speaker in np.unique(speakers):
-        held = speakers == speaker
+        is_held_out = speakers == speaker
         weights, bias = _ridge(
-            states[~held], feelings[~held], np.ones((~held).sum()), _FEELING_RIDGE
+            states[~is_held_out],
+            feelings[~is_held_out],
+            np.ones((~is_held_out).sum()),
+            _FEELING_RIDGE,
         )
-        guessed = states[held] @ weights + bias
-        found.append([spearmanr(guessed[:, k], feelings[held, k]).statistic for k in (0, 1)])
-    arousal, valence = np.mean(found, axis=0)
+        predicted = states[is_held_out] @ weights + bias
+        correlations.append(
+            [spearmanr(predicted[:, k], feelings[is_held_out, k]).statistic for k in (0, 1)]
+        )
+    arousal, valence = np.mean(correlations, axis=0)
     return float(arousal), float(valence)

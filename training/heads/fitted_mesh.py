@@ -22,7 +22,7 @@ REPOSITORY = "https://github.com/makehumancommunity/makehuman-assets"
 
 
 @dataclass(slots=True)
-class Fitted:
+class FittedMesh:
     """A mesh that is fitted to the base mesh. Vertices are split at the seams of the texture."""
 
     triangles: Index  # (F, 3)
@@ -44,16 +44,16 @@ class Fitted:
         first, second = self.scale[:, 0].astype(int), self.scale[:, 1].astype(int)
         axes = np.arange(3)
         size = np.abs(vertices[first, axes] - vertices[second, axes]) / self.scale[:, 2]
-        return np.asarray(self.carry(vertices) + self.offsets * size)
+        return np.asarray(self.transfer(vertices) + self.offsets * size)
 
-    def carry(self, field: Float) -> Float:
+    def transfer(self, field: Float) -> Float:
         """Transfer displacements (19158, 3) of the base mesh to the vertices (V, 3)."""
         return np.asarray(np.einsum("vk,vkd->vd", self.weights, field[self.base]))
 
-    def only(self, mask: NDArray[np.bool_]) -> "Fitted":
+    def keep_triangles(self, mask: NDArray[np.bool_]) -> "FittedMesh":
         """Return the triangles (F,) that are kept, without unused vertices."""
         used, triangles, welds = subdivision.used_vertices(self.triangles[mask], self.welds)
-        return Fitted(
+        return FittedMesh(
             triangles,
             self.uv[used],
             welds,
@@ -64,7 +64,7 @@ class Fitted:
         )
 
 
-def read(folder: Path, name: str) -> Fitted:
+def read(folder: Path, name: str) -> FittedMesh:
     """Read a part by its path in a folder of MakeHuman's assets, such as ``hair/bob01/bob01``.
 
     Raises ``UserError`` if its files are missing or damaged.
@@ -77,7 +77,9 @@ def read(folder: Path, name: str) -> Fitted:
     triangles = np.concatenate([quads[:, order] for order in corner])
     triangles = triangles[triangles[:, 1] != triangles[:, 2]]
     _, first, same = np.unique(vertex, return_index=True, return_inverse=True)
-    return Fitted(triangles, uv, first[same], base[vertex], weights[vertex], offsets[vertex], scale)
+    return FittedMesh(
+        triangles, uv, first[same], base[vertex], weights[vertex], offsets[vertex], scale
+    )
 
 
 def find(folder: Path, name: str) -> Path:
@@ -89,7 +91,7 @@ def find(folder: Path, name: str) -> Path:
 
 
 def _fitting(text: str) -> tuple[Index, Float, Float, Float]:
-    """Return vertices of the base mesh, weights, offsets, and scale, see ``Fitted``."""
+    """Return vertices of the base mesh, weights, offsets, and scale, see ``FittedMesh``."""
     scale = np.zeros((3, 3))
     rows = []
     in_rows = False

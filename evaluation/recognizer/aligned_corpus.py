@@ -29,7 +29,7 @@ RATE_NAMES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class AlignedRecording:
     """A recording of a corpus and the aligned phones of its text, without silence."""
 
     utterance: Utterance
@@ -50,7 +50,7 @@ class Reference:
 
 def align_corpus(
     model: AcousticModel, corpus: Path, split: str, audio: Path | None = None
-) -> list[Reference]:
+) -> list[AlignedRecording]:
     """Align the recordings of one split of a corpus in the model's language.
 
     Prints the rows that cannot be used. Raises UserError if the split has no usable recording.
@@ -65,7 +65,7 @@ def align_corpus(
         except (UserError, ValueError) as error:
             errors.add(utterance.utterance_id, str(error))
             continue
-        references.append(Reference(utterance, spoken(phones, model.inventory)))
+        references.append(AlignedRecording(utterance, spoken(phones, model.inventory)))
     if not references:
         raise errors.no_recording_error(f"in the split {split!r} of {corpus}")
     errors.report_to(print_message)

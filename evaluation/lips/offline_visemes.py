@@ -1,4 +1,4 @@
-"""The full model, offline: phones with their times in, all FAP frames out.
+"""The model of dynamic visemes, offline: converts timed phones to all FAP frames.
 
 Source: Wang & Cai 2003, eq. 6: every frame blends all visemes and silences. Li et al. 2011, 3.2,
 schemes 1 (phones of a forced alignment) and 2 (recognized phones with their times).

@@ -1,6 +1,6 @@
-"""Delay packets: return each packet that is routed to a TUN device some time later, in order.
+"""Delays packets: returns each packet that is routed to a TUN device later, in order.
 
-usage: python -m kouxing.evaluation.system.delay DEVICE DELAY_MS JITTER_MS
+usage: python -m kouxing.evaluation.system.packet_delay DEVICE DELAY_MS JITTER_MS
 """
 
 import fcntl
@@ -27,8 +27,8 @@ def main(device: str, delay_s: float, jitter_s: float) -> None:
     queue: deque[tuple[float, bytes]] = deque()  # due time, packet
     due_s = 0.0
     while True:
-        left_s = max(0.0, queue[0][0] - time.monotonic()) if queue else None
-        if select.select([tun], [], [], left_s)[0]:
+        remaining_s = max(0.0, queue[0][0] - time.monotonic()) if queue else None
+        if select.select([tun], [], [], remaining_s)[0]:
             packet = os.read(tun, MAX_PACKET_BYTES)
             wait_s = delay_s + rng.uniform(-jitter_s, jitter_s)
             due_s = max(due_s, time.monotonic() + wait_s)

@@ -22,8 +22,8 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.sounds import Sound, held_out
 from kouxing.evaluation.recognizer import synthetic_sounds
+from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import Disturb, add_sound
-from kouxing.evaluation.recognizer.references import Reference
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.evaluation.tables import letters_of, percent
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -40,23 +40,23 @@ _SLICE_S = SLICE / SAMPLE_RATE_HZ
 _PAUSE = 2 * SAMPLE_RATE_HZ  # samples of silence before and after a recording of speech
 _SYNTHETIC_S = 60.0
 _SUNG_OVER_MUSIC_DB = 5.0
-_KINDS = {"singing": True, "laughter": False, "breath": False, "music": False, "noise": False}
+_SOUND_KINDS = {"singing": True, "laughter": False, "breath": False, "music": False, "noise": False}
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
+class LabeledAudio:
     """Recordings of one kind of audio, each with a mask of the slices with a voice."""
 
     kind: str
     recordings: Sequence[tuple[Samples, Mask]]
 
 
-def materials_of(
-    references: Sequence[Reference],
+def labeled_audio(
+    references: Sequence[AlignedRecording],
     disturbances: Mapping[str, Disturb],
     music: Samples,
     sounds: Sequence[Sound],
-) -> Iterator[Material]:
+) -> Iterator[LabeledAudio]:
     """Read, disturb and synthesize the audio, one kind at a time.
 
     ``music`` accompanies the melodies.
@@ -67,22 +67,22 @@ def materials_of(
         for reference, samples in zip(references, speech, strict=True)
     ]
     for name, disturb in disturbances.items():
-        yield Material(f"speech, {name}", [*zip(map(disturb, speech), voiced, strict=True)])
-    for kind, is_voice in _KINDS.items():
+        yield LabeledAudio(f"speech, {name}", [*zip(map(disturb, speech), voiced, strict=True)])
+    for kind, is_voice in _SOUND_KINDS.items():
         recordings = [as_floats(sound.samples) for sound in held_out(sounds, kind)]
         if recordings:
-            yield _material(kind, recordings, is_voice=is_voice)
+            yield _label_all(kind, recordings, is_voice=is_voice)
     melodies = synthetic_sounds.melodies()
     over_music = [add_sound(melody, music, _SUNG_OVER_MUSIC_DB) for melody in melodies]
-    yield _material("melody", melodies, is_voice=True)
-    yield _material("melody, music 5 dB", over_music, is_voice=True)
-    yield _material("held vowels", synthetic_sounds.held_vowels(), is_voice=True)
-    for name, make in synthetic_sounds.WITHOUT_VOICE.items():
-        yield _material(name, [make(_SYNTHETIC_S)], is_voice=False)
+    yield _label_all("melody", melodies, is_voice=True)
+    yield _label_all("melody, music 5 dB", over_music, is_voice=True)
+    yield _label_all("held vowels", synthetic_sounds.held_vowels(), is_voice=True)
+    for name, make in synthetic_sounds.VOICELESS_SOUNDS.items():
+        yield _label_all(name, [make(_SYNTHETIC_S)], is_voice=False)
 
 
-def _material(kind: str, recordings: Iterable[Samples], *, is_voice: bool) -> Material:
-    return Material(
+def _label_all(kind: str, recordings: Iterable[Samples], *, is_voice: bool) -> LabeledAudio:
+    return LabeledAudio(
         kind, [(samples, np.full(-(-len(samples) // SLICE), is_voice)) for samples in recordings]
     )
 
@@ -97,7 +97,7 @@ def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
 
 
 def evaluate_voice(
-    models: Mapping[str, AcousticModel], materials: Iterable[Material]
+    models: Mapping[str, AcousticModel], materials: Iterable[LabeledAudio]
 ) -> dict[str, dict[str, Any]]:
     """Measure voice activity; return figures for a JSON file, by model and kind of audio.
 
