@@ -136,7 +136,8 @@ def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -
         source = raw_audio(pipe, raw := RawFormat(), name)
         source.notices.append(
             f"{name}: no sound format fits, so this is read as raw samples: 16-bit, mono,"
-            f" {raw.sample_rate_hz} Hz; for another rate use kouxing speak with --raw and --rate"
+            f" {raw.sample_rate_hz} Hz; for other samples use kouxing speak with --raw, --rate and"
+            " --channels"
         )
         return source
     begin = pipe.skip(start)

@@ -19,6 +19,7 @@ from kouxing.services.cli.options import (
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
+from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 from kouxing.shared.keys import control_endpoint
@@ -41,6 +42,13 @@ SHOWN_METRICS = {
     *("in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"),
     *("load", "network_hop", "light_sessions"),
 }
+
+Control = Annotated[
+    str,
+    typer.Option(
+        help="Address of control. Default: $KOUXING_CONTROL, or your system on this machine."
+    ),
+]
 
 
 def speak(
@@ -67,14 +75,19 @@ def speak(
         ),
     ] = "",
     raw: Annotated[
-        bool, typer.Option("--raw", help="Read raw samples: 16-bit integers, mono, little-endian.")
+        bool, typer.Option("--raw", help="Read raw samples: 16-bit integers, little-endian.")
     ] = False,
     rate: Annotated[
         int | None, typer.Option(help="Sample rate of raw samples, Hz. Default: 16000.")
     ] = None,
+    channels: Annotated[
+        int | None,
+        typer.Option(min=1, max=8, help="Number of channels of raw samples. Default: 1."),
+    ] = None,
     track: AudioTrack = None,
     mouth: MouthFile = None,
     language: Language = None,
+    control: Control = "",
 ) -> None:
     """Stream a file, a pipe, the microphone or this machine's sound to a running system."""
     from kouxing.services.cli.streaming import stream
@@ -86,14 +99,16 @@ def speak(
     profile = b"" if mouth is None else read_mouth_profile(mouth)
     if device and source not in ("mic", "monitor"):
         raise UserError("--device applies to mic and monitor: kouxing speak mic --device NAME")
-    if source in ("mic", "monitor") and (raw or rate or track):
-        raise UserError(f"--raw, --rate and --track do not apply to {source}; leave them out")
+    if source in ("mic", "monitor") and (raw or rate or channels or track):
+        raise UserError(
+            f"--raw, --rate, --channels and --track do not apply to {source}; leave them out"
+        )
     if source in ("mic", "monitor") and fast:
         raise UserError(
             f"--fast does not apply to {source}: its sound arrives in real time; leave it out"
         )
-    if rate is not None and not raw:
-        raise UserError("--rate applies to raw samples; add --raw")
+    if (rate or channels) and not raw:
+        raise UserError("--rate and --channels apply to raw samples; add --raw")
     if raw and track is not None:
         raise UserError("--track does not apply to raw samples; leave out --raw or --track")
     if source == "mic":
@@ -101,11 +116,11 @@ def speak(
     elif source == "monitor":
         audio = monitor(device)
     else:
-        raw_format = (RawFormat() if rate is None else RawFormat(rate)) if raw else None
-        audio = open_audio(Path(source), track=track, raw=raw_format)
+        raw_format = RawFormat(rate or 16_000, channels or 1)
+        audio = open_audio(Path(source), track=track, raw=raw_format if raw else None)
     summary = stream(
         audio,
-        control_address(),
+        control_address(control),
         CONSOLE,
         session=_session_name(session),
         record=record,
@@ -158,6 +173,7 @@ def listen(
     ] = None,
     alphabet: PhoneAlphabet = None,
     force: Force = False,
+    control: Control = "",
 ) -> None:
     """Print or record the output of a session until it ends.
 
@@ -167,7 +183,7 @@ def listen(
     from kouxing.services.cli.follow import follow
 
     check_output(output, force=force)
-    follow(_session_name(session), output, form, control_address(), alphabet)
+    follow(_session_name(session), output, form, control_address(control), alphabet)
 
 
 def send(
@@ -181,6 +197,7 @@ def send(
     session: Annotated[
         str, typer.Option(help="Name of the session. Default: always the newest.")
     ] = "",
+    control: Control = "",
 ) -> None:
     """Animate avatars in other programs, over VMC, Live Link Face, OSC or VTube Studio."""
     from kouxing.services.cli.send import send_to
@@ -191,7 +208,7 @@ def send(
     send_to(
         [parse_target(url) for url in targets],
         _session_name(session),
-        control_address(),
+        control_address(control),
         config.idle_motion_seed,
     )
 
@@ -209,6 +226,7 @@ def express(
         float | None,
         typer.Option(help=f"Seconds until the expressions fade. Default: {DEFAULT_HOLD_S:g}."),
     ] = None,
+    control: Control = "",
 ) -> None:
     """Show expressions on a face; without expressions, clear the current ones."""
     from kouxing.shared.control_client import connect
@@ -220,7 +238,7 @@ def express(
         raise UserError("--hold needs an expression: kouxing express joy=0.4 --hold 2")
     hold_s = DEFAULT_HOLD_S if hold is None else hold
     check_expressions(strengths, hold_s)
-    with connect(control_address()) as client:
+    with connect(control_address(control)) as client:
         all_sessions = [state.session for state in client.status().sessions]
         for name in [session] if session else ["", *all_sessions]:
             client.set_face(name, expressions=strengths, hold_s=hold_s)
@@ -234,12 +252,12 @@ def _parse_strength(text: str) -> tuple[str, float]:
         raise UserError(f"{text!r}: write NAME=STRENGTH, for example joy=0.4") from None
 
 
-def status(json_file: JsonFile = None, force: Force = False) -> None:
+def status(control: Control = "", json_file: JsonFile = None, force: Force = False) -> None:
     """Show services, sessions, rates and latencies."""
     from kouxing.shared.control_client import connect
 
     check_output(json_file, force=force)
-    with connect(control_address(), timeout_s=3.0) as client:
+    with connect(control_address(control), timeout_s=3.0) as client:
         report = client.status()
     out = Console()
     services = []
@@ -271,12 +289,12 @@ def status(json_file: JsonFile = None, force: Force = False) -> None:
     write_json(json_file, asdict(report))
 
 
-def doctor() -> None:
+def doctor(control: Control = "") -> None:
     """Check keys, addresses, clocks and versions from this machine, and print what to do."""
     from kouxing.services.cli.doctor import examine
 
     num_checks = num_failed = 0
-    for finding in examine():
+    for finding in examine(control):
         num_checks += 1
         num_failed += bool(finding.fix)
         typer.echo(f"{'FAIL' if finding.fix else 'ok  '} {finding.subject}: {finding.result}")
@@ -302,23 +320,24 @@ def _is_drop_counter(name: str) -> bool:
     return name.startswith("dropped_") and not name.endswith("_per_s")
 
 
-def control_address() -> str:
+def control_address(address: str) -> str:
     """Return the address of control, followed by its public key unless connections are insecure.
 
-    Without a setting, it is the address of the user's newest system.
+    Without ``address`` and a setting, it is the address of the user's newest system.
     """
-    running, config = find_system()
+    running, config = find_system(address)
     return running or control_endpoint(config.control, insecure=config.insecure)
 
 
-def find_system() -> tuple[str, ServiceConfig]:
+def find_system(address: str) -> tuple[str, ServiceConfig]:
     """Return control's endpoint in the user's newest system, if it applies, and the settings."""
-    settings = read_settings()
-    keys = {setting.key: setting for setting in settings.describe(ServiceConfig)}
+    if address:
+        split_endpoint(address, "--control")
+    settings, overrides = read_settings(), {"control": address} if address else {}
+    keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
     running = find_control() if keys["control"].is_default else ""
-    config = settings.load(ServiceConfig)
+    config = settings.load(ServiceConfig, overrides)
     if "*" in config.control:
-        raise UserError(
-            f"common.control: {config.control!r} is not a host and port; write tcp://HOST:PORT"
-        )
+        key = "--control" if address else "common.control"
+        raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
     return running, config

@@ -35,9 +35,9 @@ class CheckResult(NamedTuple):
     fix: str = ""  # empty: the check passed
 
 
-def examine() -> Iterator[CheckResult]:
-    """Yield the result of each check."""
-    control, config = find_system()
+def examine(address: str) -> Iterator[CheckResult]:
+    """Yield the result of each check; if ``address`` is empty, control is the configured one."""
+    control, config = find_system(address)
     control = control or config.control
     endpoint_address = control.partition(" ")[0]
     if reason := reach_error(*split_endpoint(endpoint_address, "control"), is_zeromq=True):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kouxing.services.cli.heads import ensure_page_heads
-from kouxing.services.cli.options import ConfigFile, HeadName, ServiceAssignments
+from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, ServiceAssignments
 from kouxing.services.cli.running_system import announce, find_control, reserve, starting
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
@@ -43,6 +43,7 @@ def run(
     play: Annotated[
         Path | None, typer.Option(help="Play this file first, and record it as out/demo.mp4.")
     ] = None,
+    track: AudioTrack = None,
     stop_after: Annotated[
         bool, typer.Option("--stop-after", help="Stop after playing the file.")
     ] = False,
@@ -56,8 +57,8 @@ def run(
         typer.Option(
             min=1,
             max=64,
-            help="Number of recognizers, and of synthesizers; with two or more, another one takes"
-            " over immediately if one fails.",
+            help="Number of recognizers, and of synthesizers. With two or more, another worker"
+            " takes over immediately if one fails.",
         ),
     ] = 1,
     assignments: ServiceAssignments = None,
@@ -65,8 +66,8 @@ def run(
     """Run all services on this machine, and restart any that crashes or hangs."""
     from kouxing.services.cli.supervisor import Supervisor
 
-    if play is None and stop_after:
-        raise UserError("--stop-after needs a file: kouxing run --play my.wav --stop-after")
+    if play is None and (stop_after or track is not None):
+        raise UserError("--stop-after and --track need a file: kouxing run --play my.wav")
     chosen_port = {} if port is None else {"gateway.port": str(port)}
     given = parse_assignments(assignments or []) | chosen_port
     settings = read_settings(config, given)
@@ -74,7 +75,7 @@ def run(
         settings.load(kind.config_type)  # if a key is wrong, nothing starts
     driver = settings.load(DriverConfig)
     out = Path(driver.out)
-    sample = None if play is None else _open_sample(play, out / f"{_SAMPLE_SESSION}.mp4")
+    sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
     reservation = _enter(reserve(out))
     arguments = ["--config", str(config)] if config else []
     startup = _enter(starting(lambda: print_message("waiting until another kouxing has started")))
@@ -212,13 +213,13 @@ def _open_browser(page: str) -> None:
         webbrowser.open(page)
 
 
-def _open_sample(path: Path, video: Path) -> AudioSource:
+def _open_sample(path: Path, track: int | None, video: Path) -> AudioSource:
     """Open the file to play, and remove the video of the last one."""
     from kouxing.shared.audio_file import open_audio
 
     if video.exists() and video.samefile(path):
         raise UserError(f"{path}: the video would overwrite this file; rename it first")
-    sample = open_audio(path)
+    sample = open_audio(path, track=track)
     video.unlink(missing_ok=True)
     return sample
 

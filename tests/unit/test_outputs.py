@@ -129,7 +129,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("speak a.wav --rate 8000", "--rate applies to raw samples; add --raw"),
+        ("speak a.wav --rate 8000", "--rate and --channels apply to raw samples; add --raw"),
         ("speak a.wav --raw --track 2", "--track does not apply to raw samples"),
         ("speak a.wav --device USB", "--device applies to mic and monitor"),
         ("speak mic --fast", "--fast does not apply to mic"),

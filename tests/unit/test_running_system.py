@@ -38,17 +38,17 @@ def test_finds_the_newest_running_system_even_if_others_were_killed(
     assert find_control() == ""
 
 
-def test_a_setting_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:
     with announce("tcp://127.0.0.1:1"):
-        assert control_address() == "tcp://127.0.0.1:1"
+        assert control_address("") == "tcp://127.0.0.1:1"
         key = user_key().control
+        assert control_address("tcp://127.0.0.1:4") == f"tcp://127.0.0.1:4 {key}"
         monkeypatch.setenv("KOUXING_CONTROL", "tcp://127.0.0.1:5")
-        assert control_address() == f"tcp://127.0.0.1:5 {key}"
+        assert control_address("") == f"tcp://127.0.0.1:5 {key}"
         monkeypatch.setenv("KOUXING_INSECURE", "true")
-        assert control_address() == "tcp://127.0.0.1:5"
-    monkeypatch.setenv("KOUXING_CONTROL", "localhost")
-    with pytest.raises(UserError, match=r"from \$KOUXING_CONTROL\) is not an endpoint"):
-        control_address()
+        assert control_address("") == "tcp://127.0.0.1:5"
+    with pytest.raises(UserError, match="--control: 'localhost' is not an endpoint"):
+        control_address("localhost")
 
 
 def test_ignores_a_folder_that_others_can_write_to(tmp_path: Path) -> None:
