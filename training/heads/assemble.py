@@ -13,6 +13,7 @@ from scipy import interpolate, ndimage, spatial
 
 from kouxing.shared.face.faps import FAPS
 from kouxing.training.heads import fitted_mesh, paint, parts, subdivision, textures
+from kouxing.training.heads.hair import hair_piece, strand_texture
 from kouxing.training.heads.makehuman import PIVOT, MakeHuman
 from kouxing.training.heads.measures import (
     eye_centers,
@@ -52,17 +53,7 @@ LEFT_LOWER_LID = (
 
 _SIDES = ("Left", "Right")
 _PAINTED_HAIR = "large/young_caucasian_female_special_suit.png"
-_HAIR_TEXTURES = {"afro01": "afro"}
-# styles with a fringe over the right eye: its distance from the head's axis at the side, dm, and
-# the fraction by which it is lifted off the forehead
-_FRINGES = {"bob01": (0.73, 0.0), "bob02": (0.73, 0.03)}
-_SOFT_EDGE = 7  # texels across the edges of strands that may blend
-_COARSE_HAIR = 1800  # quads; hair with fewer quads is subdivided
-# quads; smaller strands of these styles hang in front of the skin, and are removed
-_LOOSE_STRANDS = {"bob01": 60, "bob02": 60, "short04": 10}
-_SWEEP = 0.62  # fraction of the angle to the right ear by which it is turned
 _BROW_RAISE = 0.016  # how far the inner ends rise, dm
-_WIDEST_HAIR = 5.9  # height, dm
 _HAIR_HEIGHT = 0.45  # above the scalp, dm
 _TEAR_HEIGHT = 0.006  # of the wet line above the lower lid, dm
 _TEAR_REACH = 1.015  # distance of its edge from the eye's center, in radii of the eyeball
@@ -123,8 +114,9 @@ class HeadBuilder:
         skin = self._skin(vertices)
         fapu = measure_fapu(skin, vertices, self._mesh)
         face = {fap: field * fapu[FAPS[fap - 1].fapu] for fap, field in self._unit_fields.items()}
-        strands = self._strands(person)
-        hair = self._hair(vertices, person, strands[..., 1])
+        strands = strand_texture(self._folder, person)
+        right_eye = eye_centers(vertices, self._mesh)[1]
+        hair = hair_piece(self._folder, person, vertices, right_eye, strands[..., 1])
         pieces = [
             self._skin_piece(skin, face),
             self._garment(vertices),
@@ -218,71 +210,6 @@ class HeadBuilder:
                 person.upper_teeth_offset if is_upper else person.lower_teeth_offset
             )
         return pieces
-
-    def _strands(self, person: Person) -> Float:
-        """Return the texture of the hair (H, W, 2); the strands of gray hair differ less."""
-        style = person.hair
-        file = f"hair/{style}/{_HAIR_TEXTURES.get(style, style)}_diffuse.png"
-        contrast = 0.5 if person.look.cel else 1.5 - np.mean(person.look.hair)
-        return textures.strands(textures.load(self._folder, file), float(contrast))
-
-    def _hair(self, vertices: Float, person: Person, alpha: Float) -> HeadPiece:
-        """Fit the hair, with its triangles in the order in which they are drawn.
-
-        Opaque triangles come first, from the outside inward, so that they hide others before these
-        are shaded. Translucent ones follow from the inside outward, so that outer strands blend
-        over inner ones. Triangles without strands are removed; they would cast shadows. ``alpha``
-        (H, W) is the alpha channel of the texture.
-        """
-        hair = fitted_mesh.read(self._folder, f"hair/{person.hair}/{person.hair}")
-        points = hair.fit(vertices)
-        # a crown that narrows evenly toward its top looks pointed
-        height = (points[:, 1] - _WIDEST_HAIR) / (points[:, 1].max() - _WIDEST_HAIR)
-        crown = 1 + person.crown * np.sin(np.pi * np.clip(height, 0, 1) ** 1.7)
-        points[:, 0] *= person.hair_width * crown
-        if person.hair in _FRINGES:
-            points = self._swept_aside(points, vertices, *_FRINGES[person.hair])
-        quads, uv, welds = hair.quads, hair.uv, hair.welds
-        if person.hair in _LOOSE_STRANDS:
-            size = subdivision.patch_sizes(welds[quads])
-            quads = quads[size >= _LOOSE_STRANDS[person.hair]]
-        if len(quads) < _COARSE_HAIR:
-            points, quads, uv, welds = subdivision.smooth_strands(points, quads, uv, welds)
-        triangles = subdivision.triangles_of(quads)
-        triangles = triangles[(textures.sample_alpha(triangles, uv, alpha) > 0.25).any(axis=1)]
-        inner = ndimage.minimum_filter(alpha, _SOFT_EDGE)
-        opaque = (textures.sample_alpha(triangles, uv, inner) > 0.9).all(axis=1)
-        middle = points[triangles].mean(axis=1) - PIVOT
-        outward = np.hypot(middle[:, 0], middle[:, 2]) + middle[:, 2]
-        triangles = triangles[np.lexsort([np.where(opaque, -outward, outward), ~opaque])]
-        used, triangles, welds = subdivision.used_vertices(triangles, welds)
-        color = np.tile(textures.tint(person.look.hair), (len(used), 1))
-        part = parts.Geometry(points[used], triangles, uv[used], color, welds)
-        return HeadPiece("hair", part, "hair", 0.6, np.ones(len(used)))
-
-    def _swept_aside(self, points: Float, vertices: Float, width: float, lifted: float) -> Float:
-        """Turn a fringe that covers the right eye to the side, and lift it off the forehead."""
-        eye = eye_centers(vertices, self._mesh)[1]
-        x, y, z = points.T
-        depth = z - paint.AXIS_Z
-        turn = np.arctan2(x, depth)
-        low = np.clip((eye[1] + 0.55 - y) / 0.5, 0, 1)
-        low = low * low * (3 - 2 * low)
-        swept_part = np.clip(turn + np.pi / 2, 0, None) * np.clip((0.6 - turn) / 0.6, 0, 1) * low
-        turned = turn - _SWEEP * swept_part
-
-        def reach(angle: Float) -> Float:
-            return 1 / np.hypot(np.sin(angle) / width, np.cos(angle) / 1.0)
-
-        radius = np.hypot(x, depth) * reach(turned) / reach(turn)
-        swept = np.stack([radius * np.sin(turned), y, paint.AXIS_Z + radius * np.cos(turned)], 1)
-        swept = np.where((swept_part > 0)[:, None], swept, points)
-        x, depth = swept[:, 0], swept[:, 2] - paint.AXIS_Z
-        front = np.clip((1.3 - np.abs(np.arctan2(x, depth) + 0.2)) / 0.5, 0, 1)
-        above = y - eye[1]
-        front *= np.clip((1.0 - above) / 0.4, 0, 1) * np.clip((above + 0.2) / 0.3, 0, 1)
-        outward = (lifted * front)[:, None] * np.stack([x, np.zeros_like(x), depth], axis=1)
-        return np.asarray(swept + outward)
 
     def _brows(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the brows, and raise their inner ends; they follow the skin below them."""
