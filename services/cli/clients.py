@@ -46,7 +46,9 @@ SHOWN_METRICS = {
 Control = Annotated[
     str,
     typer.Option(
-        help="Address of control. Default: $KOUXING_CONTROL, or your system on this machine."
+        metavar="ADDRESS",
+        help="Address of control, tcp://HOST:PORT. Default: $KOUXING_CONTROL, or your system on"
+        " this machine.",
     ),
 ]
 

@@ -49,8 +49,8 @@ Language = Annotated[
     typer.Option(
         "--language",
         callback=_find_language,
-        help=f"Language of the speech: {', '.join(language_codes())}, or an installed language."
-        " auto: any language. Default: zh.",
+        help=f"Language of the speech: {', '.join(language_codes())}, or an installed language;"
+        " auto is any language. Default: zh.",
     ),
 ]
 PhoneAlphabet = Annotated[
