@@ -315,7 +315,7 @@ def report(
         typer.Option(help="Folder of the audio files that corpora/languages.tsv lists."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Use parts of the data; ten minutes.")
+        bool, typer.Option("--quick", help="Measure parts of the data, in about ten minutes.")
     ] = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Also run steps that are up to date.")
@@ -360,7 +360,7 @@ def schemes(
         list[str] | None, typer.Option(help="Lip model; repeatable. Default: all.")
     ] = None,
     paper_rule: Annotated[
-        bool, typer.Option("--paper-rule", help="Phones as in the paper: N = 3, no corrections.")
+        bool, typer.Option("--paper-rule", help="Use the paper's rule for phones: N = 3, no corrections.")
     ] = False,
     videos: Annotated[
         Path | None, typer.Option(help="Folder for CONDITION/SENTENCE.mp4; skips existing files.")

@@ -24,10 +24,13 @@ OptionalCorpora = Annotated[list[Path] | None, _CORPORA]
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write.")]
 PhoneLm = Annotated[
     Path | None,
-    typer.Option(help="Phone language model: phone_lm.npz, or the file of an acoustic model."),
+    typer.Option(
+        help="Phone language model, phone_lm.npz or an acoustic model. Default: counted on the"
+        " corpora."
+    ),
 ]
 Whisper = Annotated[
-    Path, typer.Option(help="Folder of Whisper base for faster-whisper, for its encoder.")
+    Path, typer.Option(help="Folder of the model Whisper base, in the format of faster-whisper.")
 ]
 StartFrom = Annotated[
     Path | None,
