@@ -360,7 +360,8 @@ def schemes(
         list[str] | None, typer.Option(help="Lip model; repeatable. Default: all.")
     ] = None,
     paper_rule: Annotated[
-        bool, typer.Option("--paper-rule", help="Use the paper's rule for phones: N = 3, no corrections.")
+        bool,
+        typer.Option("--paper-rule", help="Use phones as in the paper: N = 3, no corrections."),
     ] = False,
     videos: Annotated[
         Path | None, typer.Option(help="Folder for CONDITION/SENTENCE.mp4; skips existing files.")
