@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from kouxing.services.recognizer.onnx_session import open_network
+from kouxing.services.recognizer.onnx_session import create_inference_session
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -50,8 +50,8 @@ class FaceMesh:
     """Tracks the face in the images of a video."""
 
     def __init__(self) -> None:
-        self._detector = open_network((_MODELS / "face_detector.onnx").read_bytes())
-        self._mesh = open_network((_MODELS / "face_mesh.onnx").read_bytes())
+        self._detector = create_inference_session((_MODELS / "face_detector.onnx").read_bytes())
+        self._mesh = create_inference_session((_MODELS / "face_mesh.onnx").read_bytes())
         self._anchors = _anchors()
         self._face: _Square | None = None  # in the last image
 

@@ -28,7 +28,7 @@ from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import lip_tracks
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_text
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
@@ -285,4 +285,4 @@ def label_clips(model: AcousticModel, clips: Iterable[LipClip]) -> dict[str, lis
 
 def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
     """Find the phones of a clip: aligned if its text is known, otherwise recognized."""
-    return aligned_phones(model, clip) or recognize(model, clip.samples, SAMPLE_RATE_HZ)
+    return aligned_phones(model, clip) or recognize_recording(model, clip.samples, SAMPLE_RATE_HZ)

@@ -14,7 +14,7 @@ from kouxing.corpora.face_mesh import FaceMesh
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
 from kouxing.services.driver import picture
 from kouxing.services.mono_audio import read_mono_16k
-from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, mouth_faps
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, expand_mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.shared.audio_file import MAX_FILE_BYTES, check_video

@@ -12,7 +12,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline import WithProgress
+from kouxing.services.recognizer.offline_recognition import WithProgress
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.synthesizer.config import SynthesizerConfig

@@ -22,7 +22,7 @@ from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.front_end.pcm import SliceMeter
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.offline import WithProgress
+from kouxing.services.recognizer.offline_recognition import WithProgress
 from kouxing.services.recognizer.speech_segmenter import (
     SpeechEnd,
     SpeechItem,

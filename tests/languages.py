@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
-from kouxing.services.recognizer.search.phone_lm import Graph, PhoneLanguageModel
+from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSITIONS, Topology
+from kouxing.services.recognizer.search.phone_lm import ContextGraph, PhoneLanguageModel
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
 MANDARIN = load_inventory("mandarin")
@@ -119,7 +119,7 @@ def random_topology(
 ) -> Topology:
     """Draw HMMs; without a language, all phones are equally likely."""
     stay = rng.uniform(0.2, 0.8, NUM_PHONES * states_per_phone)
-    duration_s = np.full((NUM_POSITIONS, NUM_PHONES), 0.1, np.float32)
+    duration_s = np.full((NUM_PHRASE_POSITIONS, NUM_PHONES), 0.1, np.float32)
     return Topology(
         first_state=np.arange(NUM_PHONES + 1) * states_per_phone,
         log_stay=np.log(stay).astype(np.float32),
@@ -130,7 +130,7 @@ def random_topology(
     )
 
 
-def step(graph: Graph, context: int, phone: int) -> tuple[float, int]:
+def step(graph: ContextGraph, context: int, phone: int) -> tuple[float, int]:
     """Return a phone's log-probability after a context, and the next context, by the graph."""
     total = 0.0
     while True:

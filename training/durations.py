@@ -19,7 +19,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST, NUM_POSITIONS
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AFTER_PAUSE,
+    BEFORE_PAUSE,
+    NUM_PHRASE_POSITIONS,
+    WITHIN_PHRASE,
+)
 from kouxing.services.recognizer.front_end.features import HOP_S
 from kouxing.services.recognizer.search.decoder import PathSegment
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -31,7 +36,7 @@ _UNSEEN_MEAN_FRAMES, _UNSEEN_SPREAD_FRAMES = 10.0, 5.0  # for a phone without da
 
 
 def positions_of(phones: Sequence[int], silence: int) -> list[int]:
-    """Return ``FIRST``, ``INSIDE`` or ``LAST`` for each phone between two pauses.
+    """Return each phone's place between two pauses, such as ``AFTER_PAUSE``.
 
     For a pause (``silence``), the position refers to the whole recording.
     """
@@ -40,7 +45,9 @@ def positions_of(phones: Sequence[int], silence: int) -> list[int]:
         before = phones[number - 1] if number else None
         after = phones[number + 1] if number + 1 < len(phones) else None
         edges = (None,) if phone == silence else (None, silence)
-        positions.append(LAST if after in edges else FIRST if before in edges else INSIDE)
+        positions.append(
+            BEFORE_PAUSE if after in edges else AFTER_PAUSE if before in edges else WITHIN_PHRASE
+        )
     return positions
 
 
@@ -50,7 +57,7 @@ class PhoneDurations:
     def __init__(self, inventory: PhoneInventory) -> None:
         self._silence = inventory.index[inventory.silence]
         # weighted sums of 1, frames and frames^2
-        self._sums = np.zeros((3, NUM_POSITIONS, len(inventory)))
+        self._sums = np.zeros((3, NUM_PHRASE_POSITIONS, len(inventory)))
 
     def add(self, aligned: Sequence[PathSegment], weight: float) -> None:
         """Add the phones of one recording in order, including pauses."""

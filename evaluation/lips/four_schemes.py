@@ -29,7 +29,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
@@ -126,7 +126,7 @@ def recognize_all(
             tested.name: RecognizerOutput(
                 analyze_recording(
                     samples,
-                    recognize(tested.model, samples, MEDIA_RATE_HZ),
+                    recognize_recording(tested.model, samples, MEDIA_RATE_HZ),
                     lips,
                     is_text_known=False,
                 ),

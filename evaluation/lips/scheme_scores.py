@@ -32,7 +32,7 @@ from kouxing.evaluation.lips.four_schemes import (
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
 from kouxing.services.lip_models import lip_model_info
-from kouxing.services.recognizer.alignment import spoken
+from kouxing.services.recognizer.alignment import drop_pauses
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent

@@ -35,10 +35,10 @@ from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_syllables, spoken
+from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, load_table
@@ -158,8 +158,8 @@ def _syllables_and_phones(
         with contextlib.suppress(UserError):  # a transcript with words in another language
             syllables = model.inventory.pronounce(clip.transcript)
             phones = align_syllables(model, samples, SAMPLE_RATE_HZ, syllables).phones
-            return syllables, spoken(phones, model.inventory)
-    phones = spoken(recognize(model, samples, SAMPLE_RATE_HZ), model.inventory)
+            return syllables, drop_pauses(phones, model.inventory)
+    phones = drop_pauses(recognize_recording(model, samples, SAMPLE_RATE_HZ), model.inventory)
     groups = group_syllables(phones, model.inventory)
     return [tuple(phone.symbol for phone in group) for group in groups], phones
 

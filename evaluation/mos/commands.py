@@ -54,10 +54,10 @@ def heads(
     """Create a study of the built-in heads, with a one-minute video of each head."""
     from kouxing.evaluation.head_videos import write_head_videos
     from kouxing.evaluation.mos.study import check_no_study, new_study
-    from kouxing.services.recognizer.acoustic.languages import model_of_language
+    from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 
     check_no_study(folder)
-    write_head_videos(folder, model_of_language(language), recordings)
+    write_head_videos(folder, load_model_for_language(language), recordings)
     study = new_study(folder)
     count = plural(len(study.conditions), "head")
     print_message(f"created a study of {count}; next: kouxing mos serve {folder}")

@@ -40,7 +40,7 @@ from kouxing.evaluation.recognizer.disturbances import CLEAN, Disturb
 from kouxing.evaluation.recognizer.labials import LabialCounts
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.alignment import spoken
+from kouxing.services.recognizer.alignment import drop_pauses
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
@@ -219,8 +219,8 @@ def recognize_live(
     known: set[int] = set()
     for time_s, scores in scored:
         events = decoder.decode(scores)
-        first = spoken(first_hypothesis(events, known), model.inventory)
+        first = drop_pauses(first_hypothesis(events, known), model.inventory)
         out.first.extend(first)
         out.emitted_s.extend([time_s] * len(first))
-        out.final.extend(spoken(final_hypothesis(events), model.inventory))
+        out.final.extend(drop_pauses(final_hypothesis(events), model.inventory))
     return out

@@ -35,7 +35,7 @@ from kouxing.evaluation.recognizer.error_rates import (
 )
 from kouxing.evaluation.rivals.tables import FOLDER, find_installed
 from kouxing.evaluation.tables import percent
-from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
@@ -93,10 +93,10 @@ def _code_of(reference: AlignedRecording) -> str:
 def _recognitions(
     reference: AlignedRecording, rule: OutputRuleConfig
 ) -> Iterator[tuple[str, Recognition]]:
-    samples, universal = reference.read_audio(), model_of_language(UNIVERSAL)
+    samples, universal = reference.read_audio(), load_model_for_language(UNIVERSAL)
     scored = score_live(universal, samples)
     yield AUTO, recognize_live(universal, scored, rule)
-    own_model = model_of_language(find_language(_code_of(reference)))
+    own_model = load_model_for_language(find_language(_code_of(reference)))
     if own_model.inventory.language == UNIVERSAL:
         yield OWN, recognize_live(own_model, scored, rule)
         return

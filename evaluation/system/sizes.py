@@ -14,7 +14,7 @@ from kouxing_client.messages import encode
 from rich.console import Console
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.load import MODELS, load_model
+from kouxing.services.recognizer.acoustic.load import MODELS_FOLDER, load_model
 from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.terminal import print_table
@@ -48,14 +48,16 @@ def measure() -> Sizes:
     """Measure sizes and the rate of the matrix product."""
     blocks = load_model("blocks")
     assert isinstance(blocks, BlockModel)  # noqa: S101 - the file of this name is one
-    sizes = blocks.session.sizes
+    sizes = blocks.runner.sizes
     encoder_bytes = len(np.load(ENCODER_PATH, allow_pickle=False)["network"])
     weighted_positions = {  # weights are bytes; positions per second of speech
         _BLOCKS: len(blocks.network) * sizes.length * _POSITIONS_PER_S / sizes.block,
         _ENCODER: encoder_bytes * _POSITIONS_PER_S,
     }
     return Sizes(
-        model_bytes={path.stem: path.stat().st_size for path in sorted(MODELS.glob("*.npz"))},
+        model_bytes={
+            path.stem: path.stat().st_size for path in sorted(MODELS_FOLDER.glob("*.npz"))
+        },
         frame_bytes=sum(map(len, _frame_message())),
         gemm_gflops=_gemm_gflops(),
         network_gflop_per_s={

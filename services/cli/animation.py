@@ -19,11 +19,11 @@ from kouxing.services.driver.video.time_stretch import stretch
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.alignment import align_syllables
 from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -149,7 +149,7 @@ def animate(
                 transcript = None
         if phones is None:
             with_progress = partial(progress.track, description="recognizing")
-            phones = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+            phones = recognize_recording(model, samples, MEDIA_RATE_HZ, with_progress)
         with_progress = partial(progress.track, description="finding the lips")
         recording = analyze_recording(
             samples,
@@ -180,7 +180,7 @@ def animate(
 @lru_cache(maxsize=1)
 def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, LipPredictor | None]:
     """Load the models once for all files of a command."""
-    model = model_of_language(language)
+    model = load_model_for_language(language)
     return model, _load_lip_predictor(mouth)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from kouxing.services.cli.options import CaptionKind
 from kouxing.services.driver.render.captions import Caption, Captions
-from kouxing.services.recognizer.alignment import timed_syllables
+from kouxing.services.recognizer.alignment import find_syllable_times
 from kouxing.shared.errors import UserError
 from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
 from kouxing.shared.phones.events import Phone
@@ -31,7 +31,7 @@ def write_syllables(
     if transcript is None:
         return [_syllable_of(group, inventory) for group in group_syllables(phones, inventory)]
     syllables = []
-    for timed in timed_syllables(phones, transcript, inventory):
+    for timed in find_syllable_times(phones, transcript, inventory):
         spelling = inventory.write(timed.spelling)
         text = timed.text if inventory.readable.search(timed.text) else spelling
         syllables.append(replace(timed, text=text, spelling=spelling))

@@ -21,11 +21,11 @@ from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_mismatch
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
-from kouxing.services.recognizer.acoustic.languages import model_of_language
-from kouxing.services.recognizer.alignment import align_syllables, spoken
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
+from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline import WithProgress, recognize
+from kouxing.services.recognizer.offline_recognition import WithProgress, recognize_recording
 from kouxing.services.recognizer.transcriber import Transcriber
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -138,7 +138,7 @@ def draw_mouth(
         timed = _time_phones(source, samples, transcript, timing, inventory, with_progress)
         with_progress = partial(progress.track, description="finding the width")
         widths = _widths(lips, samples, timed, inventory, with_progress)
-    phones = spoken(timed, inventory)
+    phones = drop_pauses(timed, inventory)
     if not phones:
         print_message(f"{source}: no speech was found; the mouth stays closed")
     mouth = _Mouth(
@@ -170,9 +170,9 @@ def _time_phones(
         if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
             print_mismatch(source, f"the speech is {ratio:.1f} times the text's usual duration")
         return phones
-    model = model_of_language(inventory.language)
+    model = load_model_for_language(inventory.language)
     if transcript is None:
-        return recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+        return recognize_recording(model, samples, MEDIA_RATE_HZ, with_progress)
     alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     report_mismatch(source, alignment)
     return alignment.phones

@@ -232,8 +232,8 @@ def phones(
     """Recognize the phones of audio files, with their times."""
     with show_loading():
         from kouxing.services.mono_audio import read_mono_16k
-        from kouxing.services.recognizer.acoustic.languages import model_of_language
-        from kouxing.services.recognizer.offline import recognize
+        from kouxing.services.recognizer.acoustic.languages import load_model_for_language
+        from kouxing.services.recognizer.offline_recognition import recognize_recording
         from kouxing.shared.clock import MEDIA_RATE_HZ
         from kouxing.shared.phones.alphabets import respell
         from kouxing.shared.phones.phone_files import format_phones
@@ -247,14 +247,14 @@ def phones(
         pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
     check_output(*(target for _, target in pairs), inputs=audio, force=force)
     with show_loading():
-        model = model_of_language(language, acoustic)
+        model = load_model_for_language(language, acoustic)
 
     def recognize_file(source: Path, target: Path | None) -> None:
         with open_progress() as progress:
             samples = read_mono_16k(source, track, progress)
             duration_s = len(samples) / MEDIA_RATE_HZ
             with_progress = partial(progress.track, description="recognizing")
-            recognized = recognize(model, samples, MEDIA_RATE_HZ, with_progress)
+            recognized = recognize_recording(model, samples, MEDIA_RATE_HZ, with_progress)
         if not recognized:
             print_message(f"{source}: no speech was found")
         written = [*respell(recognized, model.inventory, alphabet)]
@@ -283,8 +283,8 @@ def align(
     with show_loading():
         from kouxing.services.cli.spoken_text import read_text, report_mismatch
         from kouxing.services.mono_audio import read_mono_16k
-        from kouxing.services.recognizer.acoustic.languages import model_of_language
-        from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
+        from kouxing.services.recognizer.acoustic.languages import load_model_for_language
+        from kouxing.services.recognizer.alignment import align_syllables, find_syllable_times
         from kouxing.shared.clock import MEDIA_RATE_HZ
         from kouxing.shared.phones.alphabets import respell
         from kouxing.shared.phones.inventory import load_inventory
@@ -293,14 +293,14 @@ def align(
     style = _format(form, output)
     check_output(output, inputs=[audio, Path(text)], force=force)
     with show_loading():
-        model = model_of_language(language, acoustic)
+        model = load_model_for_language(language, acoustic)
         transcript = read_text(text, load_inventory(language or model.inventory.language))
     with open_progress() as progress:
         samples = read_mono_16k(audio, track, progress)
         with_progress = partial(progress.track, description="aligning")
         alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
     duration_s = len(samples) / MEDIA_RATE_HZ
-    syllables = timed_syllables(alignment.phones, transcript, model.inventory)
+    syllables = find_syllable_times(alignment.phones, transcript, model.inventory)
     written = [*respell(alignment.phones, model.inventory, alphabet)]
     write_output(format_phones(written, style, duration_s, syllables), output)
     report_mismatch(audio, alignment)

@@ -35,7 +35,7 @@ from kouxing.services.recognizer import (
 )
 from kouxing.services.recognizer.acoustic import blocks, model_file, network
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
-from kouxing.services.recognizer.acoustic.light import light_model_from
+from kouxing.services.recognizer.acoustic.light import parse_light_model
 from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end import pcm, resample, vad, whisper_mel
@@ -136,7 +136,7 @@ def web_model() -> dict[str, bytes]:
         gram, right = shape_set.equation
         arrays |= {f"shapes.{name}.gram": gram, f"shapes.{name}.right": right}
     block_archive = read_archive(model_path("blocks"))
-    light = light_model_from(block_archive)
+    light = parse_light_model(block_archive)
     topology = light.topology
     phone_arrays: dict[str, NDArray[Any]] = {
         **{

@@ -81,7 +81,7 @@ _CLOSED_FRACTION_SPEAKING = 0.08  # the same fraction, without silent frames
 _MIN_NEUTRAL = 5  # frames
 
 
-def mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array:
+def expand_mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array:
     """Compute the FAPs of a mouth relative to its own neutral face, FAP units, (n, 28).
 
     ``landmarks`` are ``LANDMARKS`` of each frame, pixels, (n, 43, 3). ``level_db`` are the audio

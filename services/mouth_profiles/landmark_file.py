@@ -14,7 +14,7 @@ every size.
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, mouth_faps
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, expand_mouth_faps
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import level_track, lip_tracks
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -38,7 +38,7 @@ def parse_landmark_file(content: bytes) -> FilmedSpeech:
     except ValueError as error:
         raise UserError(str(error)) from error
     levels = np.array(level_track(samples))
-    faps = mouth_faps(landmarks, np.interp(time_s, levels[:, 0], levels[:, 1]))
+    faps = expand_mouth_faps(landmarks, np.interp(time_s, levels[:, 0], levels[:, 1]))
     return FilmedSpeech(samples=samples, frame_s=time_s, lip_track=lip_tracks(faps))
 
 

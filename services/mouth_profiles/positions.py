@@ -10,7 +10,7 @@ from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lip_predictor import features_at
+from kouxing.services.recognizer.lip_predictor import join_features
 from kouxing.services.recognizer.speech_segmenter import SpeechSegmenter
 from kouxing.shared.phones.events import LipPositions
 
@@ -32,7 +32,7 @@ class LipInputs:
     ) -> list[LipPositions]:
         """Store the encoder's features at a position."""
         self.known_s.append(known_s)
-        self.features.append(features_at(frames, features).astype(np.float16))
+        self.features.append(join_features(frames, features).astype(np.float16))
         return []
 
     def reset(self) -> None:

@@ -1,1 +1,1 @@
-"""Recognizer: audio chunks in, phones with times out."""
+"""The recognizer service: turns audio chunks into phones with times."""

@@ -3,8 +3,9 @@
 The alignment is the acoustic model's best path through the text's phones, with optional pauses at
 syllable boundaries. Li et al. 2011, section 3.2, scheme 1, used HTK for this.
 
-There is a path for any text. Its *fit* shows whether the text was spoken: one minus the score that
-the path loses to the best phone of every frame, relative to the loss of an average phone.
+Any text has a best path. Its *fit* shows whether the text was spoken: one minus the path's loss,
+relative to the loss of an average phone. The loss is the score difference to the best phone of
+each frame.
 """
 
 from collections.abc import Sequence
@@ -18,15 +19,15 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, F
 from kouxing.services.recognizer.front_end.features import (
     HOP_S,
     SAMPLE_RATE_HZ,
+    count_frames,
     frame_time_s,
-    frames_in,
 )
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.services.recognizer.offline import WithProgress
+from kouxing.services.recognizer.offline_recognition import WithProgress
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
+    build_utterance_graph,
     segments_of_path,
-    utterance_graph,
     viterbi_path,
 )
 from kouxing.shared.errors import UserError
@@ -36,15 +37,15 @@ from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 
 # Calibrated with the block model on dev sentences and conversation; see docs/recognition.md.
 MIN_FIT = 0.85
-_FIT_FRAMES = 10_000  # to compare at once
+_FIT_FRAMES = 10_000  # frames compared at once, to limit memory
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """A text in a recording."""
+    """The phones of a text, aligned with a recording."""
 
     phones: list[Phone]  # all phones and pauses in order, from start to end
-    fit: float  # 1: every phone is the best one; 0: any other phones fit as well
+    fit: float  # 1: every phone is the best one; 0: an average phone fits equally well
 
     @property
     def fits(self) -> bool:
@@ -76,19 +77,19 @@ def align_syllables(
     syllables: Sequence[Syllable],
     with_progress: WithProgress = iter,
 ) -> Alignment:
-    """Like :func:`align_text`, for known syllables, with the fit.
+    """Align known syllables like :func:`align_text`, and compute the fit.
 
-    ``with_progress`` shows the progress.
+    ``with_progress`` wraps the loop to show progress.
     """
     inventory, topology = model.inventory, model.topology
     silence = inventory.index[inventory.silence]
-    graph = utterance_graph(
+    graph = build_utterance_graph(
         [inventory.index[symbol] for syllable in syllables for symbol in syllable],
         [len(syllable) for syllable in syllables],
         topology.first_state,
         silence=silence,
     )
-    num_frames = frames_in(-(-len(samples) * SAMPLE_RATE_HZ // sample_rate_hz))
+    num_frames = count_frames(-(-len(samples) * SAMPLE_RATE_HZ // sample_rate_hz))
     if num_frames < graph.num_needed[0]:
         raise UserError(
             f"{num_frames * HOP_S:.2f} s of audio is too short for the phones of the text,"
@@ -100,8 +101,8 @@ def align_syllables(
     for segment in segments_of_path(path, graph):
         onset_s = frame_time_s(segment.start)
         # posterior of the phone, if one phone fills these frames
-        best_of_phones = _best_of_phones(scores[segment.start : segment.end], topology)
-        evidence = best_of_phones.sum(axis=0, dtype=np.float64)
+        best_scores = _best_phone_scores(scores[segment.start : segment.end], topology)
+        evidence = best_scores.sum(axis=0, dtype=np.float64)
         likelihood = np.exp(evidence - evidence.max())
         phones.append(
             Phone(
@@ -123,7 +124,7 @@ def _score_recording(
     num_frames: int,
     with_progress: WithProgress,
 ) -> Floats:
-    """Return the scores of all frames, (frames, states), computed second by second."""
+    """Score a recording second by second; return the scores of all frames, (frames, states)."""
     resampler = Resampler(sample_rate_hz, 1 if samples.ndim == 1 else samples.shape[1])
     front_end, stream = model.create_front_end(), model.create_stream()
     scores = np.empty((num_frames, model.topology.num_states), np.float32)
@@ -142,7 +143,7 @@ def _score_recording(
     return scores[:num_scored]
 
 
-def _best_of_phones(scores: Floats, topology: Topology) -> Floats:
+def _best_phone_scores(scores: Floats, topology: Topology) -> Floats:
     """Return the score of each phone's best state, (frames, phones)."""
     best: Floats = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
     return best
@@ -157,33 +158,33 @@ def _fit(
 ) -> float:
     """Compare a path's states with the best phone of each frame.
 
-    Frames that are silent in the path and in the audio are excluded, so that pauses do not count.
+    Pauses do not count: frames that are silent in the path and in the audio are excluded.
     """
     losses = []
     for first in range(0, len(path), _FIT_FRAMES):
         rows, nodes = scores[first : first + _FIT_FRAMES], path[first : first + _FIT_FRAMES]
-        best_of_phones = _best_of_phones(rows, topology)
-        best = best_of_phones.max(axis=1)
+        best_scores = _best_phone_scores(rows, topology)
+        best = best_scores.max(axis=1)
         lost = best - rows[np.arange(len(nodes)), graph.states[nodes]]
-        lost_on_average = best - best_of_phones.mean(axis=1)
+        lost_on_average = best - best_scores.mean(axis=1)
         is_silent = (graph.phones[graph.phone_number[nodes]] == silence) & (
-            best_of_phones.argmax(axis=1) == silence
+            best_scores.argmax(axis=1) == silence
         )
         losses.append(np.stack([lost, lost_on_average])[:, ~is_silent])
     lost, lost_on_average = np.concatenate(losses, axis=1)
     return 1.0 - float(lost.sum() / lost_on_average.sum()) if len(lost) else 0.0
 
 
-def spoken(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Phone]:
+def drop_pauses(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Phone]:
     """Return the phones without pauses."""
     return [phone for phone in phones if phone.symbol != inventory.silence]
 
 
-def timed_syllables(
+def find_syllable_times(
     phones: Sequence[Phone], transcript: Transcript, inventory: PhoneInventory
 ) -> list[TimedSyllable]:
     """Return the syllables of a text with the times of its aligned phones."""
-    rest = iter(spoken(phones, inventory))
+    rest = iter(drop_pauses(phones, inventory))
     timed = []
     for syllable in transcript.syllables:
         aligned = list(islice(rest, len(syllable.phones)))

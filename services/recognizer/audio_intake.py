@@ -1,4 +1,4 @@
-"""Checks the audio messages of clients, and reports rejections."""
+"""Checks clients' audio messages and reports rejected ones."""
 
 import logging
 import time
@@ -57,7 +57,7 @@ class AudioIntake:
             self._loop.metrics.count("repeated")
         else:
             session.on_new_audio(now_s)
-            is_next = session.take_next(message, now_s)
+            is_next = session.accept_in_order(message, now_s)
         if is_next:
             self._accept(session, message, sender)
         if message.acknowledge:  # immediately if the client resends or must fill a gap

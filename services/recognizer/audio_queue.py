@@ -1,4 +1,4 @@
-"""The audio of one session that is queued for decoding."""
+"""Queue of one session's audio that is not decoded yet."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from kouxing.services.recognizer.resumption import Chunk
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.overload import SkipPolicy
 
-_MIN_CHUNK_S = 0.001  # a shorter chunk counts as this long: decoding it takes as much time
+_MIN_CHUNK_S = 0.001  # shorter chunks count as this duration, because decoding them takes as long
 
 
 class AudioQueue:
@@ -25,7 +25,7 @@ class AudioQueue:
 
     @property
     def duration_s(self) -> float:
-        """Duration of the queued audio. Each chunk counts as at least 1 ms, also an empty one."""
+        """Duration of the queued audio. Each chunk, even an empty one, counts as at least 1 ms."""
         return max(self._num_samples / self._rate_hz, _MIN_CHUNK_S * len(self._chunks))
 
     @property
@@ -49,7 +49,7 @@ class AudioQueue:
         self._num_samples = 0
 
     def is_outdated(self, now_s: float) -> bool:
-        """Return whether even the newest chunk is late, so more audio should have arrived."""
+        """Return whether even the newest chunk is late, so that more audio should have arrived."""
         return bool(self._chunks) and self.overload.is_late(now_s)
 
     def skip_old(self, now_s: float) -> bool:

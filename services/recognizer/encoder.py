@@ -30,12 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import load_part
+from kouxing.services.recognizer.acoustic.model_file import load_component
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     check_outputs,
-    open_session,
-    run_session,
+    open_onnx_session,
+    run_onnx_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
@@ -50,11 +50,11 @@ _MAX_WIDTH = 4096
 
 
 class VoiceKind(IntEnum):
-    """Kinds of voice."""
+    """Kinds of voice that the encoder distinguishes."""
 
     NONE = 0
     SPEECH = 1
-    SUNG = 2  # or held
+    SINGING = 2  # or a held sound
     LAUGHTER = 3
 
 
@@ -69,11 +69,11 @@ class EncoderOutput(NamedTuple):
 
 
 class AudioEncoder:
-    """The network, shared by any number of streams."""
+    """The encoder network, shared by any number of streams."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
         """Open an ONNX file; ``ValueError`` if it does not contain an audio encoder."""
-        self._session = open_session(file)
+        self._session = open_onnx_session(file)
         nodes = [*self._session.get_inputs(), *self._session.get_outputs()]
         widths = {node.name: node.shape[-1] for node in nodes}
         self.state_width, self.num_features, self.num_phones = (
@@ -95,7 +95,7 @@ class AudioEncoder:
         Other positions do not affect a position's results.
         """
         inputs = {"frames": frames.reshape(len(frames), -1), "state": states}
-        outputs: list[Floats] = run_session(self._session, _OUTPUTS, inputs)
+        outputs: list[Floats] = run_onnx_session(self._session, _OUTPUTS, inputs)
         return outputs
 
     def create_stream(self) -> EncoderStream:
@@ -104,7 +104,7 @@ class AudioEncoder:
 
 
 class EncoderStream:
-    """The positions of one session's audio."""
+    """Runs the encoder on one session's audio, position by position."""
 
     def __init__(self, encoder: AudioEncoder) -> None:
         self.encoder = encoder
@@ -123,7 +123,7 @@ def process_positions(
     outputs = streams[0].encoder.run(np.array(frames), states)
     positions = []
     for stream, of_stream, *rows in zip(streams, frames, *outputs, strict=True):
-        features, phones, voice, state = (row.copy() for row in rows)  # a view keeps all rows
+        features, phones, voice, state = (row.copy() for row in rows)  # a view would keep all rows
         stream.state = state
         positions.append(EncoderOutput(of_stream, features, phones, voice, state))
     return positions
@@ -132,7 +132,7 @@ def process_positions(
 @cache
 def load_encoder(path: Path = ENCODER_PATH) -> AudioEncoder:
     """Read a model file; ``UserError`` if it is missing, broken or of another format."""
-    return load_part(
+    return load_component(
         path,
         FORMAT,
         "audio encoder",

@@ -1,7 +1,7 @@
 """The interface of a model that predicts lip frames from the audio.
 
-It gets what the audio encoder computes at every position, 50 times a second during speech, and
-predicts lip frames. A model offers several delays, of which the recognizer chooses one.
+The audio encoder computes features at every position, 50 times a second. From these features, the
+model predicts lip frames during speech. A model offers several delays; the recognizer chooses one.
 """
 
 from collections.abc import Sequence
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 
 from kouxing.shared.phones.events import LipPositions
 
-# Face frames are due every 20 ms of audio. The network's positions end this long before them: a
-# window of 25 ms in steps of 20 ms cannot end closer.
+# FAP frames are due every 20 ms of audio. The network's positions end this much earlier: windows
+# of 25 ms in steps of 20 ms cannot end closer.
 POSITION_LAG_S = 0.005
 
 
 class LipFrameStream(Protocol):
-    """The lip frames of one session, one segment of speech after the other."""
+    """Predicts the lip frames of one session, segment by segment."""
 
     def process_position(
         self, known_s: float, frames: NDArray[np.float32], features: NDArray[np.float32]
     ) -> list[LipPositions]:
-        """Return the lip frames that follow from what the encoder computes at a position.
+        """Return the lip frames that a position's features determine.
 
         Parameters
         ----------
         known_s
-            Media time of the last sample that the position has seen, seconds.
+            Media time of the position's last sample, seconds.
         frames
-            Its two newest log-mel frames, shape (2, 80).
+            The position's two log-mel frames, shape (2, 80).
         features
             The encoder's features, shape (features,).
         """
@@ -54,6 +54,6 @@ class LipFrameModel(Protocol):
 
 
 def choose_delay(delays_s: Sequence[float], face_delay_s: float) -> float:
-    """Choose the longest delay whose lip frames are in time for a face with a delay."""
+    """Choose the longest delay whose lip frames are in time for a face with this delay."""
     in_time = [delay for delay in delays_s if delay + POSITION_LAG_S <= face_delay_s + 1e-6]
     return max(in_time, default=min(delays_s))

@@ -1,4 +1,4 @@
-"""The lip predictor: mouth shapes from the features of the audio encoder.
+"""The lip predictor: predicts mouth shapes from the features of the audio encoder.
 
 Source: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder" (gated
 recurrent unit).
@@ -38,7 +38,7 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import Archive, load_part, write_archive
+from kouxing.services.recognizer.acoustic.model_file import Archive, load_component, write_archive
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
@@ -47,7 +47,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions
 
-LIPS_PATH = Path(__file__).parent / "models" / "lips.npz"
+LIP_PREDICTOR_PATH = Path(__file__).parent / "models" / "lips.npz"
 FORMAT = "lips 4"
 # FAPs that a camera tracks. The left and the right FAP of a pair have the same value.
 LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
@@ -57,7 +57,7 @@ NUM_OUTPUTS = len(LIP_FAPS) + 2
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
 _MAX_SIZE = 4096  # limit for the numbers of features, components and units
-_COLUMNS, _ONES, _OTHERS = (
+_TRACKED_COLUMNS, _PAIR_SOURCES, _PAIR_TARGETS = (
     np.array([MOUTH_FAPS.index(fap) for fap in faps])
     for faps in (LIP_FAPS, OTHER_SIDE, OTHER_SIDE.values())
 )
@@ -86,22 +86,22 @@ class LipPredictor:
         return tuple(round(float(delay_s), 6) for delay_s in self.delays)
 
     @cached_property
-    def _of_delays(self) -> dict[tuple[int, ...], tuple[Floats, Floats]]:
+    def _weights_by_delays(self) -> dict[tuple[int, ...], tuple[Floats, Floats]]:
         return {}
 
-    def weights_of(self, delays: Sequence[int]) -> tuple[Floats, Floats]:
+    def weights_for_delays(self, delays: Sequence[int]) -> tuple[Floats, Floats]:
         """Return A and B for some delays, (features, delays 17), (2 units, delays 17).
 
         Streams with the same delays share them.
         """
         key = tuple(delays)
-        if key not in self._of_delays:
+        if key not in self._weights_by_delays:
             lips, output = (
                 weights[..., list(delays), :].reshape(-1, len(delays) * NUM_OUTPUTS)
                 for weights in (self.lip_weights, self.output_weights)
             )
-            self._of_delays[key] = lips, output
-        return self._of_delays[key]
+            self._weights_by_delays[key] = lips, output
+        return self._weights_by_delays[key]
 
     def create_stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
         """Create a session's stream; ``UserError`` if the model lacks one of the delays."""
@@ -152,12 +152,12 @@ class LipPredictor:
 
 
 class LipPredictorStream:
-    """The lip frames of one session, one segment of speech after the other."""
+    """Predicts the lip frames of one session, segment by segment."""
 
     def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
         self._model = model
         self._delays_s = [model.delays_s[delay] for delay in delays]
-        self._lip_weights, self._output_weights = model.weights_of(delays)
+        self._lip_weights, self._output_weights = model.weights_for_delays(delays)
         self._output_bias = model.output_bias[list(delays)]
         self.reset()
 
@@ -170,13 +170,13 @@ class LipPredictorStream:
     def process_position(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
-        """Return the lip frames that follow from a position; see ``LipFrameStream``."""
-        outputs = self.step(features_at(frames, features))
+        """Return a position's lip frames; see ``LipFrameStream``."""
+        outputs = self.step(join_features(frames, features))
         return [
             LipPositions(
                 time_s=known_s - delay_s,
                 delay_s=delay_s,
-                faps=mouth_faps(row[: len(LIP_FAPS)]),
+                faps=expand_mouth_faps(row[: len(LIP_FAPS)]),
                 closure=float(_sigmoid(row[CLOSURE])),
                 lip_to_teeth=float(_sigmoid(row[LIP_TO_TEETH])),
             )
@@ -188,8 +188,8 @@ class LipPredictorStream:
         model = self._model
         centered = features - model.feature_mean
         component = (centered @ model.projection).astype(np.float32, copy=False)
-        entered = np.maximum(component @ model.entry_weights + model.entry_bias, 0)
-        from_input = entered @ model.input_weights + model.input_bias
+        hidden_input = np.maximum(component @ model.entry_weights + model.entry_bias, 0)
+        from_input = hidden_input @ model.input_weights + model.input_bias
         from_state = self._state @ model.state_weights + model.state_bias
         size = len(self._state)
         gates = _sigmoid(from_input[: 2 * size] + from_state[: 2 * size])
@@ -197,22 +197,22 @@ class LipPredictorStream:
         new = np.tanh(from_input[2 * size :] + reset * from_state[2 * size :])
         self._state = (1 - update) * new + update * self._state
         from_lips = features[-len(model.lip_weights) :] @ self._lip_weights
-        self.inner = np.concatenate([self._state, entered])
+        self.inner = np.concatenate([self._state, hidden_input])
         recurrent = self.inner @ self._output_weights
         outputs: Floats = (from_lips + recurrent).reshape(self._output_bias.shape)
         return outputs + self._output_bias
 
 
-def features_at(frames: Floats, features: Floats) -> Floats:
+def join_features(frames: Floats, features: Floats) -> Floats:
     """Join a position's frames, (2, 80), with the encoder's features."""
     return np.concatenate([frames, features], axis=None)
 
 
-def mouth_faps(lips: Floats) -> Floats:
+def expand_mouth_faps(lips: Floats) -> Floats:
     """Return all FAPs of the mouth, (28,), from the FAPs that a camera tracks, (15,)."""
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
-    faps[_COLUMNS] = lips
-    faps[_OTHERS] = faps[_ONES]
+    faps[_TRACKED_COLUMNS] = lips
+    faps[_PAIR_TARGETS] = faps[_PAIR_SOURCES]
     return faps
 
 
@@ -223,21 +223,21 @@ def _sigmoid(x: Floats) -> Floats:
     return probability
 
 
-def load_lip_predictor(path: Path = LIPS_PATH) -> LipPredictor:
+def load_lip_predictor(path: Path = LIP_PREDICTOR_PATH) -> LipPredictor:
     """Read a file; ``UserError`` if it is missing, broken or of another format."""
-    return load_part(path, FORMAT, "lip predictor", _lip_predictor_from)
+    return load_component(path, FORMAT, "lip predictor", _parse_lip_predictor)
 
 
-def _lip_predictor_from(archive: Archive) -> LipPredictor:
+def _parse_lip_predictor(archive: Archive) -> LipPredictor:
     """Build the predictor after checking every size; ``ValueError`` if an array does not fit."""
-    delays = archive.floats("delays", *_sizes(archive, "delays", 1))
+    delays = archive.floats("delays", *_read_shape(archive, "delays", 1))
     if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:
         raise ValueError(f"its delays are {delays.tolist()}")
     if (np.diff(delays) <= 0).any():
         raise ValueError("its delays do not rise")
-    num_features, num_components = _sizes(archive, "projection", 2)
-    _, units = _sizes(archive, "entry_weights", 2)
-    num_lips = _sizes(archive, "lip_weights", 3)[0]
+    num_features, num_components = _read_shape(archive, "projection", 2)
+    _, units = _read_shape(archive, "entry_weights", 2)
+    num_lips = _read_shape(archive, "lip_weights", 3)[0]
     if num_features != FRAMES_PER_POSITION * NUM_MELS + load_encoder().num_features:
         raise ValueError("it was trained with another encoder.npz; run kouxing train lips")
     if num_lips > num_features:
@@ -259,7 +259,7 @@ def _lip_predictor_from(archive: Archive) -> LipPredictor:
     )
 
 
-def _sizes(archive: Archive, name: str, num_axes: int) -> tuple[int, ...]:
+def _read_shape(archive: Archive, name: str, num_axes: int) -> tuple[int, ...]:
     shape = archive.array(name, None).shape
     if len(shape) != num_axes or not all(1 <= size <= _MAX_SIZE for size in shape):
         raise ValueError(f"{name} has shape {shape}")

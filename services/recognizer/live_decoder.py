@@ -1,4 +1,4 @@
-"""Live decoding: score events to phones, with first hypotheses and corrections.
+"""Live decoding: turns score events into phones, with first hypotheses and corrections.
 
 Source: Li et al. 2011, sections 1 and 2.2.
 
@@ -16,8 +16,8 @@ from typing import TypeAlias
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
-    FIRST,
-    INSIDE,
+    AFTER_PAUSE,
+    WITHIN_PHRASE,
     Floats,
     Topology,
     empty_scores,
@@ -33,7 +33,7 @@ from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
 from kouxing.shared.records import replace
 
-_DEFAULT_CONFIDENCE = 0.5  # of a phone that was not emitted before it was final
+_DEFAULT_CONFIDENCE = 0.5  # confidence of a phone that was not emitted before it was final
 
 StreamOutput: TypeAlias = SoundEvent | Waveform
 
@@ -49,16 +49,16 @@ class LiveDecoder:
     corrects the earlier ones. Such a phone is emitted again under its ``index``, with the measured
     onset and duration, or with another symbol. Phones that the rule passed over are emitted
     together with the next one. An extra phone is withdrawn (``Phone.is_withdrawn``). Silence
-    within speech is a phone like any other.
+    within speech is also a phone.
 
     A phone is final when all paths of the search over settled scores share it, or speech has ended.
     The final phones therefore equal offline decoding. Their confidence is the mean over
     their frames. The output rule and the provisional scores affect neither.
 
     If the model has provisional scores, the search continues over them. When the next scores
-    arrive, it restarts from the last settled frame. The output rule gets each frame once, as soon
-    as the frame has a score of either kind. So phones are emitted early and corrected by better
-    scores.
+    arrive, it restarts from the last settled frame. The output rule processes each frame once, as
+    soon as the frame has a score of either kind. Phones are therefore emitted early, and better
+    scores correct them.
     """
 
     def __init__(self, topology: Topology, rule: OutputRuleConfig) -> None:
@@ -72,7 +72,7 @@ class LiveDecoder:
         self._start_speech(0)
 
     def decode(self, events: Iterable[ScoreEvent]) -> list[StreamOutput]:
-        """Return the phones and speech changes of the next events; others are passed on."""
+        """Return the phones and speech changes of the next events, and other events unchanged."""
         out: list[StreamOutput] = []
         for event in events:
             if isinstance(event, SpeechStart):
@@ -94,7 +94,7 @@ class LiveDecoder:
     def _start_speech(self, frame: int) -> None:
         self._start_frame = frame
         self._done = 0  # the decoder's frame up to which phones are final
-        self._num_checked = 0  # frames that the output rule has had
+        self._num_checked = 0  # frames that the output rule has processed
         self._confidence = np.empty(0)  # of the settled frames from ``_done`` on
         self._provisional = empty_scores(self._topology.num_states)  # scores of the last search
         self._settled.reset()
@@ -120,7 +120,7 @@ class LiveDecoder:
         return out
 
     def _search(self, scores: Floats) -> list[Phone]:
-        """Continue the search; the output rule gets the frames that it has not had."""
+        """Continue the search; the output rule processes each frame only once."""
         num_checked = max(0, self._num_checked - self._decoder.num_frames)
         confidence = [self._decoder.advance(scores[:num_checked])] if num_checked else []
         out: list[Phone] = []
@@ -148,7 +148,7 @@ class LiveDecoder:
         phone, start, confidence = self._decoder.last_phone
         revised = self._revise(self._decoder.path_since(self._done), num_following=1)
         before = self._index_of(self._open[-1]) if self._open else self._last_final
-        position = FIRST if before == self._silence else INSIDE
+        position = AFTER_PAUSE if before == self._silence else WITHIN_PHRASE
         new = Phone(
             index=self._num_final + len(self._open),
             symbol=self._inventory.phones[phone],
@@ -161,7 +161,7 @@ class LiveDecoder:
         return [*revised, new]
 
     def _revise(self, segments: list[PathSegment], num_following: int) -> list[Phone]:
-        """Replace the open phones by the best string; return those that are new or changed.
+        """Replace the open phones by the best string; return the new and changed phones.
 
         ``num_following`` phones follow the segments: one, or none if speech has ended.
         """

@@ -1,4 +1,4 @@
-"""Loads numba's runtime, which takes as long as loading the models."""
+"""Loads numba's runtime. This takes as long as loading the models, so it runs in parallel."""
 
 import sys
 

@@ -1,16 +1,16 @@
-"""A mouth profile: how one speaker's lips differ from those that the lip model predicts.
+"""A mouth profile: corrects the lip predictor for one speaker.
 
     y' = s y + b + r [h, u]
 
-y are the FAPs that the lip model predicts (``lip_predictor.py``), h and u its hidden values. A
-profile fits only the model that it was learned with.
+y are the predicted FAPs (``lip_predictor.py``); h and u are hidden values of the predictor. A
+profile fits only the predictor that it was learned with.
 
 ======== ====================================================== =================== ===========
 symbol   meaning                                                shape               unit
 ======== ====================================================== =================== ===========
 s        scale of each FAP                                      (15,)               1
 b        offset of each FAP                                     (15,)               FAP units
-r        residual: what the model misses about the speaker      (2 units, delays,   FAP units
+r        residual: the speaker's deviation from the model      (2 units, delays,   FAP units
                                                                 15)
 ======== ====================================================== =================== ===========
 
@@ -33,14 +33,14 @@ from kouxing.shared.user_file import read_file
 
 Floats = NDArray[np.float32]
 
-_MAGIC = b"kouxing voice 1\n"  # mouth profiles were first called voices
+_MAGIC = b"kouxing voice 1\n"  # the historical name, kept for existing files
 _DIGEST_BYTES = 32
 MAX_SCALE, MAX_OFFSET, MAX_RESIDUAL = 4.0, 2000.0, 2000.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class MouthProfile:
-    """One speaker's mouth."""
+    """Corrections of the predicted FAPs for one speaker."""
 
     scale: Floats  # (15,)
     offset: Floats  # (15,)
@@ -60,9 +60,9 @@ class MouthProfile:
 def parse_mouth_profile(
     content: bytes, model_digest: bytes, shape: tuple[int, int, int]
 ) -> MouthProfile:
-    """Parse a profile from an untrusted source, for the lip model with this SHA-256.
+    """Parse a profile from an untrusted source, for the lip predictor with this SHA-256.
 
-    ``shape`` is the shape of this model's residual.
+    ``shape`` is the shape of the predictor's residual.
 
     Raises ``UserError`` if it is not a profile, fits another model, or its values are out of
     bounds.

@@ -9,11 +9,11 @@ from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.stream import SpeechStream
 
 MAX_SESSIONS = 4  # decoded together; all results are sent at the end
-MAX_WAIT_S = 0.02  # longest wait for more sessions, to save processor time
+MAX_WAIT_S = 0.02  # limit for waiting for more sessions, to save processor time
 
 
 class NetworkThread:
-    """Decodes sessions whose next audio is due for the block network (``is_due``).
+    """Decodes sessions whose next audio is due for the block network (``waits_for_network``).
 
     While a session is on the thread (``is_scoring``), other threads may only use its stream as
     ``SpeechStream.start_scoring`` describes, so that lips do not wait for the network.
@@ -33,14 +33,14 @@ class NetworkThread:
         self._on_decoded = on_decoded
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="network")
         self._due: list[RecognizerSession] = []
-        self._due_since_s = 0.0  # the first of them
+        self._due_since_s = 0.0  # when the first of them was queued
         self._batch: list[RecognizerSession] = []
         self._job: Future[None] | None = None
 
     def add(self, session: RecognizerSession, now_s: float) -> None:
         """Queue a session for the network, unless it is already queued."""
-        if not session.is_due:
-            session.is_due = True
+        if not session.waits_for_network:
+            session.waits_for_network = True
             self._due_since_s = self._due_since_s if self._due else now_s
             self._due.append(session)
 
@@ -56,7 +56,7 @@ class NetworkThread:
             return
         self._batch, self._due = self._due[:MAX_SESSIONS], self._due[MAX_SESSIONS:]
         for session in self._batch:
-            session.is_due, session.is_scoring = False, True
+            session.waits_for_network, session.is_scoring = False, True
             session.stream.start_scoring()
         streams = [session.stream for session in self._batch]
         self._job = self._executor.submit(self._decode, streams)
@@ -80,6 +80,6 @@ class NetworkThread:
 
     def _decode(self, streams: Sequence[SpeechStream]) -> None:
         start_s = time.thread_time()
-        self._recognizer.decode_found(streams)
+        self._recognizer.decode_speech(streams)
         self.batch_s = time.thread_time() - start_s
         self.work_s += self.batch_s

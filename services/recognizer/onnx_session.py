@@ -11,7 +11,7 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # read during the import
 import onnxruntime
 
 
-def open_network(file: bytes) -> Any:
+def create_inference_session(file: bytes) -> Any:
     """Return an ``onnxruntime.InferenceSession``; its errors have no common base class."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
-from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import run_encoder, score_found
+from kouxing.services.recognizer.speech_scorer import run_encoder, score_speech
 from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
@@ -49,7 +49,7 @@ class Recognizer:
         if language is None:
             return self.model
         if language not in self._models:
-            self._models[language] = model_of_language(language)
+            self._models[language] = load_model_for_language(language)
         return self._models[language]
 
     def create_stream(
@@ -107,11 +107,11 @@ class Recognizer:
     def decode_streams(self, streams: Sequence[SpeechStream]) -> None:
         """Decode all audio that the streams have accepted; the model scores it in batches."""
         self.run_encoder(streams)
-        self.decode_found(streams)
+        self.decode_speech(streams)
 
-    def decode_found(self, streams: Sequence[SpeechStream]) -> None:
+    def decode_speech(self, streams: Sequence[SpeechStream]) -> None:
         """Decode the speech that ``run_encoder`` has found."""
-        score_found([scorer for stream in streams for scorer in stream.scorers])
+        score_speech([scorer for stream in streams for scorer in stream.scorers])
         for stream in streams:
             stream.decode()
 
@@ -120,7 +120,7 @@ class Recognizer:
         return stream.take_results()
 
     def warm_up(self) -> None:
-        """Run everything once, so that a session's first chunk does not wait for the compiler."""
+        """Run all compiled functions once, so that no session waits for the compiler."""
         silence = np.zeros(round(_WARM_UP_S * SAMPLE_RATE_HZ), np.float32)
         scores = score_segment(self.model, self.model.create_front_end().accept_waveform(silence))
         decoder = Decoder(self.model.topology)

@@ -1,8 +1,7 @@
-"""How a recognizer continues the session of a lost one.
+"""Continues the session of a lost recognizer.
 
-It processes some audio again from before the time at which it continues, because the networks look
-back 2.5 s. It does not emit the results of that audio. It replaces all results of the lost
-recognizer for later audio.
+The new recognizer first reprocesses some earlier audio, because the networks look back 2.5 s. It
+does not emit results for that audio. Its later results replace those of the lost recognizer.
 """
 
 from collections import deque
@@ -26,29 +25,30 @@ from kouxing.shared.phones.events import (
 from kouxing.shared.phones.final_time import FinalTime
 from kouxing.shared.records import replace
 
-WARM_UP_S = 2.8  # duration of audio before that time; docs/recognition.md explains the choice
+WARM_UP_S = 2.8  # duration of the reprocessed audio; docs/recognition.md explains the choice
 # Audio starts at a multiple of this time. Network blocks and positions divide it, so they are
-# aligned as in a session without a loss.
+# aligned as in an uninterrupted session.
 GRID_S = 0.16
-MAX_REPLAYED = 5000  # audio messages that a client keeps
+MAX_REPLAYED_MESSAGES = 5000  # limit of audio messages that a client keeps
 
 Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
 
 
 class ReplayWindow:
-    """The audio messages that another recognizer would need to continue the session."""
+    """Tracks the audio messages that a replacement recognizer would need."""
 
     def __init__(self) -> None:
-        self.last_droppable_sequence = 0  # newest message that no other recognizer would need
+        self.last_droppable_sequence = 0  # last message that a replacement can do without
         self._final = FinalTime()  # final time of the events that the synthesizer has
-        self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED)  # sequence, end
+        # (sequence, end) of each message
+        self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED_MESSAGES)
 
     def add(self, sequence: int, end: int) -> None:
         """Add an audio message that ends at a media time in samples."""
         self._messages.append((sequence, end))
 
     def update(self, event: SoundEvent, newest_sequence: int) -> None:
-        """Drop the messages that are no longer needed once the synthesizer has an event."""
+        """Drop the messages that are no longer needed, because the synthesizer has an event."""
         if isinstance(event, EndOfSound):
             self.last_droppable_sequence = newest_sequence
             return
@@ -58,8 +58,8 @@ class ReplayWindow:
             self.last_droppable_sequence, _ = self._messages.popleft()
 
 
-class Resumption:
-    """Suppresses results that are already known: up to ``time_s``, by the middle of a phone."""
+class ResumeFilter:
+    """Drops results before ``time_s``, which are already known. The middle of a phone counts."""
 
     def __init__(self, time_s: float, silence: str) -> None:
         self._time_s = time_s
@@ -120,7 +120,7 @@ class Resumption:
         return Waveform(time_s=self._time_s, samples=samples) if len(samples) else None
 
     def _trim_phone(self, phone: Phone) -> Phone | None:
-        """Return a new phone; one that turns out to be known is withdrawn when it is final."""
+        """Return a new phone. An emitted phone that turns out to be known is finally withdrawn."""
         is_new = phone.onset_s + phone.duration_s / 2 >= self._time_s
         was_emitted = phone.index in self._emitted
         if phone.final:

@@ -1,4 +1,4 @@
-"""The recognizer as a service: audio chunks in, phones and speech events out.
+"""The recognizer service: receives audio chunks, sends phones and speech events.
 
 Handles: audio-chunk (clients), start-session, close-session, flush-session, set-face (control),
 acknowledge (synthesizer).
@@ -13,18 +13,22 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from operator import attrgetter
 
-from kouxing.services.recognizer.acoustic.languages import LANGUAGES_OF_MODELS
+from kouxing.services.recognizer.acoustic.languages import MODEL_LANGUAGES
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.audio_intake import AudioIntake
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.live_batches import MAX_BATCH_S, SESSIONS_TOGETHER, LiveBatches
+from kouxing.services.recognizer.live_batch_decoder import (
+    MAX_BATCH_S,
+    SESSIONS_TOGETHER,
+    LiveBatchDecoder,
+)
 from kouxing.services.recognizer.load_numba import load_numba
+from kouxing.services.recognizer.pending_sessions import PendingSessions
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import RecognizerSession
-from kouxing.services.recognizer.starting_sessions import StartingSessions
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import NO_PEER, Peer
@@ -45,11 +49,11 @@ from kouxing.shared.wire.speech import Acknowledge, Speech
 
 MAX_QUEUED_S = 60.0  # limit for live audio; later audio waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for more late audio: once, and in total
-MAX_UNPACED_S = 0.06  # limit for unpaced audio that live audio may have to wait for
-FREE_MEMORY_AFTER_S = 10.0  # from the end of a session, because many often end together
+MAX_UNPACED_S = 0.06  # limit for unpaced audio decoded at a time, while live audio waits
+FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # interval between ticks while a session is open
-STEP_S = 0.002  # interval between steps with several sessions, to process their audio together
-MAX_TICK_S = 0.05  # if two ticks are further apart, this process was busy
+MIN_STEP_S = 0.002  # interval between steps with several sessions, to process their audio together
+MAX_TICK_S = 0.05  # longer intervals between ticks mean that this process was busy
 
 
 class RecognizerService(SessionService):
@@ -60,12 +64,12 @@ class RecognizerService(SessionService):
     def __init__(self, config: RecognizerConfig) -> None:
         super().__init__(config)
         self._sessions: dict[str, RecognizerSession] = {}
-        self._unpaced_read_s = time.monotonic()  # when unpaced audio was last read
+        self._last_unpaced_read_s = time.monotonic()  # when unpaced audio was last read
         self._max_lag_s = config.max_lag_s
         self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
-        self._stepped_s = 0.0
-        self._stalls_checked_s = time.monotonic()
+        self._last_step_s = 0.0
+        self._last_stall_check_s = time.monotonic()
         self._synthesizers = SynthesizerSockets(
             self, {Acknowledge: self._on_acknowledge, Error: self.on_error}
         )
@@ -85,11 +89,11 @@ class RecognizerService(SessionService):
             model = loading.result()
         self._recognizer = Recognizer(model, config.output_rule)
         self.facts = SessionFacts(language=model.inventory.language)
-        self.languages = [*LANGUAGES_OF_MODELS]
-        self._starting = StartingSessions(model.inventory.language, self.waker.wake)
+        self.languages = [*MODEL_LANGUAGES]
+        self._pending = PendingSessions(model.inventory.language, self.waker.wake)
         self._lip_predictor = load_lip_predictor()
         self._recognizer.warm_up()
-        self._live = LiveBatches(
+        self._live = LiveBatchDecoder(
             self._sessions,
             self._recognizer,
             self.busy,
@@ -106,8 +110,8 @@ class RecognizerService(SessionService):
     def step(self, timeout_s: float) -> None:
         """Read new messages, then decode some audio of all live sessions together.
 
-        If no live audio is left, decode some unpaced audio. More unpaced audio waits in its socket,
-        and then at the sender.
+        If no live audio is left, decode some unpaced audio. Further unpaced audio waits in the
+        socket, then at the sender.
         """
         has_unpaced = self._has_unpaced_audio and not self._is_unpaced_blocked
         super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
@@ -120,11 +124,11 @@ class RecognizerService(SessionService):
     def wait(self, timeout_s: float) -> list[Socket]:
         """Wait for messages; with several sessions, also for those that arrive soon after."""
         sockets = super().wait(timeout_s)
-        early_s = self._stepped_s + STEP_S - time.monotonic()
+        early_s = self._last_step_s + MIN_STEP_S - time.monotonic()
         if sockets and early_s > 0.0 and len(self._sessions) >= SESSIONS_TOGETHER:
             time.sleep(early_s)
             sockets = super().wait(0.0)
-        self._stepped_s = time.monotonic()
+        self._last_step_s = time.monotonic()
         return sockets
 
     # --- sessions --------------------------------------------------------------------------------
@@ -134,13 +138,13 @@ class RecognizerService(SessionService):
         return super().control_handlers() | {SetFace: self._on_set_face}
 
     def served_sessions(self) -> Iterable[StartSession]:
-        """Return the sessions, as they are now, for a restarted control."""
+        """Return the current state of the sessions, for a restarted control."""
         now_s = time.monotonic()
         for session in self._sessions.values():
             yield replace(session.start, face=session.face.at(now_s))
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
-        self._starting.set_face(message.session, message.face)
+        self._pending.set_face(message.session, message.face)
         if (session := self._sessions.get(message.session)) is not None:
             session.face.change(message.face, time.monotonic())
 
@@ -149,7 +153,7 @@ class RecognizerService(SessionService):
 
         The first session in another language starts when its model is loaded.
         """
-        if self._starting.add(start):
+        if self._pending.add(start):
             return False
         session = self._sessions.get(start.session)
         is_new = session is None or session.start.token != start.token
@@ -177,13 +181,13 @@ class RecognizerService(SessionService):
 
     def stop_session(self, session: str) -> None:
         """Remove a session."""
-        self._starting.remove(session)
+        self._pending.remove(session)
         if self._sessions.pop(session, None) is not None:
             free_at_s = time.monotonic() + FREE_MEMORY_AFTER_S
             self._free_memory_at_s = min(self._free_memory_at_s, free_at_s)
 
     def flush_session(self, session: str) -> None:
-        """Drop the current speech; the next audio starts again."""
+        """Drop the current speech; the next audio starts a new segment."""
         if (flushed := self._sessions.get(session)) is not None:
             if flushed.start.paced:
                 self._live.decode_all([flushed])
@@ -200,7 +204,7 @@ class RecognizerService(SessionService):
 
         Clients must wait while a synthesizer's acknowledgements are overdue.
         """
-        for start in self._starting.take_ready():
+        for start in self._pending.take_ready():
             self._on_start_session(start, NO_PEER)
         if now_s >= self._free_memory_at_s:
             self._free_memory_at_s = math.inf
@@ -224,15 +228,15 @@ class RecognizerService(SessionService):
         return now_s + SESSION_TICK_S if self._sessions else self._free_memory_at_s
 
     def _report_stalled(self, now_s: float) -> None:
-        """Report live clients that send no audio to their synthesizers."""
-        tick_s, self._stalls_checked_s = min(now_s - self._stalls_checked_s, MAX_TICK_S), now_s
+        """Report stalled live clients to their synthesizers."""
+        tick_s, self._last_stall_check_s = min(now_s - self._last_stall_check_s, MAX_TICK_S), now_s
         if self._has_live_audio or self._audio.wait(0.0):
             return
         for session in self._sessions.values():
             session.check_stalled(tick_s, now_s)
 
     def on_drain(self) -> bool:
-        """Let other recognizers take the sessions; finish those that stay."""
+        """Hand sessions over to other recognizers; finish the remaining ones."""
         sessions = self._sessions.values()
         self._live.decode_all(self._select_sessions(paced=True))
         if self.is_handing_over and not all(session.is_finished for session in sessions):
@@ -245,7 +249,7 @@ class RecognizerService(SessionService):
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return the input progress of each session."""
-        read_s = {True: time.monotonic(), False: self._unpaced_read_s}  # by paced
+        read_s = {True: time.monotonic(), False: self._last_unpaced_read_s}  # by paced
         return {
             name: SessionInput(
                 idle_s=max(0.0, read_s[session.start.paced] - session.last_audio_s),
@@ -256,13 +260,15 @@ class RecognizerService(SessionService):
         }
 
     def gauges(self) -> dict[str, float]:
-        """Return figures about queued audio, unacknowledged messages and the light model."""
+        """Return gauges of queued audio, unacknowledged messages and the light model."""
         backlogs = [session.link.backlog for session in self._sessions.values()]
         return {
             "queued_audio_seconds": self._queued_s(paced=True) + self._queued_s(paced=False),
             "unacknowledged_messages": max(backlogs, default=0),
             "network_hop": self._live.hop,
-            "light_sessions": sum(session.stream.is_light for session in self._sessions.values()),
+            "light_sessions": sum(
+                session.stream.uses_light_model for session in self._sessions.values()
+            ),
         }
 
     # --- audio -----------------------------------------------------------------------------------
@@ -300,7 +306,7 @@ class RecognizerService(SessionService):
         return self._has_live_audio or (not self._is_live_blocked and self._audio.wait(0.0))
 
     def _read_late_audio(self) -> None:
-        """After a stall, read all received audio, so that it can be skipped in one cut."""
+        """After a stall, read all received audio, so that it can be skipped at once."""
         end_s = time.monotonic() + MAX_READ_S
         while not self._is_live_blocked and (now_s := time.monotonic()) < end_s:
             late = [one.audio for one in self._sessions.values() if one.audio.is_outdated(now_s)]
@@ -337,14 +343,14 @@ class RecognizerService(SessionService):
         is_paused = is_full or self._is_unpaced_blocked
         self.pause(self._unpaced_audio, paused=is_paused)
         if not is_paused:
-            self._unpaced_read_s = time.monotonic()
+            self._last_unpaced_read_s = time.monotonic()
 
     def _decode_unpaced(self) -> None:
         """Decode some unpaced audio, and finish the sessions whose audio ends."""
         before = self._live.work
         left_s = self._max_unpaced_s
         batch = []
-        # the session that has waited longest comes first, so that none starves
+        # the session that has waited longest is first, so that no session starves
         waiting = sorted(self._select_sessions(paced=False), key=attrgetter("accepted_s"))
         for session in waiting:
             if session.audio and left_s > 0.0:
@@ -372,8 +378,9 @@ class RecognizerService(SessionService):
     def _send_results(self, session: RecognizerSession) -> None:
         """Send new results to the subscribers, the synthesizer and control.
 
-        Subscribers are first: a new recognizer does not repeat results that the synthesizer has.
-        All messages are sent together at the end, so that each receiver wakes up only once.
+        Subscribers come first, because a replacement recognizer does not repeat results that the
+        synthesizer has. All messages are sent together at the end, so that each receiver wakes up
+        only once.
         """
         now_s = time.monotonic()
         results = session.new_results(self._recognizer)

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 from kouxing.services.recognizer.audio_queue import AudioQueue
-from kouxing.services.recognizer.front_end.pcm import BadAudio, samples_of
+from kouxing.services.recognizer.front_end.pcm import BadAudio, decode_pcm
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumption
+from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, ResumeFilter
 from kouxing.services.recognizer.sound_packets import SoundPackets
 from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
@@ -38,14 +38,14 @@ from kouxing.shared.wire.speech import (
 from kouxing.shared.wire.speech import LipPositions as LipMessage
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
-MAX_LEAD_S = 15.0  # limit for a paced client ahead of the clock; a delayed one may catch up as much
+MAX_LEAD_S = 15.0  # limit for the lead of a paced client over the clock, and for catching up
 ACKNOWLEDGE_EVERY_S = 0.1  # interval between acknowledgements to a client that sends audio
 STALLED_AFTER_S = 0.2  # a live client that sends no audio for this time has stalled
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
-RESEND_WAIT_S = 1.0  # time for resending missing audio; then the session continues after the gap
+RESEND_WAIT_S = 1.0  # wait for resent audio; then the session continues after the gap
 M = TypeVar("M", bound=Message)
 
-_CLIENT_CLOCK_RATE = 1.01  # a client's clock may be faster than this one
+_CLIENT_CLOCK_RATE = 1.01  # a client's clock may run this much faster
 
 
 class AudioRejected(Exception):
@@ -57,7 +57,7 @@ class AudioRejected(Exception):
 
 
 class RecognizerSession:
-    """A session's state. A mouth profile that does not fit is ignored and reported."""
+    """The state of one session. A mouth profile that does not fit is ignored and reported."""
 
     def __init__(
         self,
@@ -91,22 +91,22 @@ class RecognizerSession:
             speech_time=start.speech_time or 0,
             language=start.facts.language,
         )
-        self.resumption: Resumption | None = None  # if another recognizer has lost the session
+        self.resume_filter: ResumeFilter | None = None  # after a lost recognizer
         if start.media_time:
             silence = recognizer.model.inventory.silence
-            self.resumption = Resumption(to_seconds(start.media_time), silence)
+            self.resume_filter = ResumeFilter(to_seconds(start.media_time), silence)
         overload = SkipPolicy(
             max_lag_s if start.paced else math.inf,
             now_s + CATCH_UP_S if start.epoch > 1 else now_s,
         )
         self.audio = AudioQueue(start.sample_rate_hz, overload)  # not decoded yet
-        self.is_due = False  # waits for the block network's thread
-        self.is_scoring = False  # on this thread
+        self.waits_for_network = False  # waits for the block network's thread
+        self.is_scoring = False  # on the block network's thread
         self.accepted_s = now_s  # when the stream last took audio, except during scoring
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.last_sequence = 0  # number of the newest accepted audio message
-        self._gap_since_s: float | None = None  # start of dropping messages after a gap
+        self._gap_since_s: float | None = None  # when messages after a gap were first dropped
         self.client = NO_PEER  # sender of the newest audio
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded
@@ -115,15 +115,15 @@ class RecognizerSession:
         self.silent_s = -MOVE_GRACE_S if start.epoch > 1 else 0.0
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
-        self.is_laughing = False  # the speaker
+        self.is_laughing = False  # whether the speaker laughs
         self._published_acoustic = AcousticModelName.FULL
-        self._sound = SoundPackets(face_delay_s)
+        self._sound_packets = SoundPackets(face_delay_s)
         is_checked = start.encoding == "s16le" and start.epoch <= 1
         self._encoding = EncodingCheck(start.num_channels) if is_checked else None
         self.output_sequence = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
-        self._lead_limit = _AheadLimit(now_s, may_catch_up=start.epoch > 1)
+        self._lead_limit = _LeadLimiter(now_s, may_catch_up=start.epoch > 1)
 
     @property
     def name(self) -> str:
@@ -133,7 +133,7 @@ class RecognizerSession:
     @property
     def is_decoding(self) -> bool:
         """Whether received audio is not decoded yet."""
-        return bool(self.audio) or self.is_due or self.is_scoring
+        return bool(self.audio) or self.waits_for_network or self.is_scoring
 
     @property
     def received_sequence(self) -> int:
@@ -142,7 +142,7 @@ class RecognizerSession:
             return self.last_sequence
         return min(self.last_sequence, self.end.sequence - 1)
 
-    def take_next(self, message: AudioChunk, now_s: float) -> bool:
+    def accept_in_order(self, message: AudioChunk, now_s: float) -> bool:
         """Accept a message newer than the last, unless messages before it are missing.
 
         ZeroMQ loses messages in flight when a connection ends. A client that asks for
@@ -179,13 +179,13 @@ class RecognizerSession:
             raise AudioRejected(ErrorCode.FINISHED, text)
 
     def read_chunk(self, chunk: AudioChunk, now_s: float) -> Chunk | None:
-        """Return the audio of a message in order; None if all of it is to be skipped.
+        """Return the audio of a message; None if all of it must be skipped.
 
         Raises ``AudioRejected`` if the audio is not valid, or too early.
         """
         rate_hz, media_time = self.start.sample_rate_hz, chunk.media_time
         try:
-            samples = samples_of(chunk.pcm, self.start.encoding, self.start.num_channels)
+            samples = decode_pcm(chunk.pcm, self.start.encoding, self.start.num_channels)
             if self._encoding is not None:
                 self._encoding.check(chunk.pcm)
         except (BadAudio, UserError) as error:
@@ -201,9 +201,9 @@ class RecognizerSession:
             raise AudioRejected(ErrorCode.BAD_AUDIO, text)
         end = media_time + len(samples) * MEDIA_RATE_HZ // rate_hz
         self.replay_window.add(chunk.sequence, end)
-        if self.resumption is None:
+        if self.resume_filter is None:
             return media_time, samples
-        aligned = self.resumption.align((media_time, samples), rate_hz)
+        aligned = self.resume_filter.align((media_time, samples), rate_hz)
         return aligned if len(aligned[1]) else None
 
     @property
@@ -211,7 +211,7 @@ class RecognizerSession:
         """Whether there is queued audio that the stream may take now."""
         if not self.audio:
             return False
-        return not self.is_scoring or self.stream.can_continue(self.audio.media_time)
+        return not self.is_scoring or self.stream.can_accept_while_scoring(self.audio.media_time)
 
     def accept_waveform(self, max_s: float, now_s: float, hop: int) -> None:
         """Pass up to ``max_s`` of queued audio to the stream. Skip audio that is too old.
@@ -224,8 +224,10 @@ class RecognizerSession:
             self.accepted_s = now_s
             self.stream.set_hop(hop)
             has_skipped = self.audio.skip_old(now_s)
-            is_light = self.face.settings.acoustic == AcousticModelName.LIGHT
-            self.stream.set_light(is_light or self.audio.overload.needs_light_model(now_s))
+            uses_light_model = self.face.settings.acoustic == AcousticModelName.LIGHT
+            self.stream.set_light_model(
+                uses_light_model or self.audio.overload.needs_light_model(now_s)
+            )
         chunks = self.audio.take(max_s)
         while self.can_accept and (chunk := next(chunks, None)) is not None:
             media_time, samples = chunk
@@ -270,26 +272,26 @@ class RecognizerSession:
     def new_results(self, recognizer: Recognizer) -> list[StreamOutput]:
         """Return the stream's new results, without those that a lost recognizer has emitted."""
         results = recognizer.get_result(self.stream)
-        return results if self.resumption is None else self.resumption.new_results(results)
+        return results if self.resume_filter is None else self.resume_filter.new_results(results)
 
     def published_messages(self, results: Iterable[StreamOutput]) -> Iterator[Message]:
         """Yield the messages of results for subscribers."""
         for result in results:
             if isinstance(result, Phone | LipPositions | SpeechChange):
-                yield self._numbered(message_of(result))
+                yield self._number(message_of(result))
             else:
-                yield from map(self._numbered, self._sound.add(result))
+                yield from map(self._number, self._sound_packets.add(result))
 
     def acoustic_message(self, results: Sequence[StreamOutput]) -> Acoustic | None:
-        """Return the message about the acoustic model in use, if these results make it due."""
-        model = AcousticModelName.LIGHT if self.stream.is_light else AcousticModelName.FULL
+        """Return a message about the acoustic model if it has changed or speech starts."""
+        model = AcousticModelName.LIGHT if self.stream.uses_light_model else AcousticModelName.FULL
         starts = any(isinstance(result, SpeechChange) and result.active for result in results)
         if model == self._published_acoustic and not starts:
             return None
         self._published_acoustic = model
-        return self._numbered(Acoustic(model=model, media_time=self.stream.media_time))
+        return self._number(Acoustic(model=model, media_time=self.stream.media_time))
 
-    def _numbered(self, message: M) -> M:
+    def _number(self, message: M) -> M:
         self.output_sequence += 1
         return replace(
             message, session=self.name, epoch=self.start.epoch, sequence=self.output_sequence
@@ -302,7 +304,7 @@ class RecognizerSession:
                 self.replay_window.update(event_of(message), self.last_sequence)
 
 
-class _AheadLimit:
+class _LeadLimiter:
     """Limits how far a paced client's audio is ahead of the clock."""
 
     def __init__(self, now_s: float, *, may_catch_up: bool) -> None:

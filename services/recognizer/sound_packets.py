@@ -1,10 +1,10 @@
-"""Joins a session's audio into longer messages, because each message has a fixed cost."""
+"""Joins a session's audio into longer messages, because every message has a fixed cost."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
-from kouxing.services.recognizer.front_end.pcm import pcm16_of
+from kouxing.services.recognizer.front_end.pcm import encode_pcm16
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.phones.events import EndOfSound, SoundEvent, Waveform
 from kouxing.shared.wire.audio import Sound
@@ -35,6 +35,6 @@ class SoundPackets:
 
     def _take(self) -> Iterator[Sound]:
         if len(self._samples):
-            yield Sound(media_time=self._start, pcm=pcm16_of(self._samples))
+            yield Sound(media_time=self._start, pcm=encode_pcm16(self._samples))
             self._start += len(self._samples)
             self._samples = self._samples[:0]

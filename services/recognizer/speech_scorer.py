@@ -1,4 +1,4 @@
-"""Audio to state scores of speech.
+"""Finds speech in audio and scores it with the acoustic model.
 
     samples -> speech segmenter -> [speech only] acoustic model -> events
 
@@ -20,7 +20,7 @@ from kouxing.services.recognizer.encoder import EncoderOutput, EncoderStream, pr
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.speech_segmenter import (
-    Position,
+    EncoderInput,
     SpeechEnd,
     SpeechFrames,
     SpeechSegmenter,
@@ -39,8 +39,8 @@ from kouxing.shared.records import Record, replace
 class FrameScores(Record, frozen=True):
     """State scores of the next frames of speech."""
 
-    settled: Floats  # (m, states) of the frames after those settled before
-    provisional: Floats  # (k, states) of the frames after those, until the next FrameScores
+    settled: Floats  # (m, states) of the frames after the last settled frame
+    provisional: Floats  # (k, states) of the frames after ``settled``, until the next event
 
 
 ScoreEvent: TypeAlias = (
@@ -58,17 +58,17 @@ ScoreEvent: TypeAlias = (
 EarlyEvent: TypeAlias = LipPositions | Progress | Waveform
 
 
-class _Slice(Record, frozen=True):
+class _SliceEnd(Record, frozen=True):
     """The end of a slice of 20 ms."""
 
-    progress: Progress  # its measurement, without the traits of the voice
+    progress: Progress  # the slice's measurement, without the traits of the voice
 
 
 class SpeechScorer:
     """Scores the speech of one session.
 
     ``accept_waveform`` queues the audio. ``run_encoder`` finds the speech in it and
-    ``score_found`` scores the speech, together with other sessions' audio. ``get_events`` returns
+    ``score_speech`` scores the speech, together with other sessions' audio. ``get_events`` returns
     the results in order.
 
     For the other parameters, see :class:`SpeechSegmenter`.
@@ -80,58 +80,67 @@ class SpeechScorer:
         lip_stream: LipFrameStream | None = None,
         start_frame: int | None = None,
     ) -> None:
-        self._own: AcousticStream = model.create_stream()
-        self._stream = self._own  # the one in use
-        self._blocks = self._own if isinstance(self._own, BlockStream) else None
-        light = model.light if isinstance(model, BlockModel) else None
-        self._light = light.create_stream() if light else None
-        front_end = WhisperMel() if self._own.uses_encoder else model.create_front_end()
+        self._default_stream: AcousticStream = model.create_stream()
+        self._stream = self._default_stream  # the stream in use
+        self._block_stream = (
+            self._default_stream if isinstance(self._default_stream, BlockStream) else None
+        )
+        light = model.light_model if isinstance(model, BlockModel) else None
+        self._light_stream = light.create_stream() if light else None
+        front_end = (
+            WhisperMel() if self._default_stream.uses_encoder_phones else model.create_front_end()
+        )
         self._segmenter = SpeechSegmenter(front_end, lip_stream, start_frame)
         # Audio that the encoder has not processed, and events, in order; None: the end of the audio
-        self._encoder_queue: deque[Position | _Slice | ScoreEvent | None] = deque()
+        self._encoder_queue: deque[EncoderInput | _SliceEnd | ScoreEvent | None] = deque()
         self._needs_light = False  # whether the light model scores the next speech
-        # Frames to score, and events in order. The first item is to be scored; SpeechEnd is too.
+        # Frames to score, and events, in order. The first item is SpeechFrames or SpeechEnd.
         self._queue: deque[SpeechFrames | ScoreEvent] = deque()
-        self._found = self._queue  # takes what the encoder finds; another one during scoring
+        self._detected = self._queue  # output of the encoder; a separate queue during scoring
         self._events: list[ScoreEvent] = []  # not yet returned
         self._num_unscored = 0  # frames of the current speech without settled scores
 
     @property
-    def is_light(self) -> bool:
+    def uses_light_model(self) -> bool:
         """Whether the light model scores the speech."""
-        return self._stream.uses_encoder
+        return self._stream.uses_encoder_phones
 
-    def set_light(self, is_light: bool) -> None:
+    def set_light_model(self, uses_light_model: bool) -> None:
         """Use the light model, or the session's own model from the next start of speech on."""
-        self._needs_light = is_light
-        if not is_light or self._light is None or self.is_light or self._queue:
+        self._needs_light = uses_light_model
+        if (
+            not uses_light_model
+            or self._light_stream is None
+            or self.uses_light_model
+            or self._queue
+        ):
             return
         provisional = self._stream.provisional
         if len(provisional):
             self._events.append(FrameScores(provisional, provisional[:0]))
-        self._own.reset()
-        self._light.start(self._num_unscored - len(provisional))
-        self._stream = self._light
+        self._default_stream.reset()
+        self._light_stream.start(self._num_unscored - len(provisional))
+        self._stream = self._light_stream
 
     @property
     def needs_network(self) -> bool:
         """Whether scoring the queued audio needs a run of the block network."""
-        if self._blocks is None or self._stream is not self._blocks:
+        if self._block_stream is None or self._stream is not self._block_stream:
             return False
         frames = (item.features for item in self._queue if isinstance(item, SpeechFrames))
         has_end = any(isinstance(item, SpeechEnd) for item in self._queue)
-        return has_end or self._blocks.is_due_after(sum(map(len, frames)))
+        return has_end or self._block_stream.is_due_after(sum(map(len, frames)))
 
     def set_hop(self, num_blocks: int) -> None:
         """Set the hop of the block network, if the session uses it."""
-        if self._blocks is not None:
-            self._blocks.set_hop(num_blocks)
+        if self._block_stream is not None:
+            self._block_stream.set_hop(num_blocks)
 
     def accept_waveform(self, samples: Floats, progress: Progress | None = None) -> None:
-        """Queue samples, 16 kHz mono, shape (n,), and the measurement of the slice they end."""
-        self._encoder_queue.extend(self._segmenter.positions(samples))
+        """Queue samples, 16 kHz mono, shape (n,), and the measurement of a slice that they end."""
+        self._encoder_queue.extend(self._segmenter.encoder_inputs(samples))
         if progress is not None:
-            self._encoder_queue.append(_Slice(progress))
+            self._encoder_queue.append(_SliceEnd(progress))
 
     def input_finished(self) -> None:
         """End the audio."""
@@ -141,21 +150,21 @@ class SpeechScorer:
         """Queue an event, to be returned after the results of the audio so far."""
         self._encoder_queue.append(event)
 
-    def next_position(self) -> Position | None:
+    def next_encoder_input(self) -> EncoderInput | None:
         """Return the next position for the encoder, or None if the queue has no position."""
         while self._encoder_queue:
             item = self._encoder_queue[0]
-            if isinstance(item, Position):
+            if isinstance(item, EncoderInput):
                 return item
             self._encoder_queue.popleft()
             if item is None:
-                self._found.extend(self._segmenter.input_finished())
-            elif isinstance(item, _Slice):
+                self._detected.extend(self._segmenter.input_finished())
+            elif isinstance(item, _SliceEnd):
                 traits = self._segmenter.traits._asdict()
-                self._found.append(replace(item.progress, **traits))
+                self._detected.append(replace(item.progress, **traits))
             else:
-                self._found.append(item)
-        if self._found is self._queue:
+                self._detected.append(item)
+        if self._detected is self._queue:
             self._release_events()
         return None
 
@@ -164,34 +173,34 @@ class SpeechScorer:
         """The stream that processes the positions."""
         return self._segmenter.encoder
 
-    def add_encoder_output(self, position: Position, output: EncoderOutput) -> None:
-        """Add the output of the encoder at ``next_position``."""
+    def add_encoder_output(self, position: EncoderInput, output: EncoderOutput) -> None:
+        """Add the output of the encoder at ``next_encoder_input``."""
         self._encoder_queue.popleft()
-        self._found.extend(self._segmenter.process(position, output))
+        self._detected.extend(self._segmenter.process(position, output))
 
     def start_scoring(self) -> bool:
-        """Let another thread score the speech so far; return whether more audio may follow now.
+        """Hand the speech so far to another thread; return whether more audio may follow now.
 
-        If so, ``run_encoder`` and ``release_early`` process only audio that follows, until
+        If so, ``run_encoder`` and ``take_early_events`` process only audio that follows, until
         ``finish_scoring``. Queued events prevent this, because their order would change.
         """
         if all(isinstance(item, SpeechFrames) for item in self._queue):
-            self._found = deque()
-        return self._found is not self._queue
+            self._detected = deque()
+        return self._detected is not self._queue
 
     def finish_scoring(self) -> None:
-        """Score further speech on this thread."""
-        if self._found is not self._queue:
-            self._queue.extend(self._found)
-            self._found = self._queue
+        """End ``start_scoring``: score further speech on this thread."""
+        if self._detected is not self._queue:
+            self._queue.extend(self._detected)
+            self._detected = self._queue
 
     @property
     def is_ready(self) -> bool:
         """Whether there is audio to score."""
-        return self.has_found or bool(self._encoder_queue)
+        return self.has_speech or bool(self._encoder_queue)
 
     @property
-    def has_found(self) -> bool:
+    def has_speech(self) -> bool:
         """Whether there is speech to score, or its end."""
         return bool(self._queue)
 
@@ -206,25 +215,25 @@ class SpeechScorer:
         return events
 
     def _release_events(self) -> None:
-        """Make the events available that no queued audio precedes."""
+        """Release the events that precede all queued audio."""
         while self._queue and not isinstance(event := self._queue[0], SpeechFrames | SpeechEnd):
             self._queue.popleft()
             self._events.append(event)
             if isinstance(event, SpeechStart):
-                self._stream = (self._needs_light and self._light) or self._own
+                self._stream = (self._needs_light and self._light_stream) or self._default_stream
                 self._num_unscored = 0
 
-    def release_early(self) -> list[EarlyEvent]:
-        """Return the lip frames and levels of unscored speech before its phones."""
+    def take_early_events(self) -> list[EarlyEvent]:
+        """Return lip frames and levels of unscored speech, before its phones."""
         unscored: list[SpeechFrames] = []
         early: list[EarlyEvent] = []
-        while self._found and isinstance(item := self._found[0], SpeechFrames | EarlyEvent):
-            self._found.popleft()
+        while self._detected and isinstance(item := self._detected[0], SpeechFrames | EarlyEvent):
+            self._detected.popleft()
             if isinstance(item, SpeechFrames):
                 unscored.append(item)
             else:
                 early.append(item)
-        self._found.extendleft(reversed(unscored))
+        self._detected.extendleft(reversed(unscored))
         return early
 
     def next_request(self) -> ScoreRequest:
@@ -234,7 +243,7 @@ class SpeechScorer:
         if not isinstance(item, SpeechFrames):
             return stream, None
         self._num_unscored += len(item.features)
-        return stream, item.phones if stream.uses_encoder else item.features
+        return stream, item.phones if stream.uses_encoder_phones else item.features
 
     def add_scores(self, settled: Floats) -> None:
         """Add the settled scores of ``next_request``, (m, states)."""
@@ -249,7 +258,7 @@ class SpeechScorer:
 
 def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
     """Find the speech in the queued audio of several sessions, in batches."""
-    while waiting := [(one, position) for one in scorers if (position := one.next_position())]:
+    while waiting := [(one, position) for one in scorers if (position := one.next_encoder_input())]:
         streams = [scorer.encoder for scorer, _ in waiting]
         encoder_outputs = process_positions(streams, [position.mels for _, position in waiting])
         for (scorer, position), of_scorer in zip(waiting, encoder_outputs, strict=True):
@@ -259,12 +268,12 @@ def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:
     """Score the queued audio of several sessions, in one batch for each model."""
     run_encoder(scorers)
-    score_found(scorers)
+    score_speech(scorers)
 
 
-def score_found(scorers: Sequence[SpeechScorer]) -> None:
+def score_speech(scorers: Sequence[SpeechScorer]) -> None:
     """Score the speech that ``run_encoder`` has found, in one batch for each model."""
-    while ready := [scorer for scorer in scorers if scorer.has_found]:
+    while ready := [scorer for scorer in scorers if scorer.has_speech]:
         model = ready[0].model
         batch = [scorer for scorer in ready if scorer.model is model]
         scores = model.score([scorer.next_request() for scorer in batch])

@@ -1,4 +1,4 @@
-"""Finds the speech in one session's audio, and predicts the lips during it.
+"""Finds the speech in one session's audio, and predicts the lips during speech.
 
     samples -> front ends -> audio encoder -> [speech only] frames, lip frames
 
@@ -26,7 +26,8 @@ from kouxing.shared.records import Record
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
 _DETECTION_S = 0.06  # the encoder's look-ahead, and a position
-# Positions end at odd frames, POSITION_LAG_S before a multiple of 20 ms. Speech starts at one.
+# Positions end at odd frames, POSITION_LAG_S before a multiple of 20 ms. So speech starts at an
+# odd frame.
 _FIRST_FRAME_PARITY = 1
 _SEEN_AFTER_FRAMES = 2  # frames after speech starts that its first lip frame needs
 _BLOCK_FRAMES = 4  # frames in a block of the network; blocks start with the speech
@@ -35,13 +36,13 @@ _MAX_RECENT = (_PRE_ROLL_FRAMES + _BLOCK_FRAMES) // FRAMES_PER_POSITION
 
 
 class SpeechStart(Record, frozen=True):
-    """Speech starts. Its first frame is ``frame``."""
+    """Start of speech; its first frame is ``frame``."""
 
     frame: int
 
 
 class SpeechEnd(Record, frozen=True):
-    """Speech has ended before ``frame``."""
+    """End of speech, before ``frame``."""
 
     frame: int
 
@@ -53,7 +54,7 @@ class SpeechFrames(Record, frozen=True):
     phones: Floats  # (n, phones), the encoder's log posteriors after each frame
 
 
-class Position(Record, frozen=True):
+class EncoderInput(Record, frozen=True):
     """The input of the audio encoder at a position, and the front end's features."""
 
     features: Floats  # (2, k)
@@ -64,14 +65,14 @@ SpeechItem: TypeAlias = SpeechStart | SpeechEnd | SpeechFrames | LipPositions
 
 
 class SpeechSegmenter:
-    """Follows the audio of one session.
+    """Divides the audio of one session into speech and pauses.
 
     Parameters
     ----------
     front_end
         Computes the feature frames.
     lip_stream
-        Predicts lip frames during speech, if any.
+        Predicts lip frames during speech; None: no lip frames.
     start_frame
         Frame at which speech started, if another recognizer processed its start; negative before
         the audio. The first speech then starts where the network's blocks align with the other
@@ -105,10 +106,10 @@ class SpeechSegmenter:
 
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
         """Accept samples, 16 kHz mono, shape (n,); yield the resulting items."""
-        for position in self.positions(samples):
+        for position in self.encoder_inputs(samples):
             yield from self.process(position, self.encoder.process_position(position.mels))
 
-    def positions(self, samples: Floats) -> Iterator[Position]:
+    def encoder_inputs(self, samples: Floats) -> Iterator[EncoderInput]:
         """Accept samples, 16 kHz mono, shape (n,); yield the new positions, to be processed."""
         features = self._front_end.accept_waveform(samples)
         mels = features if self._mel is None else self._mel.accept_waveform(samples)
@@ -116,7 +117,7 @@ class SpeechSegmenter:
         if self._features is not None:
             features = np.concatenate([self._features, features])
         while len(self._mels) >= FRAMES_PER_POSITION:
-            yield Position(features[:FRAMES_PER_POSITION], self._mels[:FRAMES_PER_POSITION])
+            yield EncoderInput(features[:FRAMES_PER_POSITION], self._mels[:FRAMES_PER_POSITION])
             self._mels = self._mels[FRAMES_PER_POSITION:]
             features = features[FRAMES_PER_POSITION:]
         self._features = features
@@ -126,7 +127,7 @@ class SpeechSegmenter:
         if self._is_speaking:
             yield self._end_speech()
 
-    def process(self, position: Position, output: EncoderOutput) -> Iterator[SpeechItem]:
+    def process(self, position: EncoderInput, output: EncoderOutput) -> Iterator[SpeechItem]:
         """Start or end speech and predict lips after a position, given the encoder's output."""
         features = position.features
         self._num_frames += len(features)
@@ -177,7 +178,7 @@ class SpeechSegmenter:
         return SpeechEnd(self._num_frames)
 
     def _predict_lips(self, position: EncoderOutput, newest_frame: int) -> list[LipPositions]:
-        """Return the lip frames that follow from a position, whose last frame is given."""
+        """Return the lip frames of a position; ``newest_frame`` is its last feature frame."""
         if self._lip_stream is None:
             return []
         known_s = newest_frame * HOP_S + WINDOW_S

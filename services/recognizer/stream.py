@@ -1,4 +1,4 @@
-"""One session's audio, between the recognizer's calls.
+"""Holds one session's audio and results between the recognizer's calls.
 
     chunks -> gaps -> resampler -> 20 ms slices -> scores -> phones, lip frames, level
 
@@ -30,7 +30,7 @@ from kouxing.shared.phones.events import (
 )
 from kouxing.shared.records import replace
 
-MAX_JITTER = MEDIA_RATE_HZ // 10  # media time that jumps further ahead leaves a gap; samples
+MAX_JITTER = MEDIA_RATE_HZ // 10  # a larger jump of the media time is a gap; samples
 SILENT_DB = -120.0  # the level after the last sample
 
 
@@ -68,21 +68,22 @@ class SpeechStream:
         self._next_index = 0
         self._is_speaking = False
         self._results: list[StreamOutput] = []  # not yet returned
-        self._early: list[StreamOutput] | None = None  # the same during scoring on another thread
+        # early results during scoring on another thread
+        self._early_results: list[StreamOutput] | None = None
         self._segments = [self._new_segment(0)]  # the last one accepts audio
 
     @property
-    def is_light(self) -> bool:
+    def uses_light_model(self) -> bool:
         """Whether the light model finds the phones."""
-        return self._segments[-1].scorer.is_light
+        return self._segments[-1].scorer.uses_light_model
 
-    def set_light(self, is_light: bool) -> None:
+    def set_light_model(self, uses_light_model: bool) -> None:
         """Use the light model, or the session's own model from the next start of speech on.
 
         All audio so far must be decoded.
         """
-        self._needs_light_model = is_light
-        self._segments[-1].scorer.set_light(is_light)
+        self._needs_light_model = uses_light_model
+        self._segments[-1].scorer.set_light_model(uses_light_model)
 
     def set_hop(self, num_blocks: int) -> None:
         """Set the hop of the block network, as a number of blocks."""
@@ -125,7 +126,7 @@ class SpeechStream:
         self._segments[-1].accept_waveform(samples)
 
     def skip_to(self, media_time: int) -> None:
-        """Continue at a media time, as after a gap. The skipped time gets no frames."""
+        """Continue at a media time, as after a gap. The skipped time has no frames."""
         self._segments[-1].input_finished()
         self._start_at(media_time)
         self._segments[-1].scorer.add_event(AudioSkipped(time_s=to_seconds(media_time)))
@@ -156,35 +157,35 @@ class SpeechStream:
         self._segments = self._segments[-1:]
 
     def decode_early(self) -> None:
-        """Return the lip frames and levels of unscored speech before its phones."""
-        if self._early is not None:
-            self._early += self._segments[0].decode_early()
+        """Return lip frames and levels of unscored speech, before its phones."""
+        if self._early_results is not None:
+            self._early_results += self._segments[0].decode_early()
         elif len(self._segments) == 1:
             self.decode()
             self._results += self._segments[0].decode_early()
 
     def start_scoring(self) -> None:
-        """Let another thread decode the speech that was found, until ``finish_scoring``.
+        """Hand the detected speech to another thread, until ``finish_scoring``.
 
         In the meantime, ``take_results`` returns only results of ``decode_early``. The stream may
-        take further audio if ``can_continue``, and no other calls.
+        take further audio if ``can_accept_while_scoring``, and no other calls.
         """
         if len(self._segments) == 1 and self._segments[0].scorer.start_scoring():
-            self._early = []
+            self._early_results = []
 
     def finish_scoring(self) -> None:
-        """Use the stream as usual again."""
+        """End ``start_scoring``: all calls are allowed again."""
         self._segments[0].scorer.finish_scoring()
-        self._early = None
+        self._early_results = None
 
-    def can_continue(self, media_time: int) -> bool:
+    def can_accept_while_scoring(self, media_time: int) -> bool:
         """Return whether the stream may take audio from this time on during scoring."""
-        return self._early is not None and not self._is_gap_before(media_time)
+        return self._early_results is not None and not self._is_gap_before(media_time)
 
     def take_results(self) -> list[StreamOutput]:
         """Return the results since the last call."""
-        if self._early is not None:
-            early, self._early = self._early, []
+        if self._early_results is not None:
+            early, self._early_results = self._early_results, []
             return early
         results, self._results = self._results, []
         return results
@@ -201,7 +202,7 @@ class SpeechStream:
         return replace(phone, index=index)
 
     def _start_at(self, media_time: int) -> None:
-        """Start the first segment again, or add one after a gap."""
+        """Restart the first segment, or add a segment after a gap."""
         is_first, self._first_chunk, self._num_in = self._first_chunk is None, media_time, 0
         segment = self._new_segment(media_time)
         self._segments = [segment] if is_first else [*self._segments, segment]
@@ -216,7 +217,7 @@ class SpeechStream:
             start_frame = frame_at(to_seconds(self._speech_time - media_time))
             self._speech_time = 0
         scorer = SpeechScorer(self._model, lip_stream, start_frame)
-        scorer.set_light(self._needs_light_model)
+        scorer.set_light_model(self._needs_light_model)
         scorer.set_hop(self._hop)
         return _AudioSegment(
             media_time,
@@ -265,7 +266,7 @@ class _AudioSegment:
 
     def decode_early(self) -> list[StreamOutput]:
         """Return the lip frames and levels of unscored speech, as ``decode`` would later."""
-        return self._to_session_times(self.scorer.release_early())
+        return self._to_session_times(self.scorer.take_early_events())
 
     def _to_session_times(self, results: Iterable[StreamOutput]) -> list[StreamOutput]:
         return [

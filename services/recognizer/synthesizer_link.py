@@ -1,7 +1,7 @@
 """A session's messages to its synthesizer, and the sockets to synthesizers.
 
-A new synthesizer in place of a lost one must continue the face. It gets the newest frame that was
-published, and the messages of the last seconds again.
+A synthesizer that replaces a lost one must continue the face. It receives the newest published
+frame, and the messages of the last seconds again.
 """
 
 from collections import deque
@@ -16,20 +16,20 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
 
 MAX_BACKLOG = 2000  # unacknowledged messages above which audio waits
-MAX_OVERDUE_S = 5.0  # new messages are dropped after this time, so that other sessions continue
-KEPT = to_samples(3.0)  # media time of the messages that a new synthesizer gets, samples
+MAX_OVERDUE_S = 5.0  # then new messages are dropped, so that other sessions continue
+KEPT_SAMPLES = to_samples(3.0)  # media time of the messages kept for a new synthesizer, samples
 
 
 class SynthesizerLink:
-    """Sends to the session's current synthesizer, and keeps what a new one needs."""
+    """Sends to the session's current synthesizer, and keeps messages for a replacement."""
 
     def __init__(self) -> None:
         self._sender: ReliableSender | None = None
-        self._kept: deque[Message] = deque()  # acknowledged messages of the last KEPT samples
-        self._speech: Speech | None = None  # the newest message before those
+        self._acknowledged: deque[Message] = deque()  # messages of the last KEPT_SAMPLES
+        self._speech: Speech | None = None  # the newest Speech before these messages
         self._newest_frame: NewestFrame | None = None  # published by the synthesizer
         self._full_since_s: float | None = None
-        self._drops = False
+        self._is_dropping = False
 
     @property
     def backlog(self) -> int:
@@ -37,10 +37,13 @@ class SynthesizerLink:
         return len(self._sender.unacknowledged) if self._sender is not None else 0
 
     def connect(self, socket: Socket, session: str, epoch: int, now_s: float) -> None:
-        """Send to this synthesizer from now on, first what a new one needs."""
-        messages = [*self._kept, *(self._sender.unacknowledged if self._sender is not None else ())]
-        self._kept.clear()
-        self._full_since_s, self._drops = None, False
+        """Switch to this synthesizer. First send the newest frame and the kept messages."""
+        messages = [
+            *self._acknowledged,
+            *(self._sender.unacknowledged if self._sender is not None else ()),
+        ]
+        self._acknowledged.clear()
+        self._full_since_s, self._is_dropping = None, False
         self._sender = ReliableSender(socket, session, epoch)
         if (frame := self._newest_frame) is not None:
             self._sender.send(Progress(media_time=frame.media_time, newest_frame=frame), now_s)
@@ -53,25 +56,25 @@ class SynthesizerLink:
 
     @property
     def is_full(self) -> bool:
-        """Whether audio must wait."""
-        return self.backlog > MAX_BACKLOG and not self._drops
+        """Whether the backlog is too long to accept more audio."""
+        return self.backlog > MAX_BACKLOG and not self._is_dropping
 
     def check_overdue(self, now_s: float) -> bool:
-        """Return whether the link starts to drop messages; it stops when all are acknowledged."""
+        """Return whether the link starts to drop messages. It stops when all are acknowledged."""
         if self.backlog <= MAX_BACKLOG:
             self._full_since_s = None
-            self._drops = self._drops and self.backlog > 0
+            self._is_dropping = self._is_dropping and self.backlog > 0
             return False
         if self._full_since_s is None:
             self._full_since_s = now_s
-        if self._drops or now_s - self._full_since_s <= MAX_OVERDUE_S:
+        if self._is_dropping or now_s - self._full_since_s <= MAX_OVERDUE_S:
             return False
-        self._drops = True
+        self._is_dropping = True
         return True
 
     def send(self, message: Message, now_s: float) -> None:
         """Send a message, if there is a synthesizer and the link is not dropping messages."""
-        if self._sender is not None and not self._drops:
+        if self._sender is not None and not self._is_dropping:
             self._sender.send(message, now_s)
 
     def acknowledge(self, ack: Acknowledge, now_s: float) -> list[Message]:
@@ -81,16 +84,19 @@ class SynthesizerLink:
         self._newest_frame = ack.newest_frame or self._newest_frame
         acknowledged = self._sender.acknowledge(ack.sequence, now_s)
         messages = [message for message in acknowledged if not is_state_report(message)]
-        self._kept.extend(messages)
-        while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:
-            oldest = self._kept.popleft()
+        self._acknowledged.extend(messages)
+        while (
+            self._acknowledged
+            and self._acknowledged[0].media_time < self._acknowledged[-1].media_time - KEPT_SAMPLES
+        ):
+            oldest = self._acknowledged.popleft()
             if isinstance(oldest, Speech):
                 self._speech = oldest
         return messages
 
     def forget(self) -> None:
         """Forget all messages before an interruption."""
-        self._kept.clear()
+        self._acknowledged.clear()
         self._speech = None
 
     def tick(self, now_s: float) -> int:

@@ -1,4 +1,4 @@
-"""Speech to text, for audio without a transcript, with sherpa-onnx."""
+"""Speech to text with sherpa-onnx, for audio without a transcript."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from kouxing.shared.errors import UserError, install_command
 
 
 class Transcriber:
-    """A Mandarin model that the user provides.
+    """Transcribes Mandarin with a model that the user provides.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Estimates what a voice shows apart from its words: arousal, valence, laughter and breath.
+"""Estimates arousal, valence, laughter and breath from the voice.
 
 A linear readout of the audio encoder's hidden layers, every 20 ms:
 
@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import Archive, load_part, write_archive
+from kouxing.services.recognizer.acoustic.model_file import Archive, load_component, write_archive
 from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 
 TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
@@ -39,7 +39,7 @@ NUM_TRAITS = 4  # arousal, valence, laughter, breath
 MIN_VOICE = 0.5  # smallest probability of a voice at which arousal and valence count
 
 _FEELING = slice(0, 2)
-_MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # memory of the mean arousal and valence; its prior
+_MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # memory of mean arousal and valence; weight of the prior
 _PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # voice: weight of the prior mean, memory of m
 _DIGITS = 2  # feelings change slowly, so that equal messages compress well
 _EVIDENCE_FRACTION = 0.1  # weight of a new position
@@ -49,7 +49,7 @@ _LAUGH_POSITIONS = 50  # laughter ends after this many positions without a laugh
 
 
 class VoiceTraits(NamedTuple):
-    """Traits of a voice; the fields match ``Progress``."""
+    """Traits of a voice; the fields have the names in ``Progress``."""
 
     arousal: float = 0.0
     valence: float = 0.0
@@ -89,11 +89,11 @@ class VoiceTraitsStream:
 
     def process_position(self, position: EncoderOutput) -> None:
         """Process the encoder's next position."""
-        # Few numbers: lists take less time than arrays.
+        # For so few numbers, lists are faster than arrays.
         outputs: list[float] = (
             position.state @ self._readout.weights + self._readout.bias
         ).tolist()
-        if position.voice[VoiceKind.SPEECH] + position.voice[VoiceKind.SUNG] > MIN_VOICE:
+        if position.voice[VoiceKind.SPEECH] + position.voice[VoiceKind.SINGING] > MIN_VOICE:
             self._num_voiced += 1
             feeling = outputs[_FEELING]
             num_known = min(self._num_voiced + _PRIOR_POSITIONS, _MAX_POSITIONS)
@@ -124,10 +124,10 @@ class VoiceTraitsStream:
 @cache
 def load_voice_readout(path: Path = TRAITS_PATH) -> VoiceReadout:
     """Read a model file; ``UserError`` if it is missing, broken or of another format."""
-    return load_part(path, FORMAT, "readout of voice traits", _readout_from)
+    return load_component(path, FORMAT, "readout of voice traits", _parse_readout)
 
 
-def _readout_from(archive: Archive) -> VoiceReadout:
+def _parse_readout(archive: Archive) -> VoiceReadout:
     return VoiceReadout(
         weights=archive.floats("weights", load_encoder().state_width, NUM_TRAITS),
         bias=archive.floats("bias", NUM_TRAITS),

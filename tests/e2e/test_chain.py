@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kouxing.evaluation.lips.live_faces import live_events, live_frames
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
@@ -171,7 +171,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def expected(recordings: list[Path]) -> dict[str, list[events.Phone]]:
     """The phones of each recording by its name, found by a single call."""
     model = load_model()
-    return {path.name: recognize(model, *read_audio(path)) for path in recordings}
+    return {path.name: recognize_recording(model, *read_audio(path)) for path in recordings}
 
 
 def without_silence(phones: list[events.Phone]) -> list[events.Phone]:

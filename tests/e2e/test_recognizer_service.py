@@ -7,11 +7,11 @@ from itertools import pairwise
 
 import pytest
 
-from kouxing.services.recognizer import starting_sessions
+from kouxing.services.recognizer import pending_sessions
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.live_batches import MAX_BATCH_S
+from kouxing.services.recognizer.live_batch_decoder import MAX_BATCH_S
 from kouxing.services.recognizer.service import MAX_UNPACED_S, RecognizerService
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
@@ -158,9 +158,9 @@ def test_other_sessions_continue_while_a_model_is_loaded(
     def load_slowly(language: str) -> AcousticModel:
         loaded_on.append(threading.get_ident())
         assert is_released.wait(60.0)
-        return model_of_language(language)
+        return load_model_for_language(language)
 
-    monkeypatch.setattr(starting_sessions, "model_of_language", load_slowly)
+    monkeypatch.setattr(pending_sessions, "load_model_for_language", load_slowly)
     german = replace(UNPACED, session="de", facts=SessionFacts(language="german"))
     live = replace(UNPACED, session="live", paced=True)
     for start in (live, german, replace(german, session="closed")):
@@ -192,7 +192,7 @@ def test_reports_a_model_that_cannot_be_loaded(
     def fail(language: str) -> AcousticModel:
         raise UserError(f"no model for {language}")
 
-    monkeypatch.setattr(starting_sessions, "model_of_language", fail)
+    monkeypatch.setattr(pending_sessions, "load_model_for_language", fail)
     service._on_start_session(replace(UNPACED, facts=SessionFacts(language="german")), Peer())
     wait_until(lambda: service.warned, step=lambda: service.step(0.01))
     assert service.warned == [("start", "no model for german")]

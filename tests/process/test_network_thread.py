@@ -14,7 +14,7 @@ class FakeSession:
     """A session whose stream is itself."""
 
     def __init__(self) -> None:
-        self.is_due = self.is_scoring = False
+        self.waits_for_network = self.is_scoring = False
         self.stream = self
         self.num_scored = 0
 
@@ -32,7 +32,7 @@ class FakeRecognizer:
         self.batches: list[Sequence[Any]] = []
         self.error: Exception | None = None
 
-    def decode_found(self, streams: Sequence[Any]) -> None:
+    def decode_speech(self, streams: Sequence[Any]) -> None:
         self.batches.append(streams)
         if self.error is not None:
             raise self.error
@@ -64,13 +64,13 @@ def test_the_thread_decodes_waiting_sessions_once_and_in_order(
     sessions = make_sessions(MAX_SESSIONS + 1)
     for session in [*sessions, *sessions]:
         thread.add(session, 0.0)
-    assert all(session.is_due for session in sessions)
+    assert all(session.waits_for_network for session in sessions)
     thread.start(0.0)
     assert [session.is_scoring for session in sessions] == [True] * MAX_SESSIONS + [False]
     assert decoded(thread) == sessions[:MAX_SESSIONS]
     thread.start(0.0)
     assert decoded(thread) == sessions[MAX_SESSIONS:]
-    assert not any(session.is_due or session.is_scoring for session in sessions)
+    assert not any(session.waits_for_network or session.is_scoring for session in sessions)
     assert [cast(FakeSession, session).num_scored for session in sessions] == [1] * len(sessions)
     assert [len(batch) for batch in recognizer.batches] == [MAX_SESSIONS, 1]
 
@@ -79,7 +79,7 @@ def test_under_load_sessions_wait_for_others_for_a_limited_time(thread: NetworkT
     first, *others = make_sessions(MAX_SESSIONS)
     thread.add(first, 0.0)
     thread.start(0.5 * MAX_WAIT_S, saves_time=True)
-    assert first.is_due
+    assert first.waits_for_network
     thread.start(MAX_WAIT_S, saves_time=True)
     assert decoded(thread) == [first]
     for session in [first, *others]:

@@ -13,8 +13,8 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import (
     align_syllables,
     align_text,
-    spoken,
-    timed_syllables,
+    drop_pauses,
+    find_syllable_times,
 )
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
@@ -32,7 +32,7 @@ def vowels() -> list[Phone]:
 
 
 def test_all_phones_in_order_without_gaps(vowels: list[Phone]) -> None:
-    symbols = [phone.symbol for phone in spoken(vowels, load_inventory())]
+    symbols = [phone.symbol for phone in drop_pauses(vowels, load_inventory())]
     assert symbols == ["a", "o", "e", "i", "u", "v"]
     for one, two in pairwise(vowels):
         assert one.onset_s + one.duration_s == pytest.approx(two.onset_s)
@@ -100,7 +100,7 @@ def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:
     transcript = load_inventory().read("你好")
     symbols = ["sil", "n", "i", "sil", "h", "ao"]
     aligned = [lips.phone(i, symbol, 0.1 * i, 0.1) for i, symbol in enumerate(symbols)]
-    syllables = timed_syllables(aligned, transcript, load_inventory())
+    syllables = find_syllable_times(aligned, transcript, load_inventory())
     lines = format_phones(aligned, "textgrid", 0.7, syllables).splitlines()
     assert "size = 3" in lines
     names = [line.split('"')[1] for line in lines if "name =" in line]

@@ -11,7 +11,7 @@ import torch
 from kouxing.corpora.feature_cache import as_integers
 from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
-from kouxing.services.recognizer.onnx_session import open_network
+from kouxing.services.recognizer.onnx_session import create_inference_session
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, targets
@@ -100,7 +100,7 @@ def test_trains_resumes_and_writes_a_model(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
-    monkeypatch.setattr(batches, "NUM_POSITIONS", 30)
+    monkeypatch.setattr(batches, "NUM_PHRASE_POSITIONS", 30)
     monkeypatch.setattr(targets, "CHUNK_SIZE", 2)
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
     monkeypatch.setattr(lip_teacher, "NUM_EPOCHS", 1)

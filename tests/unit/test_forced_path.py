@@ -8,8 +8,8 @@ import pytest
 from kouxing.services.recognizer.search import forced_path
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
+    build_utterance_graph,
     segments_of_path,
-    utterance_graph,
     viterbi_path,
 )
 from tests.languages import MANDARIN, SIL
@@ -22,7 +22,7 @@ def spoken_phones(num_phones: int, num_frames: int) -> tuple[UtteranceGraph, np.
     """Return an utterance with pauses, its scores, and its phones with 6 frames each."""
     rng = np.random.default_rng(0)
     phones = rng.choice(np.delete(np.arange(len(MANDARIN)), SIL), num_phones).tolist()
-    graph = utterance_graph(phones, [1] * num_phones, FIRST_STATE, silence=SIL)
+    graph = build_utterance_graph(phones, [1] * num_phones, FIRST_STATE, silence=SIL)
     scores = rng.normal(-9, 1, (num_frames, FIRST_STATE[-1])).astype(np.float32)
     states = np.concatenate([np.repeat(FIRST_STATE[p] + np.arange(3), 2) for p in phones])
     pause = np.repeat(FIRST_STATE[SIL] + np.arange(3), [2, 2, num_frames])

@@ -8,9 +8,9 @@ from kouxing.services.recognizer.front_end.features import (
     NUM_BANDS,
     NUM_STATIC,
     RunningMean,
-    with_differences,
+    append_deltas,
 )
-from kouxing.services.recognizer.front_end.pcm import level_db, samples_of
+from kouxing.services.recognizer.front_end.pcm import decode_pcm, level_db
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
 from kouxing.services.recognizer.front_end.vtln import REFERENCE_HZ, VocalTractNormalizer
@@ -21,12 +21,12 @@ from kouxing.shared.errors import UserError
 def test_int16_samples_are_scaled_to_one() -> None:
     pcm = np.array([[-32768, 16384], [0, 32767]], "<i2").tobytes()
     expected = [[-1.0, 0.5], [0.0, 32767 / 32768]]
-    np.testing.assert_allclose(samples_of(pcm, "s16le", 2), expected)
+    np.testing.assert_allclose(decode_pcm(pcm, "s16le", 2), expected)
 
 
 def test_float_samples_above_one_are_clipped() -> None:
     pcm = np.array([2.0, -3.0, 0.25], "<f4").tobytes()
-    np.testing.assert_array_equal(samples_of(pcm, "f32le", 1)[:, 0], [1.0, -1.0, 0.25])
+    np.testing.assert_array_equal(decode_pcm(pcm, "f32le", 1)[:, 0], [1.0, -1.0, 0.25])
 
 
 def test_level_is_the_rms_in_decibels_of_full_scale() -> None:
@@ -82,11 +82,11 @@ def test_differences_of_a_line_and_a_parabola() -> None:
     time = np.arange(40, dtype=np.float32)
     for half_width in (1, 2):
         line = np.repeat((3 * time)[:, None], NUM_STATIC, axis=1)
-        inner = with_differences(line, half_width)[2 * half_width : -2 * half_width]
+        inner = append_deltas(line, half_width)[2 * half_width : -2 * half_width]
         np.testing.assert_allclose(inner[:, NUM_STATIC : 2 * NUM_STATIC], 3.0, rtol=1e-5)
         np.testing.assert_allclose(inner[:, 2 * NUM_STATIC :], 0.0, atol=1e-4)
         parabola = np.repeat((time**2)[:, None], NUM_STATIC, axis=1)
-        inner = with_differences(parabola, half_width)[2 * half_width : -2 * half_width]
+        inner = append_deltas(parabola, half_width)[2 * half_width : -2 * half_width]
         np.testing.assert_allclose(inner[:, 2 * NUM_STATIC :], 2.0, rtol=1e-3)
 
 

@@ -8,9 +8,9 @@ import pytest
 from kouxing.services.cli.mouth_drawing import draw_mouth
 from kouxing.services.cli.options import WidthSource
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.languages import model_of_language, restrict_phones
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language, restrict_phones
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import (
@@ -27,35 +27,39 @@ SOUND = ROOT / "shared" / "demo" / "hello-female.wav"
 
 def test_mandarin_has_its_own_model() -> None:
     models = (
-        model_of_language(),
-        model_of_language("mandarin", "gmm"),
-        model_of_language(None, "gmm"),
+        load_model_for_language(),
+        load_model_for_language("mandarin", "gmm"),
+        load_model_for_language(None, "gmm"),
     )
     assert [model.inventory.language for model in models] == ["mandarin"] * 3
-    assert model_of_language() is model_of_language("mandarin") is not models[1]
+    assert load_model_for_language() is load_model_for_language("mandarin") is not models[1]
 
 
 def test_other_languages_use_their_phones_of_the_universal_model() -> None:
-    english, universal = model_of_language("english"), model_of_language("universal")
+    english, universal = load_model_for_language("english"), load_model_for_language("universal")
     assert english.inventory is universal.inventory is load_inventory("universal")
     assert isinstance(english, BlockModel)
     assert isinstance(universal, BlockModel)
-    assert english.session is universal.session  # in memory once
-    symbols = {phone.symbol for phone in recognize(english, SAMPLES, 16_000)}
+    assert english.runner is universal.runner  # in memory once
+    symbols = {phone.symbol for phone in recognize_recording(english, SAMPLES, 16_000)}
     assert symbols & load_inventory("english").vowels
     assert symbols <= {*load_inventory("english").phones}
 
 
 def test_a_model_of_other_phones_is_an_error() -> None:
     with pytest.raises(UserError, match="the acoustic model gmm has the phones of mandarin"):
-        model_of_language("english", "gmm")
+        load_model_for_language("english", "gmm")
 
 
 def test_limits_the_phones_of_a_model() -> None:
     model = load_model("gmm")
     limited = restrict_phones(model, ("sil", "i", "u"))
-    assert {phone.symbol for phone in recognize(limited, SAMPLES, 16_000)} <= {"sil", "i", "u"}
-    assert "ao" in {phone.symbol for phone in recognize(model, SAMPLES, 16_000)}
+    assert {phone.symbol for phone in recognize_recording(limited, SAMPLES, 16_000)} <= {
+        "sil",
+        "i",
+        "u",
+    }
+    assert "ao" in {phone.symbol for phone in recognize_recording(model, SAMPLES, 16_000)}
 
 
 def test_languages_have_codes_and_titles() -> None:

@@ -13,7 +13,7 @@ from kouxing.evaluation.recognizer import languages
 from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
 from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
 from kouxing.evaluation.rivals import tables
-from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import find_language, load_inventory
@@ -53,7 +53,7 @@ def test_measures_each_recognizer_by_language(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     manifest = write_manifest(tmp_path)
-    references = align_corpus(model_of_language("universal"), manifest, "test")
+    references = align_corpus(load_model_for_language("universal"), manifest, "test")
     monkeypatch.setattr(
         languages, "_run_hama", lambda english: iter([("n", "i", "h", "a", "uh"), ()])
     )

@@ -12,7 +12,7 @@ from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     FORMAT,
     LipPredictor,
-    features_at,
+    join_features,
     load_lip_predictor,
 )
 from kouxing.shared.errors import UserError
@@ -58,7 +58,7 @@ def test_each_delay_has_separate_outputs_and_times() -> None:
     single = MODEL.create_stream([0.155]).process_position(1.0, frames, features)
     assert [(lip.time_s, lip.delay_s) for lip in pair] == [(1.005, -0.005), (0.845, 0.155)]
     np.testing.assert_allclose(pair[1].faps, single[0].faps, rtol=1e-5)
-    outputs = MODEL.create_stream([0.155]).step(features_at(frames, features))
+    outputs = MODEL.create_stream([0.155]).step(join_features(frames, features))
     assert single[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
     with pytest.raises(UserError, match="no delay of 70 ms; choose -5, 55, 155"):
         MODEL.create_stream([0.07])

@@ -62,5 +62,5 @@ def test_rejects_clips_without_a_free_license(tmp_path: Path) -> None:
         train_lips(tmp_path, tmp_path / "lips.npz")
 
 
-NUM_POSITIONS, NUM_FEATURES, NUM_DELAYS = 400, 5, 2
+NUM_PHRASE_POSITIONS, NUM_FEATURES, NUM_DELAYS = 400, 5, 2
 JAW, WIDTH, CORNER = (LIP_FAPS.index(fap) for fap in (3, 6, 59))

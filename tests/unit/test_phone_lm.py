@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.model_file import Archive, phone_lm_arrays, phone_lm_from
+from kouxing.services.recognizer.acoustic.model_file import Archive, parse_phone_lm, phone_lm_arrays
 from tests.languages import NUM_PHONES, SIL, START, Table, step
 
 PHONES_IN_USE = (0, 7, 21, 30, 58, SIL)
@@ -38,7 +38,7 @@ def test_arrays_round_trip() -> None:
     phone_lm = table(1, 4, 0.6).tree()
     assert phone_lm.log_prob.min() >= -12.75
     assert np.abs(phone_lm.log_backoff).max() <= 6.35
-    again = phone_lm_from(Archive(phone_lm_arrays(phone_lm)))
+    again = parse_phone_lm(Archive(phone_lm_arrays(phone_lm)))
     np.testing.assert_array_equal(again.num_children, phone_lm.num_children)
     np.testing.assert_array_equal(again.phone, phone_lm.phone)
     np.testing.assert_allclose(again.log_prob, phone_lm.log_prob, atol=0.025 + 1e-5)
@@ -80,4 +80,4 @@ Change = Callable[[NDArray[Any]], NDArray[Any]]
 def test_rejects_damaged_arrays(name: str, change: Change, message: str) -> None:
     arrays = phone_lm_arrays(table(0, 3, 0.5).tree())
     with pytest.raises(ValueError, match=message):
-        phone_lm_from(Archive({**arrays, name: change(arrays[name])}))
+        parse_phone_lm(Archive({**arrays, name: change(arrays[name])}))

@@ -204,7 +204,7 @@ def take(
 ) -> list[int]:
     """Return the messages that a session accepts."""
     messages = [chunk(number, **{"acknowledge": True, **values}) for number in sequences]
-    return [message.sequence for message in messages if session.take_next(message, now_s)]
+    return [message.sequence for message in messages if session.accept_in_order(message, now_s)]
 
 
 def test_takes_audio_in_order_from_a_client_that_resends() -> None:

@@ -9,7 +9,7 @@ from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -24,7 +24,7 @@ STILL = SynthesizerConfig(idle_motion=False, expressiveness=1.0, feeling=0.0)
 def test_dynamic_visemes_are_the_full_model() -> None:
     samples = read_audio(VOWELS_FILE)[0][:, 0]
     analyzed = analyze_recording(
-        samples, recognize(load_model(), samples, 16_000), is_text_known=False
+        samples, recognize_recording(load_model(), samples, 16_000), is_text_known=False
     )
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
@@ -57,7 +57,7 @@ def test_lips_close_and_open_for_the_phones_of_a_known_text() -> None:
 def test_every_phone_of_a_sentence_with_many_rounded_vowels_is_right() -> None:
     samples = read_audio(DEMO / "lake-male.wav")[0][:, 0]
     model = load_model()
-    phones = recognize(model, samples, 16_000)
+    phones = recognize_recording(model, samples, 16_000)
     spoken = [phone.symbol for phone in phones if phone.symbol != model.inventory.silence]
     text = model.inventory.pronounce("五月的湖边，我和女儿读书、画鱼。")
     assert spoken == [phone for syllable in text for phone in syllable]

@@ -10,7 +10,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_decoder import StreamOutput
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.search import frame_search, path_records
 from kouxing.services.recognizer.stream import MAX_JITTER
@@ -98,7 +98,7 @@ def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
     stream = LiveStream(MODEL, **FACE)
     outputs = []
     for number, part in enumerate(np.split(SAMPLES, cuts)):
-        stream.stream.set_light(number == 1)
+        stream.stream.set_light_model(number == 1)
         outputs += stream.feed(part, chunk=320)
     outputs += stream.finish()
     for kind in (LipPositions, SpeechChange, Progress):
@@ -206,7 +206,7 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
                 early = recognizer.get_result(stream)
                 num_early += len(of_kind(LipPositions, early))
                 results += early
-                recognizer.decode_found([stream])
+                recognizer.decode_speech([stream])
                 stream.finish_scoring()
                 recognizer.run_encoder([stream])
             elif recognizer.needs_network(stream):
@@ -214,9 +214,9 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
                 results += recognizer.get_result(stream)
                 if continues:
                     stream.start_scoring()
-            is_scoring = stream.can_continue(stream.next_media_time)
+            is_scoring = stream.can_accept_while_scoring(stream.next_media_time)
             if not is_scoring:
-                recognizer.decode_found([stream])
+                recognizer.decode_speech([stream])
                 results += recognizer.get_result(stream)
         outputs.append(results)
     assert num_early > 5
@@ -237,14 +237,14 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
         recognizer.run_encoder([stream])
         begin += 320
     stream.start_scoring()
-    assert not stream.can_continue(begin)  # the lips of this audio are not sent yet
+    assert not stream.can_accept_while_scoring(begin)  # the lips of this audio are not sent yet
     stream.finish_scoring()
     stream.decode_early()
     stream.start_scoring()
-    assert stream.can_continue(begin)
-    assert not stream.can_continue(begin + MAX_JITTER + 1)
+    assert stream.can_accept_while_scoring(begin)
+    assert not stream.can_accept_while_scoring(begin + MAX_JITTER + 1)
     stream.finish_scoring()
-    assert not stream.can_continue(begin)
+    assert not stream.can_accept_while_scoring(begin)
 
 
 def test_a_longer_hop_changes_only_the_phones() -> None:
@@ -275,7 +275,7 @@ def test_silence_and_noise_have_no_phones() -> None:
     noise = np.random.default_rng(0).normal(0, 0.01, 32_000).astype(np.float32)
     outputs = recognize_live(load_model(), noise, 320)
     assert not any(isinstance(output, Phone | SpeechChange) for output in outputs)
-    assert recognize(load_model(), noise, 16_000) == []
+    assert recognize_recording(load_model(), noise, 16_000) == []
 
 
 @pytest.mark.slow
@@ -283,6 +283,6 @@ def test_warm_up_compiles_everything_and_changes_no_result() -> None:
     expected = hello_phones()
     Recognizer(load_model()).warm_up()
     assert frame_search.advance_frames.signatures
-    assert path_records.count_paths.signatures
-    assert path_records.compact.signatures
+    assert path_records.count_record_paths.signatures
+    assert path_records.compact_records.signatures
     assert hello_phones() == expected

@@ -3,7 +3,7 @@
 from typing import cast
 
 from kouxing.services.recognizer.synthesizer_link import (
-    KEPT,
+    KEPT_SAMPLES,
     MAX_BACKLOG,
     MAX_OVERDUE_S,
     SynthesizerLink,
@@ -59,7 +59,7 @@ def test_a_new_synthesizer_receives_the_newest_frame_and_the_last_messages() -> 
     assert resume.newest_frame == NewestFrame(sequence=40, media_time=12_800, values=FAPS)
     times = [message.media_time for message in rest]
     assert times == [to_samples(number) for number in range(3, 8)]
-    assert times[-2] - times[0] == KEPT
+    assert times[-2] - times[0] == KEPT_SAMPLES
     assert [message.sequence for message in (resume, speech, *rest)] == list(range(1, 8))
     assert {message.epoch for message in (resume, speech, *rest)} == {2}
 

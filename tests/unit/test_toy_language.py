@@ -13,8 +13,8 @@ import pytest
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_text, spoken
-from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.alignment import align_text, drop_pauses
+from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
@@ -72,14 +72,14 @@ def path(toy: PhoneInventory, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def symbols(phones: list[Phone], toy: PhoneInventory) -> str:
-    return " ".join(phone.symbol for phone in spoken(phones, toy))
+    return " ".join(phone.symbol for phone in drop_pauses(phones, toy))
 
 
 def test_the_language_is_recognized_live_and_offline(toy: PhoneInventory, path: Path) -> None:
     model = load_model(path)
     assert model.inventory is toy
     assert toy.phones == ("sil", "m", "a", "o", "e", "i", "u", "y")
-    heard = symbols(recognize(model, SAMPLES, 16_000), toy)
+    heard = symbols(recognize_recording(model, SAMPLES, 16_000), toy)
     assert set(heard.split()) == {"a", "o", "i", "u"}  # e and ü of this voice sound like i
     events = recognize_live(model, SAMPLES)
     final = [event for event in events if isinstance(event, Phone) and event.final]
@@ -89,7 +89,9 @@ def test_the_language_is_recognized_live_and_offline(toy: PhoneInventory, path: 
 def test_a_text_of_the_language_is_aligned(toy: PhoneInventory, path: Path) -> None:
     aligned = spoken(align_text(load_model(path), SAMPLES, 16_000, "aoe iuy"), toy)
     assert symbols(aligned, toy) == "a o e i u y"
-    expected = spoken(align_text(load_model(), SAMPLES, 16_000, "啊喔鹅衣乌迂"), load_inventory())
+    expected = drop_pauses(
+        align_text(load_model(), SAMPLES, 16_000, "啊喔鹅衣乌迂"), load_inventory()
+    )
     onsets_s = [phone.onset_s for phone in expected]
     assert [phone.onset_s for phone in aligned] == pytest.approx(onsets_s, abs=0.15)
     with pytest.raises(UserError, match="cannot read 'xyz'"):

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from kouxing.corpora.speech_corpus import RowErrors, may_distribute, read_corpus
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.search.forced_path import utterance_graph, viterbi_path
+from kouxing.services.recognizer.search.forced_path import build_utterance_graph, viterbi_path
 from kouxing.shared.errors import UserError
 from kouxing.training.commands import app
 from kouxing.training.gmm.recipe import train_gmm
@@ -135,7 +135,7 @@ def test_licenses_that_allow_distribution() -> None:
 def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first_state = np.arange(len(MANDARIN) + 1)  # one state each: sil a sil b sil
-    graph = utterance_graph([22, 30], [1, 1], first_state, silence=SIL)
+    graph = build_utterance_graph([22, 30], [1, 1], first_state, silence=SIL)
     num_frames = 6
     scores = rng.normal(0, 2, (num_frames, len(graph.states))).astype(np.float32)
     stay = rng.uniform(0.2, 0.8, len(MANDARIN))

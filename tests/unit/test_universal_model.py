@@ -77,7 +77,7 @@ def test_the_first_readout_and_the_caches_do_not_change() -> None:
         other.append_frames(frames)
         while stream.is_due:
             outputs, both_outputs = (
-                network.session.run([scored.block()])
+                network.runner.run([scored.block()])
                 for network, scored in ((model, stream), (both, other))
             )
             np.testing.assert_array_equal(outputs[2], both_outputs[2])
@@ -144,7 +144,7 @@ def test_the_shipped_model_keeps_the_state_after_the_kept_positions() -> None:
     stream = model.create_stream()
     stream.append_frames(FRAMES[:100])
     block = stream.block()
-    first, second = (model.session.run([records.replace(block, num_kept=num)])[1] for num in (2, 4))
+    first, second = (model.runner.run([records.replace(block, num_kept=num)])[1] for num in (2, 4))
     assert not np.array_equal(first, second)
 
 

@@ -34,7 +34,7 @@ def rebuild_readout(model: BlockModel) -> BlockReadout:
     """Rebuild the readout, whose recurrent layer is exported in ONNX's layout."""
     tensors = _tensors_of(model)
     inner = len(tensors["readout.inner.bias"])
-    shape = ReadoutShape(inner=inner, gru=model.session.sizes.state, dropout=0.0, noise=0.0)
+    shape = ReadoutShape(inner=inner, gru=model.runner.sizes.state, dropout=0.0, noise=0.0)
     readout = BlockReadout(len(tensors["readout.mean"]), model.topology.num_states, shape)
     input_biases, recurrent_biases = np.split(tensors["readout.biases"], 2, axis=1)
     recurrent = {

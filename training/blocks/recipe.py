@@ -31,10 +31,10 @@ from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
+    parse_topology,
     topology_arrays,
-    topology_from,
 )
-from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, frames_in
+from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, count_frames
 from kouxing.shared.terminal import print_message
 from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, BatchSource
 from kouxing.training.blocks.export import export_onnx
@@ -90,7 +90,7 @@ class _LabeledSet:
             LabeledRecording(samples=sound, targets=FrameTargets(*pair), weight=float(weight))
             for sound, *pair, weight in zip(samples, states, probs, saved["weights"], strict=True)
         ]
-        return cls(recordings, topology_from(Archive(saved)), saved["log_prior"])
+        return cls(recordings, parse_topology(Archive(saved)), saved["log_prior"])
 
 
 def train_blocks(

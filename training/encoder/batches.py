@@ -32,9 +32,9 @@ Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
 Batch = tuple[Halves, Halves]  # inputs, (batch, positions, 160); targets
 
-NUM_POSITIONS = 250  # length of an excerpt, 5 s
+NUM_PHRASE_POSITIONS = 250  # length of an excerpt, 5 s
 NUM_EXCERPTS = 28
-BATCH_S = NUM_EXCERPTS * NUM_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
+BATCH_S = NUM_EXCERPTS * NUM_PHRASE_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
 _MAX_SPEED = 1.3
 _MAX_PIECE = 400  # positions of one recording in an excerpt
 _PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
@@ -96,7 +96,7 @@ def _excerpt(
     chosen[:, PITCH] += np.float32(np.log2(speed))
     lips = material.columns.lips
     delayed = [
-        _rows(targets[:, lips], speed * (np.arange(NUM_POSITIONS) + known) - 1)
+        _rows(targets[:, lips], speed * (np.arange(NUM_PHRASE_POSITIONS) + known) - 1)
         for known in (_KNOWN - delay_s / POSITION_S for delay_s in LIP_DELAYS_S)
     ]
     return inputs, np.concatenate([chosen[:, : lips.start], *delayed], axis=1)
@@ -115,7 +115,7 @@ def _speech(
     """Join recordings and pauses that are long enough for an excerpt at any speed."""
     sounds: list[Floats] = []
     rows: list[Floats] = []
-    missing = int(NUM_POSITIONS * _MAX_SPEED)
+    missing = int(NUM_PHRASE_POSITIONS * _MAX_SPEED)
     while missing > 0:
         piece = material.draw(rng, probs)
         size = min(len(piece.targets), _MAX_PIECE, missing)

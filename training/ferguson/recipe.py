@@ -33,7 +33,7 @@ from kouxing.corpora.speech_corpus import (
 )
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_syllables, spoken
+from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
 from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
@@ -298,7 +298,9 @@ def aligned_speech(
         except (UserError, OSError, ValueError) as error:
             errors.add(row.utterance_id, str(error))
             continue
-        yield AlignedSpeech(measure_slices(samples), syllables, spoken(phones, model.inventory))
+        yield AlignedSpeech(
+            measure_slices(samples), syllables, drop_pauses(phones, model.inventory)
+        )
 
 
 def format_table(table: PhoneTable, inventory: PhoneInventory, about: list[str]) -> str:

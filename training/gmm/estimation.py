@@ -34,13 +34,13 @@ from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, mixture_s
 from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
     RunningMean,
-    cepstra_of_all,
-    with_differences,
+    append_deltas,
+    compute_cepstra_batch,
 )
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
+    build_utterance_graph,
     segments_of_path,
-    utterance_graph,
     viterbi_path,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
@@ -106,7 +106,7 @@ def normalized_features(
     copy: RecordingCopy, prior_mean: NDArray[np.float32], half_width: int
 ) -> NDArray[np.float32]:
     """Compute the normalized features of a copy as a new session does, (frames, 39)."""
-    features = with_differences(cepstra_of_all(copy.log_mel.astype(np.float32)), half_width)
+    features = append_deltas(compute_cepstra_batch(copy.log_mel.astype(np.float32)), half_width)
     return RunningMean(prior_mean).normalize(features)
 
 
@@ -134,7 +134,7 @@ class FrameSet:
         blocks = [normalized_features(copy, prior_mean, half_width) for copy in copies]
         silence = inventory.index[inventory.silence]
         graphs = [
-            utterance_graph(
+            build_utterance_graph(
                 copy.example.phones, copy.example.syllables, first_state, silence=silence
             )
             for copy in copies

@@ -9,7 +9,11 @@ from numpy.typing import NDArray
 from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
-from kouxing.services.recognizer.front_end.features import NUM_FEATURES, LogMel, cepstra_of_all
+from kouxing.services.recognizer.front_end.features import (
+    NUM_FEATURES,
+    LogMel,
+    compute_cepstra_batch,
+)
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.gmm.estimation import (
@@ -150,7 +154,7 @@ def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
     """Compute the mean cepstra of the recordings, shape (13,)."""
     step = max(1, len(examples) // _MEAN_RECORDINGS)
     means = [
-        cepstra_of_all(example.log_mel.astype(np.float32)).mean(axis=0)
+        compute_cepstra_batch(example.log_mel.astype(np.float32)).mean(axis=0)
         for example in examples[::step]
     ]
     return np.asarray(np.mean(means, axis=0, dtype=np.float32))

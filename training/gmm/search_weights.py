@@ -11,7 +11,7 @@ from kouxing.corpora.scoring import ErrorCounts, count_errors
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology, score_segment
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
-from kouxing.services.recognizer.front_end.vtln import without_pitch
+from kouxing.services.recognizer.front_end.vtln import append_unvoiced_pitch
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_message
@@ -59,7 +59,7 @@ def choose_search_weights(
     except UserError:
         print_message("no dev recordings; acoustic scale and phone penalty keep their defaults")
         return None
-    features = (without_pitch(example.log_mel.astype(np.float32)) for example in dev)
+    features = (append_unvoiced_pitch(example.log_mel.astype(np.float32)) for example in dev)
     scores = [score_segment(model, frames) for frames in features]
     best: SearchWeights | None = None
     for scale in _SCALES:

@@ -24,8 +24,8 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
 from kouxing.services.recognizer.acoustic.network import NetworkModel
 from kouxing.services.recognizer.search.decoder import PathSegment
 from kouxing.services.recognizer.search.forced_path import (
+    build_utterance_graph,
     segments_of_path,
-    utterance_graph,
     viterbi_path,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
@@ -156,7 +156,7 @@ def _align_examples(aligner: AcousticModel, examples: Sequence[Example]) -> list
 
     def align(number: int) -> Alignment | None:
         example = examples[number]
-        graph = utterance_graph(
+        graph = build_utterance_graph(
             example.phones, example.syllables, topology.first_state, silence=silence
         )
         front_end = aligner.create_front_end()

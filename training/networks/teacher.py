@@ -37,7 +37,7 @@ from rich.progress import track
 from torch import Tensor
 
 from kouxing.corpora.feature_cache import as_floats
-from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
+from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, count_frames
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.batches import (
@@ -94,7 +94,7 @@ class WholeEncoder(Encoder):
     def features(self, samples: NDArray[np.int16]) -> NDArray[np.float16]:
         """Encode samples, (n,) at 16 kHz; two frames share a row, (ceil(frames / 2), 3 width)."""
         pieces = []
-        num_frames = frames_in(len(samples))
+        num_frames = count_frames(len(samples))
         for start in range(0, num_frames, _PIECE_FRAMES):
             end = min(start + _PIECE_FRAMES, num_frames)
             piece = samples[HOP_SAMPLES * start : HOP_SAMPLES * (end - 1) + WINDOW_SAMPLES]
@@ -136,7 +136,7 @@ class Teacher:
 
     def _targets_of(self, sounds: Sequence[NDArray[np.int16]]) -> Iterator[FrameTargets]:
         """Yield the targets of recordings. The last recording must be the longest."""
-        longest = frames_in(len(sounds[-1]))
+        longest = count_frames(len(sounds[-1]))
         if longest > _PIECE_FRAMES:  # each alone, in pieces
             features = [torch.from_numpy(self.encoder.features(sound))[None] for sound in sounds]
         else:

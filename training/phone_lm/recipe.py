@@ -29,8 +29,8 @@ from rich.progress import track
 
 from kouxing.corpora.speech_corpus import RowErrors, is_synthetic, read_corpus
 from kouxing.services.recognizer.acoustic.model_file import (
+    parse_phone_lm,
     phone_lm_arrays,
-    phone_lm_from,
     read_archive,
     write_archive,
 )
@@ -251,7 +251,7 @@ def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
     Raises UserError if the file contains no phone language model, or one for another language.
     """
     try:
-        phone_lm = phone_lm_from(read_archive(path))
+        phone_lm = parse_phone_lm(read_archive(path))
     except ValueError as error:
         raise UserError(
             f"{path} has no phone language model: {error}; make one with: kouxing train phone-lm"

@@ -25,7 +25,7 @@ from kouxing.corpora.universal_phones import labeled_phones
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
-    utterance_graph,
+    build_utterance_graph,
     viterbi_path,
 )
 from kouxing.shared.errors import UserError
@@ -95,7 +95,7 @@ class Aligner:
     def _graph(self, name: str, num_states: int) -> UtteranceGraph:
         recording = self.recordings[name]
         first_state = num_states * np.arange(self.num_phones + 1)
-        return utterance_graph(
+        return build_utterance_graph(
             recording.phones,
             recording.syllables,
             first_state,

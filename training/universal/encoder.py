@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
-    open_session,
+    open_onnx_session,
     position_table,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
@@ -34,7 +34,7 @@ class FeatureEncoder:
     def __init__(self, model: BlockModel, layers: Sequence[int]) -> None:
         encoder = rebuild_encoder(model)
         self._shape = encoder.shape
-        self._session = open_session(_FeatureGraph(encoder, layers).file_of_features())
+        self._session = open_onnx_session(_FeatureGraph(encoder, layers).file_of_features())
         unused = np.zeros((LENGTH, self._shape.width), np.float32)
         self._positions = np.concatenate([position_table(self._shape.width), unused])
 

@@ -1,1 +1,1 @@
-"""Acoustic models: state scores from feature frames."""
+"""Acoustic models: score HMM states from feature frames."""

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.phones.inventory import PhoneInventory
 
-# Position of a phone between two pauses. The last phone is lengthened; a single one counts as last.
-FIRST, INSIDE, LAST = range(3)
-NUM_POSITIONS = 3
+# Place of a phone between two pauses. The phone before a pause is lengthened; a single
+# phone counts as BEFORE_PAUSE.
+AFTER_PAUSE, WITHIN_PHRASE, BEFORE_PAUSE = range(3)
+NUM_PHRASE_POSITIONS = 3
 
 Floats: TypeAlias = NDArray[np.float32]
 
@@ -33,7 +34,7 @@ class Topology:
     log_leave: Floats  # (states,) log-probability of leaving it
     lm_scale: float = 1.0  # weight of the phone language model's log-probabilities
     phone_penalty: float = 0.0  # added to the log score at every phone
-    rate_weight: float = 0.0  # how far the phone penalty follows the speaking rate; see Decoder
+    rate_weight: float = 0.0  # dependence of the phone penalty on the speaking rate; see Decoder
     duration_mean_s: Floats  # (3, phones) mean by position and phone, seconds
     duration_spread_s: Floats  # (3, phones) standard deviation, seconds
 
@@ -61,13 +62,14 @@ class FrontEnd(Protocol):
 class AcousticStream(ABC):
     """State scores of one speaker's speech, segment by segment.
 
-    The scores that a stream returns are settled: each frame gets them once. A stream may also have
-    provisional scores of the next frames, computed from less audio than the settled scores.
+    The returned scores are settled: they never change. A stream may also have provisional scores
+    of the next frames, computed from less audio.
     """
 
-    uses_encoder = False  # whether its frames are the encoder's phones instead of the front end's
+    # whether it scores the encoder's phones instead of the front end's frames
+    uses_encoder_phones = False
     look_ahead_frames: int  # maximum delay of a frame's settled scores, frames
-    provisional: Floats  # (k, states) of the next frames; a change is a new array
+    provisional: Floats  # (k, states) of the next frames; replaced by a new array when it changes
 
     def __init__(self, model: AcousticModel) -> None:
         self.model = model
@@ -115,7 +117,7 @@ class AcousticModel(ABC):
 
     @abstractmethod
     def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
-        """Score several streams in one batch, with the same scores as one by one."""
+        """Score several streams in one batch. The scores do not depend on the batch."""
 
 
 def score_segment(model: AcousticModel, frames: Floats) -> Floats:

@@ -54,17 +54,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, ScoreRequest
-from kouxing.services.recognizer.acoustic.light import LightModel, light_model
-from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
+from kouxing.services.recognizer.acoustic.light import LightModel, build_light_model
+from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology, write_model
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     MAX_POSITIONS,
     NetworkModel,
     check_outputs,
-    integer_inputs,
-    open_session,
+    encode_integer_inputs,
+    open_onnx_session,
     position_table,
-    run_session,
+    run_onnx_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
 from kouxing.shared.records import Record
@@ -77,9 +77,9 @@ _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # bef
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
 # Constants of the file that become inputs: the number of kept positions, and the last of them.
 _NUM_KEPT, _LAST_KEPT = "block", "last_of_block"
-EXTENSION = "universal_"  # before the names of a second readout's input and outputs
+EXTENSION_PREFIX = "universal_"  # before the names of a second readout's input and outputs
 _PADDING = 2  # frames of zeros before a segment's first
-_SEEN_AFTER = 2  # frames that a position sees after its first
+_SEEN_AFTER = 2  # frames that a position sees after its first frame
 _MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
 _MAX_SIZE = 4096
 _MAX_CACHE_BYTES = 3_000_000  # per session
@@ -87,17 +87,17 @@ _MAX_CACHE_BYTES = 3_000_000  # per session
 
 @dataclass(frozen=True, kw_only=True)
 class BlockModel(NetworkModel):
-    """A network that runs on blocks."""
+    """The block model: a network that scores speech in blocks."""
 
     @cached_property
-    def session(self) -> BlockRunner:
-        """The network, ready to run."""
+    def runner(self) -> BlockRunner:
+        """The network, opened at its first use."""
         return BlockRunner(self.network)
 
     @cached_property
-    def light(self) -> LightModel | None:
+    def light_model(self) -> LightModel | None:
         """The model for a busy machine, or None if the encoder has other phones."""
-        return light_model(self.topology, self.log_prior)
+        return build_light_model(self.topology, self.log_prior)
 
     def create_stream(self) -> BlockStream:
         """Create the stream of one speaker."""
@@ -111,11 +111,11 @@ class BlockModel(NetworkModel):
         while ready := [(stream, stream.block()) for stream in streams if stream.is_due]:
             num_kept = ready[0][1].num_kept
             self._run([one for one in ready if one[1].num_kept == num_kept][:_MAX_BATCH])
-        return [stream.take_final_scores() for stream in streams]
+        return [stream.take_settled_scores() for stream in streams]
 
     def _run(self, blocks: Sequence[tuple[BlockStream, Block]]) -> None:
-        log_posteriors, states, new = self.session.run([block for _, block in blocks])
-        scores = self.scores_of(log_posteriors)
+        log_posteriors, states, new = self.runner.run([block for _, block in blocks])
+        scores = self.compute_scores(log_posteriors)
         # copies: a view would keep the whole batch
         for row, (stream, block) in enumerate(blocks):
             stream.append_outputs(block, scores[row].copy(), states[row].copy(), new[row])
@@ -161,30 +161,31 @@ class NetworkState:
 
 
 class Block(Record, frozen=True):
-    """A block of one session with its right context, to be computed."""
+    """The next block of one session, with its right context."""
 
     frames: Floats  # (2 positions + 3, 80), from two before the first position's
     row: int  # row of the first position in the table
     num_positions: int
-    num_settled: int  # number of first positions, whose scores are settled
-    num_kept: int  # number of first positions, whose keys and values are kept; 0 if nothing follows
+    num_settled: int  # number of leading positions whose scores are settled
+    num_kept: int  # number of leading positions whose keys and values are kept; 0 at the end
     past: NetworkState
 
 
 class BlockRunner:
-    """A network that is ready to run; ``ValueError`` if the file has another kind."""
+    """Runs a block network. Raises ``ValueError`` if the file contains another network."""
 
-    run_s: ClassVar[float] = 0.0  # processor time spent in all networks so far
+    total_run_s: ClassVar[float] = 0.0  # processor time spent in all networks so far
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
         content = file.tobytes()
-        names = (_LAST_KEPT, f"{EXTENSION}{_LAST_KEPT}")  # a second readout may have its own
+        # a second readout may have its own constant
+        names = (_LAST_KEPT, f"{EXTENSION_PREFIX}{_LAST_KEPT}")
         self._last_kept = [name for name in names if name.encode() in content]
         axes = {_NUM_KEPT: 1, **dict.fromkeys(self._last_kept, 0)}
-        self._session = open_session(file, integer_inputs(axes))
+        self._session = open_onnx_session(file, encode_integer_inputs(axes))
         self.sizes, self._first_state = _sizes_of(self._session)
         self._names = _cache_names(self.sizes.layers)
-        prefix = EXTENSION if self._first_state else ""
+        prefix = EXTENSION_PREFIX if self._first_state else ""
         self._state = f"{prefix}state"
         self._outputs = [f"{prefix}{name}" for name in _OUTPUTS[:2]] + _OUTPUTS[2:]
         unused = np.zeros((self.sizes.length, self.sizes.width), np.float32)
@@ -215,11 +216,11 @@ class BlockRunner:
         if len(blocks) > 1:
             rings = np.stack([block.past.rings for block in blocks], axis=1)
         inputs |= zip(self._names, rings, strict=True)
-        if self._first_state:  # the readout that is not used has a state
+        if self._first_state:  # the unused readout also needs a state
             inputs["state"] = np.zeros((len(blocks), self._first_state), np.float32)
         start_s = time.thread_time()
-        log_posteriors, state, new = run_session(self._session, self._outputs, inputs)
-        BlockRunner.run_s += time.thread_time() - start_s
+        log_posteriors, state, new = run_onnx_session(self._session, self._outputs, inputs)
+        BlockRunner.total_run_s += time.thread_time() - start_s
         return log_posteriors, state, new
 
 
@@ -230,7 +231,7 @@ class BlockStream(AcousticStream):
 
     def __init__(self, model: BlockModel) -> None:
         super().__init__(model)
-        self._sizes = model.session.sizes
+        self._sizes = model.runner.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
         self._hop = self._sizes.block  # H
         self._empty_scores = self.provisional
@@ -255,7 +256,7 @@ class BlockStream(AcousticStream):
         self._past = NetworkState(np.zeros(self._sizes.state, np.float32), self._rings)
 
     def set_hop(self, num_blocks: int) -> None:
-        """Set the hop of the runs after the next one, as a number of blocks."""
+        """Set the hop in blocks, from the run after the next one."""
         self._hop = min(num_blocks * self._sizes.block, self._sizes.length)
 
     def append_frames(self, frames: Floats | None) -> None:
@@ -311,7 +312,7 @@ class BlockStream(AcousticStream):
         )
 
     def append_outputs(self, block: Block, scores: Floats, state: Floats, new: Float16) -> None:
-        """Append the scores, new state, and keys and values of a block; shapes as of a run."""
+        """Append a block's scores, new state, keys and values; shapes as in ``BlockRunner.run``."""
         past = self._sizes.past
         end = FRAMES_PER_POSITION * block.num_settled
         self._settled.append(scores[:end])
@@ -329,8 +330,8 @@ class BlockStream(AcousticStream):
         num_due = block.num_positions - block.num_kept + self._hop
         self._num_due = min(num_due, MAX_POSITIONS - self._row)
 
-    def take_final_scores(self) -> Floats:
-        """Return the new final scores, (m, states); at the end, of all remaining frames."""
+    def take_settled_scores(self) -> Floats:
+        """Return the new settled scores, (m, states); at the end, of all remaining frames."""
         rows = np.concatenate([self._empty_scores, *self._settled])
         self._settled = []
         self._num_settled += len(rows)
@@ -348,9 +349,9 @@ def _sizes_of(session: Any) -> tuple[BlockSizes, int]:
     shapes = {node.name: list(node.shape[1:]) for node in session.get_inputs()}
     outputs = {node.name: list(node.shape[1:]) for node in session.get_outputs()}
     num_layers = sum(name.startswith("keys_") for name in shapes)
-    is_extended = f"{EXTENSION}state" in shapes
-    more_inputs = [f"{EXTENSION}state"] * is_extended
-    more_outputs = [f"{EXTENSION}{name}" for name in _OUTPUTS[:2]] * is_extended
+    is_extended = f"{EXTENSION_PREFIX}state" in shapes
+    more_inputs = [f"{EXTENSION_PREFIX}state"] * is_extended
+    more_outputs = [f"{EXTENSION_PREFIX}{name}" for name in _OUTPUTS[:2]] * is_extended
     if list(shapes) != [*_INPUTS, *_cache_names(num_layers), *more_inputs] or (
         list(outputs) != [*_OUTPUTS, *more_outputs]
     ):
@@ -363,7 +364,7 @@ def _sizes_of(session: Any) -> tuple[BlockSizes, int]:
             length=length,
             past=shapes["keys_0"][1],
             width=width,
-            state=shapes[f"{EXTENSION if is_extended else ''}state"][0],
+            state=shapes[f"{EXTENSION_PREFIX if is_extended else ''}state"][0],
             layers=rings // 2,
             heads=heads,
             head_size=head_size,
@@ -387,25 +388,26 @@ def _cache_names(num_layers: int) -> list[str]:
     return [f"{kind}_{layer}" for kind in ("keys", "values") for layer in range(num_layers)]
 
 
-def block_model_from(archive: Archive) -> BlockModel:
+def parse_block_model(archive: Archive) -> BlockModel:
     """Build the model after checking every size; ``ValueError`` if something does not fit."""
     return model_of(archive, archive.array("network", None).astype(np.uint8))
 
 
 def model_of(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
-    """Build the model of a file with this network; errors as of :func:`block_model_from`."""
-    topology = topology_from(archive)
+    """Build the model of a file with this network; raises like :func:`parse_block_model`."""
+    topology = parse_topology(archive)
     model = BlockModel(
         topology=topology,
         network=network,
         log_prior=archive.floats("log_prior", topology.num_states),
         acoustic_scale=float(archive.floats("acoustic_scale")),
     )
-    sizes = model.session.sizes
+    sizes = model.runner.sizes
     past = NetworkState(np.zeros(sizes.state, np.float32), np.zeros(sizes.rings, np.float16))
     frames = np.zeros((2 * sizes.length + 3, NUM_MELS), np.float32)
-    num_kept = sizes.block + 1  # differs from the number in the file
-    outputs = model.session.run([Block(frames, 0, sizes.length, num_kept, num_kept, past)])
+    # differs from the file's constant, to check that the input replaces it
+    num_kept = sizes.block + 1
+    outputs = model.runner.run([Block(frames, 0, sizes.length, num_kept, num_kept, past)])
     new = (1, 2 * sizes.layers, sizes.heads, num_kept, sizes.head_size)
     check_outputs(outputs, [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new])
     return model

@@ -1,4 +1,4 @@
-"""Gaussian mixture acoustic model: log scores of HMM states for one feature frame.
+"""Gaussian mixture acoustic model: log-likelihoods of HMM states.
 
 Source: Li et al. 2011, section 3.1 (one mixture per state, diagonal covariances); the density is
 the HTK book's eq. 7.2 (Young et al. 2009).
@@ -38,19 +38,19 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Floats,
     ScoreRequest,
 )
-from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from, write_model
+from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology, write_model
 from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
     NUM_STATIC,
     DeltaFeatures,
     RunningMean,
-    cepstra,
+    compute_cepstra,
 )
 from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
 
 FORMAT = "gmm 3"
 _MAX_MIXTURES = 1024
-_MAX_HALF_WIDTH = 4  # limit for the half width of the differences, feature frames
+_MAX_HALF_WIDTH = 4  # limit for the half width of the deltas, feature frames
 
 _MIN_LOG_WEIGHT = -1e30  # for an absent component: finite, so that no NaN arises
 
@@ -98,7 +98,7 @@ class GmmModel(AcousticModel):
     mixtures: GaussianMixtures
     rotation: Floats  # (39, 39)
     prior_mean: Floats  # (13,) cepstral mean of the training corpus
-    half_width: int  # of the differences, frames
+    half_width: int  # of the deltas, frames
     acoustic_scale: float = 1.0  # weight of the log scores: neighboring frames are correlated
 
     @cached_property
@@ -143,20 +143,20 @@ class GmmStream(AcousticStream):
         super().__init__(model)
         self._vtln = VocalTractNormalizer()
         self._mean = RunningMean(model.prior_mean)
-        self._differences = DeltaFeatures(model.half_width)
-        self.look_ahead_frames = self._differences.look_ahead_frames
+        self._deltas = DeltaFeatures(model.half_width)
+        self.look_ahead_frames = self._deltas.look_ahead_frames
 
     def score(self, frames: Floats | None) -> Floats:
         """Score log-mel frames with their pitch, (n, 43); None ends the segment.
 
-        The speaker's mean and pitch stay known in the next segment.
+        The next segment continues with the speaker's mean and pitch.
         """
         if frames is None:
-            features = self._differences.finish()
-            self._differences = DeltaFeatures(self.model.half_width)
+            features = self._deltas.finish()
+            self._deltas = DeltaFeatures(self.model.half_width)
         else:
             log_mel = self._vtln.warp(frames[:, :-2], frames[:, -2], frames[:, -1])
-            features = self._differences.append(cepstra(log_mel))
+            features = self._deltas.append(compute_cepstra(log_mel))
         normalized = self._mean.normalize(features)
         scores = np.empty((len(features), self.model.topology.num_states), dtype=np.float32)
         num_mixtures = self.model.mixtures.weights.shape[1]
@@ -167,20 +167,20 @@ class GmmStream(AcousticStream):
 
     def reset(self) -> None:
         """Reset the state of the segment and the speaker."""
-        self._differences = DeltaFeatures(self.model.half_width)
+        self._deltas = DeltaFeatures(self.model.half_width)
         self._vtln.reset()
         self._mean.reset()
 
 
-def gmm_model_from(archive: Archive) -> GmmModel:
+def parse_gmm_model(archive: Archive) -> GmmModel:
     """Build the model after checking every size; ``ValueError`` if an array does not fit."""
-    topology = topology_from(archive)
+    topology = parse_topology(archive)
     num_mixtures = archive.array("weights", None).shape[-1]
     if not 1 <= num_mixtures <= _MAX_MIXTURES:
         raise ValueError(f"it has {num_mixtures} mixture components")
     half_width = int(archive.array("half_width", ()))
     if not 1 <= half_width <= _MAX_HALF_WIDTH:
-        raise ValueError(f"the half width of its differences is {half_width}")
+        raise ValueError(f"the half width of its deltas is {half_width}")
     shape = (topology.num_states, num_mixtures)
     mixtures = GaussianMixtures(
         weights=archive.floats("weights", *shape),

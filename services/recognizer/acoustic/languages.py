@@ -1,4 +1,4 @@
-"""Chooses the acoustic model of a language for commands and services."""
+"""Loads the acoustic model for a language."""
 
 import copy
 from dataclasses import replace
@@ -17,12 +17,14 @@ from kouxing.shared.phones.inventory import (
     load_inventory,
 )
 
-LANGUAGES_OF_MODELS = (DEFAULT_LANGUAGE, UNIVERSAL, *TABLE_LANGUAGES)  # shipped models
-_EXCLUDED = np.float32(-1e3)  # log-probability of a phone that the language lacks
+MODEL_LANGUAGES = (DEFAULT_LANGUAGE, UNIVERSAL, *TABLE_LANGUAGES)  # shipped models
+_EXCLUDED_LOG_PROB = np.float32(-1e3)  # log-probability of a phone that the language lacks
 
 
 @cache
-def model_of_language(language: str | None = None, acoustic: str | None = None) -> AcousticModel:
+def load_model_for_language(
+    language: str | None = None, acoustic: str | None = None
+) -> AcousticModel:
     """Return the acoustic model with the phones of a language; by default Mandarin.
 
     Mandarin has its own model. For other languages, the universal model is restricted to the phones
@@ -33,14 +35,14 @@ def model_of_language(language: str | None = None, acoustic: str | None = None) 
     """
     is_default = language in (None, DEFAULT_LANGUAGE)
     model = _load(acoustic or (DEFAULT_MODEL if is_default else UNIVERSAL))
-    of_model = model.inventory.language
-    if language in (None, of_model):
+    model_language = model.inventory.language
+    if language in (None, model_language):
         return model
     inventory = load_inventory(language)
-    if of_model != UNIVERSAL or not inventory.has_universal_phones:
+    if model_language != UNIVERSAL or not inventory.has_universal_phones:
         raise UserError(
-            f"the acoustic model {acoustic or UNIVERSAL} has the phones of {of_model}; use that"
-            f" language, or a model for {language}"
+            f"the acoustic model {acoustic or UNIVERSAL} has the phones of {model_language}; use"
+            f" that language, or a model for {language}"
         )
     return restrict_phones(model, inventory.phones)
 
@@ -51,12 +53,14 @@ def _load(acoustic: str) -> AcousticModel:
 
 
 def restrict_phones(model: AcousticModel, phones: tuple[str, ...]) -> AcousticModel:
-    """Return a model that recognizes only some of its phones. Both share the network."""
+    """Return a copy of a model that recognizes only these phones. Both share the network."""
     language_model = model.topology.phone_lm
     is_spoken = np.array([phone in phones for phone in model.inventory.phones])
-    log_prob = np.where(is_spoken[language_model.phone], language_model.log_prob, _EXCLUDED)
+    log_prob = np.where(
+        is_spoken[language_model.phone], language_model.log_prob, _EXCLUDED_LOG_PROB
+    )
     if isinstance(model, BlockModel):
-        model.session  # noqa: B018 - opens the network before the copy
+        model.runner  # noqa: B018 - opens the network before the copy
     limited = copy.copy(model)
     topology = replace(model.topology, phone_lm=replace(language_model, log_prob=log_prob))
     object.__setattr__(limited, "topology", topology)

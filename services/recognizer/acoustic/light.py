@@ -1,7 +1,7 @@
-"""Light model: the phones of the audio encoder, for weak or busy machines.
+"""Light model: scores phones with the audio encoder, for weak or busy machines.
 
-The encoder runs on all audio, so these phones cost only their search. HMMs and phone language model
-come from the block model.
+The encoder processes all audio anyway, so this model costs only the search. HMMs and phone
+language model come from the block model.
 
 ======== ============================================================== ==================
 symbol   meaning                                                        shape
@@ -31,7 +31,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     ScoreRequest,
     Topology,
 )
-from kouxing.services.recognizer.acoustic.model_file import Archive, topology_from
+from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.encoder import PHONES_LAG_FRAMES, load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
@@ -41,7 +41,7 @@ _ACOUSTIC_SCALE = 1.0
 
 
 class EncoderPhones:
-    """A front end that runs the encoder: its log posteriors, (frames, phones)."""
+    """A front end that runs the encoder and returns its log posteriors, (frames, phones)."""
 
     def __init__(self) -> None:
         self._mel = WhisperMel()
@@ -67,7 +67,7 @@ class LightModel(AcousticModel):
     log_prior: Floats  # (phones,)
 
     def create_front_end(self) -> EncoderPhones:
-        """Create a front end, for audio that passes through no other encoder."""
+        """Create a front end with its own encoder."""
         return EncoderPhones()
 
     def create_stream(self) -> LightStream:
@@ -76,9 +76,11 @@ class LightModel(AcousticModel):
 
     def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
         """Score the encoder's rows of several streams; None ends a stream's segment."""
-        return [self._scores_of(cast(LightStream, stream).take(rows)) for stream, rows in requests]
+        return [
+            self._compute_scores(cast(LightStream, stream).take(rows)) for stream, rows in requests
+        ]
 
-    def _scores_of(self, rows: Floats) -> Floats:
+    def _compute_scores(self, rows: Floats) -> Floats:
         num_states = np.diff(self.topology.first_state)
         scores = np.float32(_ACOUSTIC_SCALE) * (rows - self.log_prior)
         return np.repeat(scores, num_states, axis=1)
@@ -87,7 +89,7 @@ class LightModel(AcousticModel):
 class LightStream(AcousticStream):
     """Scores of one speaker's speech, segment by segment."""
 
-    uses_encoder = True
+    uses_encoder_phones = True
     look_ahead_frames = PHONES_LAG_FRAMES
 
     def __init__(self, model: LightModel) -> None:
@@ -100,7 +102,7 @@ class LightStream(AcousticStream):
         self.start(0)
 
     def start(self, num_missing: int) -> None:
-        """Start where another stream stopped, ``num_missing`` frames before the next one."""
+        """Continue another stream, whose last ``num_missing`` frames have no scores yet."""
         self._num_missing = num_missing  # frames that have no scores yet
         self._num_early = PHONES_LAG_FRAMES - num_missing  # rows for frames that have scores
         self._last = self._no_rows
@@ -123,7 +125,7 @@ class LightStream(AcousticStream):
         return rows[num_early:]
 
 
-def light_model(topology: Topology, log_prior: Floats) -> LightModel | None:
+def build_light_model(topology: Topology, log_prior: Floats) -> LightModel | None:
     """Build the model for HMMs with a prior of their states, (states,).
 
     Returns None if the encoder has other phones.
@@ -135,10 +137,10 @@ def light_model(topology: Topology, log_prior: Floats) -> LightModel | None:
     return LightModel(topology=topology, log_prior=np.log(priors))
 
 
-def light_model_from(archive: Archive) -> LightModel:
+def parse_light_model(archive: Archive) -> LightModel:
     """Build the model from the file of a block model; ``ValueError`` if something does not fit."""
-    topology = topology_from(archive)
-    model = light_model(topology, archive.floats("log_prior", topology.num_states))
+    topology = parse_topology(archive)
+    model = build_light_model(topology, archive.floats("log_prior", topology.num_states))
     if model is None:
         raise ValueError("its phones differ from the audio encoder's phones")
     return model

@@ -13,20 +13,20 @@ from kouxing.services.recognizer.acoustic.model_file import Archive, read_archiv
 from kouxing.services.recognizer.config import MODEL_NAMES
 from kouxing.shared.errors import UserError
 
-MODELS = Path(__file__).parents[1] / "models"
+MODELS_FOLDER = Path(__file__).parents[1] / "models"
 DEFAULT_MODEL = "blocks"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
-    gmm.FORMAT: gmm.gmm_model_from,
-    blocks.FORMAT: blocks.block_model_from,
-    universal.FORMAT: lambda archive: universal.universal_model_from(archive, _block_network()),
+    gmm.FORMAT: gmm.parse_gmm_model,
+    blocks.FORMAT: blocks.parse_block_model,
+    universal.FORMAT: lambda archive: universal.parse_universal_model(archive, _block_network()),
 }
 _loaded: WeakValueDictionary[str, AcousticModel] = WeakValueDictionary()  # shipped models in use
 
 
 def model_path(name: str) -> Path:
-    """Return the file of a shipped model, by its name; any other name is a path."""
+    """Return the path of a shipped model; any other name is a path."""
     file = "blocks" if name == "light" else name
-    return MODELS / f"{file}.npz" if name in MODEL_NAMES else Path(name)
+    return MODELS_FOLDER / f"{file}.npz" if name in MODEL_NAMES else Path(name)
 
 
 def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
@@ -43,7 +43,7 @@ def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
         form = str(archive.array("format", ()))
         if form not in _READERS:
             raise ValueError(f"its format is {form!r}, not {' or '.join(_READERS)}")
-        model = light.light_model_from(archive) if name == "light" else _READERS[form](archive)
+        model = light.parse_light_model(archive) if name == "light" else _READERS[form](archive)
     except ValueError as error:
         raise UserError(f"acoustic model {path}: {error}; train the model again") from error
     except UserError as error:

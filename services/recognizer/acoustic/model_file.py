@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
+from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSITIONS, Topology
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
@@ -19,13 +19,13 @@ from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 # For model files without a phone language model.
 PHONE_LM_PATH = Path(__file__).parents[1] / "models" / "phone_lm.npz"
 
-MAX_BYTES = 256 * 1024 * 1024  # limit for a file, packed or not
+MAX_BYTES = 256 * 1024 * 1024  # limit for a file, compressed or not
 _MAX_STATES = 10_000
 _MAX_NODES = 10_000_000
 _MAX_WEIGHT = 10.0
 _MAX_RATE_WEIGHT = 1000.0
 _LANGUAGE = ("language", "phones")  # arrays
-Part = TypeVar("Part")
+Component = TypeVar("Component")
 _LOG_STEP = np.float32(0.05)  # nats; a phone language model's logs are stored in 8 bits
 
 
@@ -56,7 +56,7 @@ class Archive:
 
 
 def read_archive(path: Path) -> Archive:
-    """Read a model file; ``UserError`` if it is missing or is not one."""
+    """Read a model file; ``UserError`` if it is missing or not a model file."""
     if not path.exists():
         raise UserError(
             f"there is no acoustic model at {path}; use blocks, light, gmm, universal, or a model"
@@ -65,8 +65,10 @@ def read_archive(path: Path) -> Archive:
     return Archive(read_arrays(path, MAX_BYTES, "an acoustic model; reinstall or train one"))
 
 
-def load_part(path: Path, form: str, name: str, build: Callable[[Archive], Part]) -> Part:
-    """Build a part of a recognizer from a file; ``name`` is for errors.
+def load_component(
+    path: Path, form: str, name: str, build: Callable[[Archive], Component]
+) -> Component:
+    """Read a component of the recognizer, such as the encoder; ``name`` appears in errors.
 
     Raises ``UserError`` if the file is missing, broken or of another format.
     """
@@ -93,7 +95,7 @@ def write_model(path: Path, form: str, topology: Topology, **arrays: Any) -> Non
 
 
 def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the HMMs, and of their phone language model if it is not shipped."""
+    """Return the arrays of the HMMs, and of their phone language model unless it is shipped."""
     arrays, shipped = map(phone_lm_arrays, (topology.phone_lm, shipped_phone_lm()))
     if all(np.array_equal(array, shipped[name]) for name, array in arrays.items()):
         arrays = {name: arrays[name] for name in _LANGUAGE}
@@ -110,9 +112,11 @@ def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
     }
 
 
-def topology_from(archive: Archive) -> Topology:
-    """Build the HMMs after checking every size; raises as ``phone_lm_from``."""
-    phone_lm = phone_lm_from(archive) if "lm_children" in archive else _shipped_for(archive)
+def parse_topology(archive: Archive) -> Topology:
+    """Build the HMMs after checking every size; raises as ``parse_phone_lm``."""
+    phone_lm = (
+        parse_phone_lm(archive) if "lm_children" in archive else _shipped_phone_lm_for(archive)
+    )
     num_phones = len(phone_lm.inventory)
     first_state = archive.array("first_state", (num_phones + 1,)).astype(np.int64)
     if first_state[0] != 0 or (np.diff(first_state) < 1).any() or first_state[-1] > _MAX_STATES:
@@ -133,20 +137,20 @@ def topology_from(archive: Archive) -> Topology:
         lm_scale=lm_scale,
         phone_penalty=phone_penalty,
         rate_weight=rate_weight,
-        duration_mean_s=archive.floats("duration_mean_s", NUM_POSITIONS, num_phones),
-        duration_spread_s=archive.floats("duration_spread_s", NUM_POSITIONS, num_phones),
+        duration_mean_s=archive.floats("duration_mean_s", NUM_PHRASE_POSITIONS, num_phones),
+        duration_spread_s=archive.floats("duration_spread_s", NUM_PHRASE_POSITIONS, num_phones),
     )
 
 
 @cache
 def shipped_phone_lm() -> PhoneLanguageModel:
     """Return the shipped phone language model."""
-    return phone_lm_from(read_archive(PHONE_LM_PATH))
+    return parse_phone_lm(read_archive(PHONE_LM_PATH))
 
 
-def _shipped_for(archive: Archive) -> PhoneLanguageModel:
+def _shipped_phone_lm_for(archive: Archive) -> PhoneLanguageModel:
     """Return the shipped phone language model, if it is for the archive's language."""
-    language, shipped = inventory_from(archive).language, shipped_phone_lm()
+    language, shipped = parse_inventory(archive).language, shipped_phone_lm()
     if language != shipped.inventory.language:
         raise ValueError(f"it has no phone language model, and {language} has no shipped one")
     return shipped
@@ -162,12 +166,12 @@ def phone_lm_arrays(phone_lm: PhoneLanguageModel) -> dict[str, NDArray[Any]]:
         "phones": np.array(phone_lm.inventory.phones),
         "lm_children": phone_lm.num_children,
         "lm_phone": phone_lm.phone,
-        "lm_log_prob": np.clip(-log_prob, 0, 255).astype(np.uint8),  # without its sign
+        "lm_log_prob": np.clip(-log_prob, 0, 255).astype(np.uint8),  # the sign is always negative
         "lm_log_backoff": np.clip(log_backoff, -127, 127).astype(np.int8),
     }
 
 
-def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
+def parse_phone_lm(archive: Archive) -> PhoneLanguageModel:
     """Build a phone language model after checking every number.
 
     Raises
@@ -177,7 +181,7 @@ def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
     UserError
         If the model's language is not installed.
     """
-    inventory = inventory_from(archive)
+    inventory = parse_inventory(archive)
     num_phones = len(inventory)
     children = archive.array("lm_children", None).astype(np.int64)
     if children.ndim != 1 or not 1 + num_phones <= len(children) <= _MAX_NODES:
@@ -208,7 +212,7 @@ def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
     return phone_lm
 
 
-def inventory_from(archive: Archive) -> PhoneInventory:
+def parse_inventory(archive: Archive) -> PhoneInventory:
     """Load the inventory of the file's language, and check that the file has the same phones."""
     inventory = load_inventory(str(archive.array("language", ())))
     if tuple(archive.array("phones", None).tolist()) != inventory.phones:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.onnx_session import open_network
+from kouxing.services.recognizer.onnx_session import create_inference_session
 
 MAX_POSITIONS = 1500  # rows of the table of positions
 FRAMES_PER_POSITION = 2  # feature frames from one position to the next
@@ -37,14 +37,14 @@ class NetworkModel(AcousticModel):
         """Create the front end of one session."""
         return WhisperMel()
 
-    def scores_of(self, log_posteriors: Floats) -> Floats:
+    def compute_scores(self, log_posteriors: Floats) -> Floats:
         """Divide posteriors by priors (Bourlard and Morgan 1994), and weight the log scores."""
         scores: Floats = log_posteriors - self.log_prior
         scores *= np.float32(self.acoustic_scale)
         return scores
 
 
-def integer_inputs(num_axes: Mapping[str, int]) -> bytes:
+def encode_integer_inputs(num_axes: Mapping[str, int]) -> bytes:
     """Return bytes to append to an ONNX file. They turn its integer constants into inputs.
 
     ``num_axes`` has the axes of each constant, by name; each axis has length 1. All inputs together
@@ -64,18 +64,18 @@ def integer_inputs(num_axes: Mapping[str, int]) -> bytes:
     return field(7, inputs)
 
 
-def open_session(file: NDArray[np.uint8], inputs: bytes = b"") -> Any:
-    """Open a model's ONNX file, given as bytes, with ``integer_inputs``.
+def open_onnx_session(file: NDArray[np.uint8], inputs: bytes = b"") -> Any:
+    """Open a model's ONNX file, given as bytes, with ``encode_integer_inputs``.
 
     Raises ``ValueError`` if it is not an ONNX file.
     """
     try:
-        return open_network(file.tobytes() + inputs)
+        return create_inference_session(file.tobytes() + inputs)
     except Exception as error:  # onnxruntime's errors have no common base
         raise ValueError(f"its network cannot be read ({error})") from error
 
 
-def run_session(session: Any, outputs: list[str], inputs: Mapping[str, NDArray[Any]]) -> Any:
+def run_onnx_session(session: Any, outputs: list[str], inputs: Mapping[str, NDArray[Any]]) -> Any:
     """Return a network's outputs; ValueError if it does not run."""
     try:
         return session.run(outputs, inputs)

@@ -16,7 +16,7 @@ from kouxing.services.recognizer.acoustic.model_file import Archive, write_model
 FORMAT = "universal 1"
 
 
-def universal_model_from(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
+def parse_universal_model(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
     """Build the model on the block network; ``ValueError`` if something does not fit."""
     if str(archive.array("block_network", ())) != _hash_of(network):
         raise ValueError("it belongs to another version of the block model")

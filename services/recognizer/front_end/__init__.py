@@ -1,1 +1,1 @@
-"""From sound to feature frames: resampling, features, voice activity, VTLN."""
+"""Front end: resampling, features, pitch, voice activity detection and VTLN."""

@@ -52,19 +52,19 @@ _PEAK_DECAY = 0.005  # per frame, natural log of power: 2 dB a second
 _SPEECH_BELOW_PEAK = 6.9  # natural log of power (30 dB): the mean ignores quieter frames
 
 
-def mel_of(hz: NDArray[np.float64]) -> NDArray[np.float64]:
+def hz_to_mel(hz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert frequencies to the mel scale."""
     return MELS * np.log1p(hz / MEL_KNEE_HZ)
 
 
-def hz_of(mel: NDArray[np.float64]) -> NDArray[np.float64]:
+def mel_to_hz(mel: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert mels to frequencies."""
     return MEL_KNEE_HZ * np.expm1(mel / MELS)
 
 
-LOWEST_MEL, HIGHEST_MEL = mel_of(np.array([LOWEST_HZ, HIGHEST_HZ]))
+LOWEST_MEL, HIGHEST_MEL = hz_to_mel(np.array([LOWEST_HZ, HIGHEST_HZ]))
 BAND_MEL = np.linspace(LOWEST_MEL, HIGHEST_MEL, NUM_BANDS + 2)[1:-1]  # centers of the bands
-BAND_HZ = hz_of(BAND_MEL)
+BAND_HZ = mel_to_hz(BAND_MEL)
 
 
 def _filter_bank() -> knf.OnlineFbank:
@@ -96,7 +96,7 @@ _CEPSTRAL = _cepstral_matrix()
 
 
 def frame_time_s(frame: int) -> float:
-    """Time of the boundary before a feature frame: halfway between two windows' middles."""
+    """Return the start of a feature frame: halfway between its window's center and the previous."""
     return frame * HOP_S + (WINDOW_S - HOP_S) / 2
 
 
@@ -105,7 +105,7 @@ def frame_at(time_s: float) -> int:
     return round((time_s - (WINDOW_S - HOP_S) / 2) / HOP_S)
 
 
-def frames_in(num_samples: int) -> int:
+def count_frames(num_samples: int) -> int:
     """Return the number of whole feature frames in a number of samples."""
     return max(0, (num_samples - WINDOW_SAMPLES) // HOP_SAMPLES + 1)
 
@@ -132,7 +132,7 @@ class LogMel:
         return np.maximum(rows, np.float32(LOG_FLOOR))
 
 
-def cepstra(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+def compute_cepstra(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
     """Compute log energy and cepstra 1 to 12, (frames, 41) to (frames, 13)."""
     static = np.empty((len(log_mel), NUM_STATIC), dtype=np.float32)
     for row in range(len(log_mel)):  # row by row: rounding depends on the number of rows
@@ -156,7 +156,7 @@ class DeltaFeatures:
             self._context = np.repeat(static[:1], self.look_ahead_frames, axis=0)
         known = np.concatenate([self._context, static])
         self._context = known[-2 * self.look_ahead_frames :]
-        return _with_differences(known, self._half_width)
+        return _append_deltas(known, self._half_width)
 
     def finish(self) -> NDArray[np.float32]:
         """Return the remaining rows at the end, shape (look-ahead, 39)."""
@@ -165,20 +165,20 @@ class DeltaFeatures:
         return self.append(np.repeat(self._context[-1:], self.look_ahead_frames, axis=0))
 
 
-def with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
+def append_deltas(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
     """Append the differences of a whole recording: (frames, 13) to (frames, 39)."""
     look_ahead = 2 * half_width
     before, after = (np.repeat(edge, look_ahead, axis=0) for edge in (static[:1], static[-1:]))
-    return _with_differences(np.concatenate([before, static, after]), half_width)
+    return _append_deltas(np.concatenate([before, static, after]), half_width)
 
 
-def cepstra_of_all(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Like :func:`cepstra`, in one matrix product: the last digit may differ. For training."""
+def compute_cepstra_batch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Like :func:`compute_cepstra` with one matrix product, for training; rounding may differ."""
     return log_mel @ _CEPSTRAL
 
 
 @numba.njit(cache=True)
-def _with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
+def _append_deltas(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
     num_static = static.shape[1]
     num_first = max(0, static.shape[0] - 2 * half_width)
     num_rows = max(0, static.shape[0] - 4 * half_width)

@@ -12,14 +12,14 @@ from kouxing.shared.phones.events import Progress
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 FULL_SCALE = 32768.0
-SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
+SLICE_SAMPLES = 320  # samples at 16 kHz: 20 ms, one FAP frame
 
 
 class BadAudio(ValueError):
     """Bytes that are not audio in the session's encoding."""
 
 
-def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
+def decode_pcm(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
     """Convert bytes to samples, shape (n, channels), clipped to [-1, 1].
 
     Raises ``BadAudio`` if the bytes are not a whole number of sample frames, or a sample is not
@@ -40,16 +40,16 @@ def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float
     return np.clip(samples, -1.0, 1.0).reshape(-1, num_channels)
 
 
-def slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
-    """Cut samples, (n,), at multiples of 20 ms of the stream, of which ``num_before`` are past."""
+def split_slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
+    """Split samples, (n,), at multiples of 20 ms of the stream; ``num_before`` samples precede."""
     begin = 0
     while begin < len(samples):
-        end = begin + SLICE - (num_before + begin) % SLICE
+        end = begin + SLICE_SAMPLES - (num_before + begin) % SLICE_SAMPLES
         yield samples[begin:end]
         begin = end
 
 
-def pcm16_of(samples: NDArray[np.float32]) -> bytes:
+def encode_pcm16(samples: NDArray[np.float32]) -> bytes:
     """Convert mono samples in [-1, 1] to little-endian int16 bytes."""
     scaled = np.clip(np.rint(samples * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
     return bytes(scaled.astype("<i2").tobytes())
@@ -85,16 +85,16 @@ class SliceMeter:
         self.media_time = start  # end of the audio so far
         self._start = start
         self._pieces: list[NDArray[np.float32]] = []  # pieces of the incomplete slice
-        self._pitch = PitchTracker(start // SLICE)
+        self._pitch = PitchTracker(start // SLICE_SAMPLES)
 
     def accept_waveform(
         self, samples: NDArray[np.float32]
     ) -> Iterator[tuple[NDArray[np.float32], Progress | None]]:
         """Accept samples, (n,); yield pieces, each with the slice that ends there."""
-        for piece in slices(samples, self.media_time - self._start):
+        for piece in split_slices(samples, self.media_time - self._start):
             self.media_time += len(piece)
             self._pieces.append(piece)
-            if (self.media_time - self._start) % SLICE:
+            if (self.media_time - self._start) % SLICE_SAMPLES:
                 yield piece, None
                 continue
             newest = np.concatenate(self._pieces)
@@ -116,7 +116,7 @@ def measure_slices(
 ) -> list[Progress]:
     """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does.
 
-    ``with_progress`` shows the progress.
+    ``with_progress`` wraps the loop to show progress.
     """
     meter = SliceMeter()
     return [

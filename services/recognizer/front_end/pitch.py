@@ -27,8 +27,8 @@ _START_BEFORE = 20
 class PitchTracker:
     """Tracks the fundamental frequency of a voice.
 
-    ``num_before`` slices of the session precede the first. A tracker that starts later soon gives
-    the same results.
+    ``num_before`` slices of the session precede the first one. A tracker that starts late gives
+    the same results after a few slices.
     """
 
     def __init__(self, num_before: int = 0) -> None:

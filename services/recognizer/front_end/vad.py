@@ -26,7 +26,7 @@ _STOP_POSITIONS = 25  # half a second: longer than a closure or a breath between
 
 
 class VoiceActivityDetector:
-    """Follows one stream, position by position."""
+    """Detects speech in one stream, position by position."""
 
     def __init__(self) -> None:
         self.is_speech = False  # whether there is speech or singing, so the audio is recognized
@@ -35,7 +35,7 @@ class VoiceActivityDetector:
 
     def update(self, voice: Floats) -> None:
         """Process the probabilities of a position, (4,), by ``VoiceKind``."""
-        probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SUNG])
+        probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SINGING])
         self._num_improbable = 0 if probability >= _IMPROBABLE else self._num_improbable + 1
         if self.is_speech:
             self.is_speech = self._num_improbable < _STOP_POSITIONS

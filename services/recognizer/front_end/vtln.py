@@ -133,15 +133,15 @@ class NccfPitchTracker:
 
 
 class VocalTractNormalizer:
-    """Warps the mel bands of a low voice upwards, depending on the mean pitch so far."""
+    """Warps the mel bands of a low voice upward, depending on the mean pitch so far."""
 
     def __init__(self) -> None:
         self.reset()
 
     @property
     def factor(self) -> float:
-        """Current factor on the speaker's formants, 1 to 1.3."""
-        return float(_factor(self._state))
+        """Current warp factor of the speaker's formants, 1 to 1.3."""
+        return float(_warp_factor(self._state))
 
     def warp(
         self,
@@ -180,7 +180,7 @@ class PitchedLogMel:
         return np.column_stack([log_mel, *self._pitch.accept_waveform(samples)])
 
 
-def without_pitch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+def append_unvoiced_pitch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
     """Add an unknown pitch to log-mel frames, (n, 41) to (n, 43), so that no band is warped."""
     return np.pad(log_mel, ((0, 0), (0, 2)))
 
@@ -238,7 +238,7 @@ def _period(phi: NDArray[np.float64]) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _factor(state: NDArray[np.float64]) -> float:
+def _warp_factor(state: NDArray[np.float64]) -> float:
     log_ratio = state[0] / (_PRIOR_FRAMES + state[1])  # log of reference over mean
     return min(max(math.exp(_EXPONENT * log_ratio), 1.0), MAX_FACTOR)
 
@@ -256,7 +256,7 @@ def _warp(
         if voice[row, 1] > VOICED_STRENGTH:
             state[0] = keep * state[0] + math.log(REFERENCE_HZ / voice[row, 0])
             state[1] = keep * state[1] + 1.0
-        factor = _factor(state)
+        factor = _warp_factor(state)
         if factor == 1.0:
             continue
         # From the top down, because a band is computed from the old values at or below it.

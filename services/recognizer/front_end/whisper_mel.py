@@ -34,7 +34,7 @@ from kouxing.services.recognizer.front_end.features import (
     HOP_SAMPLES,
     SAMPLE_RATE_HZ,
     WINDOW_SAMPLES,
-    frames_in,
+    count_frames,
 )
 
 NUM_MELS = 80
@@ -74,7 +74,7 @@ class WhisperMel:
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
         """Accept samples, (n,), 16 kHz, in [-1, 1]; return the new feature frames, (frames, 80)."""
         known = np.concatenate([self._samples, samples.astype(np.float32, copy=False)])
-        num_frames = frames_in(len(known))
+        num_frames = count_frames(len(known))
         self._samples = known[HOP_SAMPLES * num_frames :]
         if num_frames == 0:
             return np.empty((0, NUM_MELS), dtype=np.float32)

@@ -5,7 +5,7 @@ frame; section 3.1: any phone may follow any phone. Token passing: Young, Russel
 
 Deviation: the cost of a phone depends on the phones before it, as far as the phone language model
 looks back. So every context has its own best path, called a token. The token's current phone is the
-last phone of the context. Tokens with a score far below the best one are dropped (beam search).
+last phone of the context. Tokens with a score far below the best score are dropped (beam search).
 
 A fixed penalty for each phone deletes phones in fast speech and inserts phones in slow speech. The
 penalty can therefore follow the rate at which the phones' scores change::
@@ -54,8 +54,8 @@ from kouxing.services.recognizer.search.path_records import (
     IMPOSSIBLE,
     NO_RECORD,
     Tokens,
-    compact,
-    count_paths,
+    compact_records,
+    count_record_paths,
 )
 
 _MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
@@ -105,9 +105,9 @@ class Decoder:
         self.reset()
 
     def reset(self) -> None:
-        """Start a new stretch of speech at frame 0."""
+        """Start a new segment of speech at frame 0."""
         self.num_frames = 0
-        self._shared: list[PathSegment] = []  # phones that no later frame can change; the latest
+        self._shared: list[PathSegment] = []  # recent phones that no later frame can change
         self._last_shared = NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
         self._confidence = 0.0  # confidence in the phone
@@ -174,12 +174,12 @@ class Decoder:
         """The last phone of the best string so far; undefined before the first frame."""
         token, _ = self._best
         phone = int(self._graph.last_phone[self._tokens.context[token]])
-        return LastPhone(phone, self._end(self._tokens.link[self._best]), self._confidence)
+        return LastPhone(phone, self._end_of(self._tokens.link[self._best]), self._confidence)
 
     def path_since(self, frame: int) -> list[PathSegment]:
         """Return the phones of the best string that start at a frame or later, without the last.
 
-        Those that end after ``shared_end`` may still change.
+        Phones that end after ``shared_end`` may still change.
         """
         path = [*self._shared, *self._trace(int(self._tokens.link[self._best]))]
         return [segment for segment in path if segment.start >= frame]
@@ -187,14 +187,14 @@ class Decoder:
     @property
     def shared_end(self) -> int:
         """Frame up to which all paths had the same phones when ``drop_records`` was last called."""
-        return self._end(self._last_shared)
+        return self._end_of(self._last_shared)
 
     def forget_before(self, frame: int) -> None:
         """Forget the phones before a frame; ``shared_end`` is not before it."""
         self._shared = [segment for segment in self._shared if segment.start >= frame]
 
     def final_path(self) -> list[PathSegment]:
-        """Return the best string at the end of the speech, without phones that were forgotten."""
+        """Return the best string at the end of the speech, without forgotten phones."""
         if self.num_frames == 0:
             return []
         first_state, log_leave = self._hmms.first_state, self._hmms.log_leave
@@ -207,15 +207,15 @@ class Decoder:
         if ends[best] <= IMPOSSIBLE:  # no phone has reached its last state
             best, state = self._best
         link = int(self._tokens.link[best, state])
-        last = PathSegment(int(phones[best]), self._end(link), self.num_frames)
+        last = PathSegment(int(phones[best]), self._end_of(link), self.num_frames)
         return [*self._shared, *self._trace(link), last]
 
     def drop_records(self) -> None:
         """Store the phones that all paths share, and drop records that no path needs."""
         paths = np.zeros(self._num_records, dtype=np.int32)
-        shared = count_paths(self._num_tokens, self._tokens, self._records, paths)
+        shared = count_record_paths(self._num_tokens, self._tokens, self._records, paths)
         self._shared += self._trace(shared)
-        num_kept, self._last_shared = compact(
+        num_kept, self._last_shared = compact_records(
             shared, paths, self._num_tokens, self._tokens, self._records
         )
         if num_kept + _MAX_TOKENS > len(self._records) // 2:
@@ -229,11 +229,11 @@ class Decoder:
         segments: list[PathSegment] = []
         while record not in (NO_RECORD, self._last_shared):
             end, phone, before = self._records[record].tolist()
-            segments.append(PathSegment(phone, self._end(before), end))
+            segments.append(PathSegment(phone, self._end_of(before), end))
             record = before
         return segments[::-1]
 
-    def _end(self, record: int) -> int:
+    def _end_of(self, record: int) -> int:
         """First frame after the phone of a record."""
         return 0 if record == NO_RECORD else int(self._records[record, 0])
 
@@ -242,7 +242,7 @@ _tables = threading.local()
 
 
 def _token_table(num_contexts: int) -> NDArray[np.int16]:
-    """Return a table from contexts to tokens, without tokens; each search empties it again.
+    """Return an empty table from contexts to tokens. Each search empties it again.
 
     All searches of a thread share it, because it is larger than the rest of a search's memory.
     """

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.search.decoder import PathSegment
 
 # scores of its frames, and columns, stay, leave and skip of its nodes
-_Block: TypeAlias = tuple[
+_BlockInputs: TypeAlias = tuple[
     NDArray[np.float32],
     NDArray[np.int64],
     NDArray[np.float64],
@@ -42,7 +42,7 @@ class UtteranceGraph:
         return np.cumsum(is_phone[::-1])[::-1]
 
 
-def utterance_graph(
+def build_utterance_graph(
     phones: Sequence[int],
     syllables: Sequence[int],
     first_state: NDArray[np.int64],
@@ -103,13 +103,13 @@ def viterbi_path(
     graph
         The utterance.
     log_stay, log_leave
-        Those of ``Topology``.
+        Transition log-probabilities of ``Topology``.
 
     Returns
     -------
     tuple
-        The node of every frame, (frames,), and the path's log-likelihood. With too few frames:
-        nothing and minus infinity.
+        The node of every frame, (frames,), and the path's log-likelihood. With too few frames, the
+        path is empty and the log-likelihood minus infinity.
 
     Memory grows with the square root of the number of frames: only some rows of scores are kept,
     and each block between two of them is computed again to trace the path (Hirschberg 1975). A
@@ -131,7 +131,7 @@ def viterbi_path(
     step = math.isqrt(num_frames) + 1
     starts = range(0, num_frames - 1, step)  # the frame before each block
 
-    def block_of(start: int, low: int, end: int) -> _Block:
+    def block_of(start: int, low: int, end: int) -> _BlockInputs:
         """Return the inputs of a block for the nodes from ``low`` to ``end``."""
         band = slice(low, end)
         block = scores[start + 1 : start + 1 + step]
@@ -159,7 +159,7 @@ def viterbi_path(
         end = int(piece[-1]) + 1
         first_node = max(low, end - step * num_skipped)  # the path cannot come from before
         inputs = block_of(start, first_node, end)
-        back = _origins(row[first_node - low : end - low], *inputs, num_skipped)
+        back = _find_origins(row[first_node - low : end - low], *inputs, num_skipped)
         _backtrace(back, first_node, num_skipped, piece)
     return path, float(totals.max())
 
@@ -176,7 +176,7 @@ def _advance(
 ) -> NDArray[np.float64]:
     """Return the row after a block, (nodes,), given the row before it."""
     num_nodes = len(row)
-    # nodes that do not exist, before the first one
+    # padding before the first node
     old = np.full(num_nodes + num_skipped, -np.inf)
     new = old.copy()
     old[num_skipped:] = row
@@ -194,7 +194,7 @@ def _advance(
 
 
 @numba.njit(cache=True, nogil=True)
-def _origins(
+def _find_origins(
     row: NDArray[np.float64],
     scores: NDArray[np.float32],
     columns: NDArray[np.int64],

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.search.path_records import IMPOSSIBLE, NO_RECORD, Tokens
-from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, Graph
+from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, ContextGraph
 
 NO_TOKEN = -1
 SLOW_RATE = np.float32(1.0 / 60.0)
@@ -51,9 +51,9 @@ def advance_frames(
     num_tokens: int,
     num_records: int,
     hmms: Hmms,
-    graph: Graph,
+    graph: ContextGraph,
 ) -> tuple[int, int, int, int, int]:
-    """Advance all paths as in `Decoder.advance_until`, or as far as there is room for records.
+    """Advance all paths like `Decoder.advance_until`, but stop when the records are full.
 
     Fills in the last phone and the confidence after each frame. Returns the numbers of frames,
     tokens and records; the best token, and its best state.
@@ -129,7 +129,7 @@ def _start_phones(
     num_tokens: int,
     num_records: int,
     hmms: Hmms,
-    graph: Graph,
+    graph: ContextGraph,
 ) -> tuple[int, int, NDArray[np.float32], NDArray[np.int32]]:
     """Record the phones that may end before the frame, and start the phones that may follow.
 
@@ -181,7 +181,10 @@ def _start_phones(
 
 @numba.njit(cache=True, nogil=True)
 def _look_up_phones(
-    context: int, graph: Graph, log_prob: NDArray[np.float32], next_context: NDArray[np.int32]
+    context: int,
+    graph: ContextGraph,
+    log_prob: NDArray[np.float32],
+    next_context: NDArray[np.int32],
 ) -> None:
     """Fill in the log-probability of each phone after a context, and the context it leads to."""
     chain = np.empty(_MAX_CHAIN, np.int32)
@@ -208,7 +211,7 @@ def _advance_states(
     entry: NDArray[np.float32],
     entry_link: NDArray[np.int32],
     hmms: Hmms,
-    graph: Graph,
+    graph: ContextGraph,
 ) -> tuple[int, int]:
     """Advance the paths within the phones by one frame; return the best token and its state."""
     context, top, score, link = tokens
@@ -243,9 +246,9 @@ def _normalize_scores(
     num_tokens: int,
     tokens: Tokens,
     records: NDArray[np.int32],
-    graph: Graph,
+    graph: ContextGraph,
 ) -> float:
-    """Subtract the best score, so that numbers stay small; return the last phone's confidence."""
+    """Subtract the best score, to keep numbers small; return the last phone's confidence."""
     context, top, score, link = tokens
     best = score[best_token, best_state]
     best_phone = graph.last_phone[context[best_token]]

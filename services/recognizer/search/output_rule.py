@@ -4,7 +4,7 @@ Source: Li et al. 2011, section 2.2, eq. 4 and fig. 3: the last phone of the bes
 emitted when the last N feature frames agree on it and it differs from the phone emitted before.
 
 Deviation: a frame counts only if the search is confident enough of its last phone. On development
-data, one such frame gives fewer wrong phones, and gives them sooner, than any N without this.
+data, one such frame emits phones earlier, with fewer errors, than any N without this condition.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class OutputRule:
         self.reset()
 
     def reset(self) -> None:
-        """Start a new stretch of speech."""
+        """Start a new segment of speech."""
         self.last_emitted = self._candidate = self._initial
         self._num_agreeing = 0
 

@@ -1,4 +1,4 @@
-"""The records of the phones on the decoder's paths, and which of them all paths share."""
+"""The records of the phones on the decoder's paths, and the search for shared ones."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ IMPOSSIBLE = np.float32(-1e30)  # score of a state that no path reaches
 
 
 class Tokens(NamedTuple):
-    """The tokens; only the first tokens are in use."""
+    """Preallocated arrays of the tokens; only the first ones are in use."""
 
     context: NDArray[np.int32]  # (tokens,)
     top: NDArray[np.float32]  # (tokens,)
@@ -20,7 +20,7 @@ class Tokens(NamedTuple):
 
 
 @numba.njit(cache=True)
-def count_paths(
+def count_record_paths(
     num_tokens: int, tokens: Tokens, records: NDArray[np.int32], paths: NDArray[np.int32]
 ) -> int:
     """Count the paths through each record, (records,); return the last one that all paths share."""
@@ -40,7 +40,7 @@ def count_paths(
 
 
 @numba.njit(cache=True)
-def compact(
+def compact_records(
     shared: int,
     paths: NDArray[np.int32],
     num_tokens: int,

@@ -1,4 +1,4 @@
-"""Phone language model: the probability of a phone given the phones before it. Back-off n-grams.
+"""Phone language model: back-off n-grams of phones.
 
 Sources: Katz 1987, "Estimation of probabilities from sparse data" (back-off); Mohri, Pereira and
 Riley 2002, "Weighted finite-state transducers in speech recognition" (n-grams as a graph).
@@ -33,7 +33,7 @@ from kouxing.shared.phones.inventory import PhoneInventory
 MAX_ORDER = 16  # phones in an n-gram
 
 
-class Graph(NamedTuple):
+class ContextGraph(NamedTuple):
     """The contexts and the arcs between them, for the search. Context 0 is the empty one."""
 
     first_arc: NDArray[np.int32]  # (contexts + 1,) context c has arcs first_arc[c] to [c + 1]
@@ -65,12 +65,12 @@ class PhoneLanguageModel:
         return levels
 
     @cached_property
-    def graph(self) -> Graph:
+    def graph(self) -> ContextGraph:
         """The tree as a graph of contexts."""
-        context, is_context, backoff_state = _contexts(self.num_children, self.phone)
+        context, is_context, backoff_state = _find_contexts(self.num_children, self.phone)
         contexts = np.flatnonzero(is_context)
         end = np.cumsum(self.num_children, dtype=np.int32)
-        return Graph(
+        return ContextGraph(
             first_arc=np.append(np.int32(0), end[contexts]),
             arc_phone=self.phone[1:],
             arc_log_prob=self.log_prob[1:],
@@ -82,7 +82,7 @@ class PhoneLanguageModel:
 
 
 @numba.njit(cache=True)
-def _contexts(
+def _find_contexts(
     num_children: NDArray[np.uint8], phone: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.int32]]:
     """Return each node's context, whether the node is a context, and its back-off context's node.

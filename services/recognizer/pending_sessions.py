@@ -1,18 +1,18 @@
-"""Sessions that wait for the acoustic model of their language, which a thread loads."""
+"""Sessions that wait for their acoustic model, which a thread loads."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.languages import model_of_language
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.shared.records import replace
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings
 
 
-class StartingSessions:
-    """Loads each model at its first use, while other sessions continue.
+class PendingSessions:
+    """Queues sessions while a thread loads their acoustic model.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class StartingSessions:
 
 
 def _load(language: str) -> AcousticModel:
-    model = model_of_language(language)
+    model = load_model_for_language(language)
     if isinstance(model, BlockModel):
-        model.session  # noqa: B018 - opens the network, which takes most of the time
+        model.runner  # noqa: B018 - opens the network, which takes most of the time
     return model

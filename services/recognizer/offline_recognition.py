@@ -1,4 +1,4 @@
-"""Recognizes whole recordings, by the same search as live audio."""
+"""Recognizes whole recordings with the same search as live audio."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
@@ -11,13 +11,13 @@ from kouxing.shared.records import replace
 WithProgress: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]  # ``iter``, or a progress bar
 
 
-def recognize(
+def recognize_recording(
     model: AcousticModel, samples: Floats, sample_rate_hz: int, with_progress: WithProgress = iter
 ) -> list[Phone]:
     """Return the phones of a recording, (n,) or (n, channels), and silence within speech.
 
-    They are the final phones of a live session with the same audio. ``with_progress`` shows the
-    progress.
+    A live session with the same audio has the same final phones. ``with_progress`` wraps the loop
+    to show progress.
     """
     recognizer = Recognizer(model)
     num_channels = 1 if samples.ndim == 1 else samples.shape[1]

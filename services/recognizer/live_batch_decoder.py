@@ -10,14 +10,14 @@ from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.shared.metrics import LoadMeter
 from kouxing.shared.overload import MAX_HOP, HopController, ProcessorTime
 
-MAX_BATCH_S = 0.3  # of audio that is decoded together
+MAX_BATCH_S = 0.3  # audio of all sessions that is decoded together
 MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
 SESSIONS_TOGETHER = 4  # the encoder processes these in one run
-NETWORK_WEIGHT = 0.25  # of the block network's time in the load of the service
+NETWORK_WEIGHT = 0.25  # weight of the block network's time in the load of the service
 
 
-class LiveBatches:
-    """Decodes live audio, at the hop of the block network that the load allows.
+class LiveBatchDecoder:
+    """Decodes live audio in batches. The load determines the hop of the block network.
 
     Parameters
     ----------
@@ -25,8 +25,8 @@ class LiveBatches:
         All sessions of the service.
     recognizer
         Decodes the streams of the sessions.
-    busy
-        Load of the service, without most of the network's time.
+    load_meter
+        Measures the load of the service; the network's time counts less.
     wake
         Called on the network's thread when sessions are decoded.
     on_early
@@ -41,29 +41,29 @@ class LiveBatches:
         self,
         sessions: Sized,
         recognizer: Recognizer,
-        busy: LoadMeter,
+        load_meter: LoadMeter,
         wake: Callable[[], None],
         on_early: Callable[[RecognizerSession], None],
         on_decoded: Callable[[Sequence[RecognizerSession]], None],
         on_batch: Callable[[], None],
     ) -> None:
-        self._all = sessions
+        self._all_sessions = sessions
         self._recognizer = recognizer
-        self._busy = busy
+        self._load_meter = load_meter
         self._on_early, self._on_decoded, self._on_batch = on_early, on_decoded, on_batch
         self._network = NetworkThread(recognizer, wake)
         self.unpaced_work = ProcessorTime()  # part of ``work`` that is not for live audio
-        self._pace = HopController(self.work, time.monotonic())
+        self._hop_controller = HopController(self.work, time.monotonic())
 
     @property
     def hop(self) -> int:
         """The current hop of the block network, in blocks."""
-        return self._pace.hop
+        return self._hop_controller.hop
 
     @property
     def work(self) -> ProcessorTime:
         """The work of the service so far."""
-        network_s = BlockRunner.run_s
+        network_s = BlockRunner.total_run_s
         return ProcessorTime(network_s, time.thread_time() + self._network.work_s - network_s)
 
     def decode_all(self, sessions: Sequence[RecognizerSession]) -> None:
@@ -80,44 +80,47 @@ class LiveBatches:
         are sent before it finishes. Otherwise, their later audio waits in the queue.
         """
         # Under load, the network runs at the longest hop, and on another core.
-        network_weight = NETWORK_WEIGHT * self._pace.hop / MAX_HOP
+        network_weight = NETWORK_WEIGHT * self._hop_controller.hop / MAX_HOP
         if decoded := self._network.take_decoded():
-            self._busy.add(network_weight * self._network.batch_s)
+            self._load_meter.add(network_weight * self._network.batch_s)
             # speech that the encoder found during the run; sessions with more audio follow below
             ended = [session for session in decoded if not session.audio]
-            ready = [session for session in ended if not self._waits_for_network(session)]
-            self._recognizer.decode_found([session.stream for session in ready])
+            ready = [session for session in ended if not self._queue_for_network(session)]
+            self._recognizer.decode_speech([session.stream for session in ready])
             self._on_decoded(decoded)
         sessions = [session for session in sessions if session.can_accept]
         now_s = time.monotonic()
         if sessions:
             is_behind = any(session.audio.overload.is_behind for session in sessions)
-            self._pace.update(self.work - self.unpaced_work, now_s, is_behind=is_behind)
+            self._hop_controller.update(self.work - self.unpaced_work, now_s, is_behind=is_behind)
         part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
-        # the first sessions do not wait for all
+        # in groups, so that the first sessions do not wait for all others
         for begin in range(0, len(sessions), SESSIONS_TOGETHER):
             group = sessions[begin : begin + SESSIONS_TOGETHER]
             for session in group:
-                session.accept_waveform(part_s, now_s, self._pace.hop)
+                session.accept_waveform(part_s, now_s, self._hop_controller.hop)
             self._recognizer.run_encoder([session.stream for session in group])
-            if len(self._all) <= 1 and not group[0].is_scoring:  # no other session waits
-                network_s = BlockRunner.run_s
+            if len(self._all_sessions) <= 1 and not group[0].is_scoring:  # no other session waits
+                network_s = BlockRunner.total_run_s
                 self._decode(group)
-                self._busy.add((network_weight - 1.0) * (BlockRunner.run_s - network_s))
+                self._load_meter.add((network_weight - 1.0) * (BlockRunner.total_run_s - network_s))
             else:
-                self._decode([session for session in group if not self._waits_for_network(session)])
-        self._network.start(now_s, saves_time=self._pace.hop > 1)
+                self._decode([session for session in group if not self._queue_for_network(session)])
+        self._network.start(now_s, saves_time=self._hop_controller.hop > 1)
         self._on_batch()
 
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:
-        self._recognizer.decode_found([session.stream for session in sessions])
+        self._recognizer.decode_speech([session.stream for session in sessions])
         self._on_decoded(sessions)
 
-    def _waits_for_network(self, session: RecognizerSession) -> bool:
-        """Queue a session for the block network if needed; under load, send its lips first."""
+    def _queue_for_network(self, session: RecognizerSession) -> bool:
+        """Queue a session that needs the block network; under load, send its lips first.
+
+        Returns whether the session was queued.
+        """
         if not (session.is_scoring or self._recognizer.needs_network(session.stream)):
             return False
-        if session.is_scoring or self._pace.hop > 1:
+        if session.is_scoring or self._hop_controller.hop > 1:
             session.stream.decode_early()
             self._on_early(session)
         if not session.is_scoring:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, cast
 
-from kouxing.services.recognizer.live_batches import LiveBatches
+from kouxing.services.recognizer.live_batch_decoder import LiveBatchDecoder
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.shared.metrics import LoadMeter
@@ -21,13 +21,13 @@ class FakeSession:
 
     def __init__(self) -> None:
         self.audio = FakeAudio([1])
-        self.is_due = self.is_scoring = False
+        self.waits_for_network = self.is_scoring = False
         self.stream = self
         self.found: list[str] = []  # speech that is not decoded yet
 
     @property
     def is_decoding(self) -> bool:
-        return bool(self.audio) or self.is_due or self.is_scoring
+        return bool(self.audio) or self.waits_for_network or self.is_scoring
 
     @property
     def can_accept(self) -> bool:
@@ -57,7 +57,7 @@ class FakeRecognizer:
     def needs_network(self, stream: FakeSession) -> bool:
         return "needs the network" in stream.found
 
-    def decode_found(self, streams: Sequence[FakeSession]) -> None:
+    def decode_speech(self, streams: Sequence[FakeSession]) -> None:
         for stream in streams:
             self.decoded += stream.found
             stream.found.clear()
@@ -66,7 +66,7 @@ class FakeRecognizer:
 def test_speech_found_during_a_run_is_decoded_without_more_audio() -> None:
     recognizer, sent = FakeRecognizer(), list[Any]()
     session = cast(RecognizerSession, FakeSession())
-    batches = LiveBatches(
+    batches = LiveBatchDecoder(
         [session, session],
         cast(Recognizer, recognizer),
         LoadMeter(1.0, 0.0),
