@@ -31,7 +31,7 @@ from kouxing.services.recognizer.speech_segmenter import (
 )
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, FaceAnimator, Frame
-from kouxing.services.synthesizer.lips.learned.closures import ClosureRule
+from kouxing.services.synthesizer.lips.learned.closure_rule import ClosureRule
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ

@@ -15,7 +15,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
     VisemeArticulation,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
-from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
+from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone
@@ -53,7 +53,7 @@ def synthesize(
             silence_end_s=timeline.silence_end_s[silent],
         )
         faps[first : first + block, np.array(MOUTH_FAPS) - 1] = blend(parameters, near, times)
-    amplitude = Amplitude()
+    amplitude = AmplitudeModifier()
     articulation = VisemeArticulation(timeline, parameters.level_db)
     for number, (frame_s, faps_now) in enumerate(zip(time_s, faps, strict=True)):
         context = FrameContext(

@@ -15,7 +15,7 @@ from kouxing.corpora.scoring import final_hypothesis
 from kouxing.evaluation.lips.curves import is_near
 from kouxing.evaluation.lips.mouths import CURVES, Mouth, real_faps, real_mouth
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import training_clip_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -141,7 +141,7 @@ def read_parts(
 
 
 def _held_out(folder: Path, clips: list[LipClip], parameters: Collection[Path]) -> list[LipClip]:
-    seen = {name for path in {None, *parameters} for name in clips_seen(path)}
+    seen = {name for path in {None, *parameters} for name in training_clip_names(path)}
     clips = [clip for clip in clips if clip.split == "held"]
     if not clips:
         raise UserError(f"{folder}: no clip is held out; list clips or speakers in held.txt")

@@ -40,8 +40,8 @@ from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
-from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, load_table
+from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, build_key_frames
+from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING, load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
@@ -172,7 +172,7 @@ def _methods(
     table = load_table(inventory)
     by_endpoints = time_text(measure_slices(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
-        yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
+        yield name, _curves_of(build_key_frames(timed, table, inventory.silence))
     delays_s = {name: lip_model_info(name).delay_ms / 1e3 for name in lip_models()}
     events = live_events(model, samples, load_lip_predictor(), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():

@@ -28,7 +28,7 @@ from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.evaluation.tables import letters_of, percent
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.front_end.pcm import SLICE_SAMPLES, split_slices
+from kouxing.services.recognizer.front_end.pcm import SLICE, split_slices
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.phones.events import Phone, Progress, SpeechChange
 from kouxing.shared.terminal import CONSOLE, print_table
@@ -36,7 +36,7 @@ from kouxing.shared.terminal import CONSOLE, print_table
 Mask = NDArray[np.bool_]  # (slices,)
 Figures = Mapping[str, Any]
 
-_SLICE_S = SLICE_SAMPLES / SAMPLE_RATE_HZ
+_SLICE_S = SLICE / SAMPLE_RATE_HZ
 _PAUSE = 2 * SAMPLE_RATE_HZ  # samples of silence before and after a recording of speech
 _SYNTHETIC_S = 60.0
 _SUNG_OVER_MUSIC_DB = 5.0
@@ -89,9 +89,7 @@ def _label_all(kind: str, recordings: Iterable[Samples], *, is_voice: bool) -> L
 
 def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
     """Return whether the middle of each slice is in a phone, after the pause."""
-    middle_s = (
-        (np.arange(-(-num_samples // SLICE_SAMPLES)) + 0.5) * SLICE_SAMPLES - _PAUSE
-    ) / SAMPLE_RATE_HZ
+    middle_s = ((np.arange(-(-num_samples // SLICE)) + 0.5) * SLICE - _PAUSE) / SAMPLE_RATE_HZ
     mask = np.zeros(len(middle_s), np.bool_)
     for phone in phones:
         mask |= (phone.onset_s <= middle_s) & (middle_s < phone.onset_s + phone.duration_s)

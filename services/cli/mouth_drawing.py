@@ -30,13 +30,13 @@ from kouxing.services.recognizer.transcriber import Transcriber
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.ferguson import drawing
-from kouxing.services.synthesizer.lips.ferguson.contour import LINES, rounded_contour
+from kouxing.services.synthesizer.lips.ferguson.contour import LINES, compute_rounded_contour
 from kouxing.services.synthesizer.lips.ferguson.key_frames import (
     KeyFrames,
-    anchors_of,
-    key_frames_of,
+    build_anchors,
+    build_key_frames,
 )
-from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.ferguson.phone_table import load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import (
     MAX_SPEECH_RATIO,
     MAX_SYLLABLES,
@@ -145,7 +145,7 @@ def draw_mouth(
         samples=samples,
         phones=phones,
         syllables=write_syllables(phones, transcript, inventory),
-        key_frames=key_frames_of(phones, load_table(inventory), inventory.silence),
+        key_frames=build_key_frames(phones, load_table(inventory), inventory.silence),
         widths=widths,
         inventory=inventory,
     )
@@ -219,7 +219,9 @@ def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
 def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.LabeledMouth]:
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
-    anchors = anchors_of(mouth.phones, mouth.inventory.silence) or [(0.0, mouth.inventory.silence)]
+    anchors = build_anchors(mouth.phones, mouth.inventory.silence) or [
+        (0.0, mouth.inventory.silence)
+    ]
     write = mouth.inventory.write
     middles_s = {phone.onset_s: phone.onset_s + phone.duration_s / 2 for phone in mouth.phones}
     widths = mouth.widths_at([middles_s.get(time_s, time_s) for time_s, _ in anchors])
@@ -290,7 +292,7 @@ def _write_csv(output: Path, mouth: _Mouth) -> str:
         firsts = progress.track(range(0, len(times_s), _BLOCK_FRAMES), description="writing")
         for first in firsts:
             block = slice(first, first + _BLOCK_FRAMES)
-            contours = rounded_contour(openings[block], widths[block], NUM_POINTS)
+            contours = compute_rounded_contour(openings[block], widths[block], NUM_POINTS)
             for time_s, opening, lines in zip(
                 times_s[block], openings[block], contours, strict=True
             ):

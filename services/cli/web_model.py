@@ -43,7 +43,7 @@ from kouxing.services.recognizer.search import decoder
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.services.synthesizer import face_animator
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.learned import closures, model, rest, track
+from kouxing.services.synthesizer.lips.learned import closure_rule, lip_track, model, resting_lips
 from kouxing.services.synthesizer.modifiers import expressiveness, feeling, nonverbal
 from kouxing.shared import clock
 from kouxing.shared.face import expression_motion, shapes
@@ -59,7 +59,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "blocks": (blocks, "FRAMES_PER_POSITION MAX_POSITIONS FLOOR_BANDS _PADDING _SEEN_AFTER"),
     "clock": (clock, "MEDIA_RATE_HZ"),
     "closures": (
-        closures,
+        closure_rule,
         "_MIN_PROBABILITY _MAX_PROBABILITY _HOLD_S _LATE_HOLD_S _MAX_LATE_S _EDGE_S _PARTED "
         "_WIDE_APART _ROUNDED _INNER_UPPER _INNER_LOWER _LEFT_CORNER _RIGHT_CORNER _UPPER "
         "_LOWER _LOWER_OUTER _INNER _OUTER _BOTH",
@@ -100,7 +100,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "SAMPLE_RATE_HZ MIN_RATE_HZ MAX_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA",
     ),
     "rest": (
-        rest,
+        resting_lips,
         "HOLD_S LEAD_S PART_S CLOSE_S CERTAIN _YIELD_S _END_S _MIN_PAUSE_S _RANGE_DB _FADE_DB "
         "_LAST_SOUND_S _ONSET_S _LIKELY _DOUBT AJAR",
     ),
@@ -111,7 +111,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     ),
     "shapes": (shapes, "NUM_FAPS _PATIENCE _ROUNDING"),
     "stream": (stream, "MEDIA_RATE_HZ SILENT_DB"),
-    "track": (track, "HOLD_S CLOSE_S _OPEN_S MAX_GAP_S"),
+    "track": (lip_track, "HOLD_S CLOSE_S _OPEN_S MAX_GAP_S"),
     "traits": (
         voice_traits,
         "NUM_TRAITS MIN_VOICE _MEAN_POSITIONS _PRIOR_FEELING _PRIOR_POSITIONS _MAX_POSITIONS "
@@ -160,7 +160,7 @@ def web_model() -> dict[str, bytes]:
         "voices": {voice.name: int(voice) for voice in encoder.VoiceKind},
         "numFaps": NUM_FAPS,
         "mouthFaps": MOUTH_FAPS,
-        "closureRule": asdict(closures.ClosureRule()),
+        "closureRule": asdict(closure_rule.ClosureRule()),
         "defaults": {
             "frameRateHz": settings.frame_rate_hz,
             "delayS": settings.delay_ms / 1e3,

@@ -13,8 +13,8 @@ _MIN_CHUNK_S = 0.001  # shorter chunks count as this duration, because decoding 
 class AudioQueue:
     """A queue of chunks that drops old audio. Times are in seconds, on any monotonic clock."""
 
-    def __init__(self, sample_rate_hz: int, overload: SkipPolicy) -> None:
-        self.overload = overload
+    def __init__(self, sample_rate_hz: int, skip_policy: SkipPolicy) -> None:
+        self.skip_policy = skip_policy
         self._rate_hz = sample_rate_hz
         self._chunks: deque[Chunk] = deque()
         self._num_samples = 0  # in the queue
@@ -38,7 +38,7 @@ class AudioQueue:
         media_time, samples = chunk
         end = media_time + len(samples) * MEDIA_RATE_HZ // self._rate_hz
         duration_s = to_seconds(max(0, end - self._end))
-        self.overload.add(duration_s, now_s, has_waiting=bool(self._chunks))
+        self.skip_policy.add(duration_s, now_s, has_waiting=bool(self._chunks))
         self._end = end
         self._chunks.append(chunk)
         self._num_samples += len(samples)
@@ -50,11 +50,11 @@ class AudioQueue:
 
     def is_outdated(self, now_s: float) -> bool:
         """Return whether even the newest chunk is late, so that more audio should have arrived."""
-        return bool(self._chunks) and self.overload.is_late(now_s)
+        return bool(self._chunks) and self.skip_policy.is_late(now_s)
 
     def skip_old(self, now_s: float) -> bool:
         """Skip audio that is too old; return whether any was skipped."""
-        has_skipped = self.overload.update(self._waiting_s, now_s)
+        has_skipped = self.skip_policy.update(self._waiting_s, now_s)
         if has_skipped:
             self._num_samples = len(self._chunks[-1][1])
             while len(self._chunks) > 1:

@@ -57,7 +57,7 @@ NUM_OUTPUTS = len(LIP_FAPS) + 2
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
 _MAX_SIZE = 4096  # limit for the numbers of features, components and units
-_TRACKED_COLUMNS, _PAIR_SOURCES, _PAIR_TARGETS = (
+_COLUMNS, _ONES, _OTHERS = (
     np.array([MOUTH_FAPS.index(fap) for fap in faps])
     for faps in (LIP_FAPS, OTHER_SIDE, OTHER_SIDE.values())
 )
@@ -211,8 +211,8 @@ def join_features(frames: Floats, features: Floats) -> Floats:
 def expand_mouth_faps(lips: Floats) -> Floats:
     """Return all FAPs of the mouth, (28,), from the FAPs that a camera tracks, (15,)."""
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
-    faps[_TRACKED_COLUMNS] = lips
-    faps[_PAIR_TARGETS] = faps[_PAIR_SOURCES]
+    faps[_COLUMNS] = lips
+    faps[_OTHERS] = faps[_ONES]
     return faps
 
 

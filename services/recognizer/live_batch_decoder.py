@@ -91,7 +91,7 @@ class LiveBatchDecoder:
         sessions = [session for session in sessions if session.can_accept]
         now_s = time.monotonic()
         if sessions:
-            is_behind = any(session.audio.overload.is_behind for session in sessions)
+            is_behind = any(session.audio.skip_policy.is_behind for session in sessions)
             self._hop_controller.update(self.work - self.unpaced_work, now_s, is_behind=is_behind)
         part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
         # in groups, so that the first sessions do not wait for all others

@@ -218,7 +218,7 @@ class RecognizerService(SessionService):
                 text = "the synthesizer is too slow, so the face misses part of the speech"
                 self.warn(ErrorCode.NO_LINK, text, session.name)
                 self.publish_event(EventName.ERROR, session.name, f"{ErrorCode.NO_LINK}: {text}")
-            self.report_skipped(session.name, session.audio.overload.take_report_s(now_s))
+            self.report_skipped(session.name, session.audio.skip_policy.take_report_s(now_s))
             if session.link.is_full:
                 blocked.add(session.start.paced)
         self._is_live_blocked = True in blocked or self._queued_s(paced=True) > MAX_QUEUED_S
@@ -254,7 +254,7 @@ class RecognizerService(SessionService):
             name: SessionInput(
                 idle_s=max(0.0, read_s[session.start.paced] - session.last_audio_s),
                 sequence=session.replay_window.last_droppable_sequence,
-                skipped_s=session.audio.overload.skipped_s,
+                skipped_s=session.audio.skip_policy.skipped_s,
             )
             for name, session in self._sessions.items()
         }
@@ -314,7 +314,7 @@ class RecognizerService(SessionService):
                 return
             if not self._audio.wait(READ_WAIT_S):
                 for audio in late:
-                    audio.overload.adapt(now_s)
+                    audio.skip_policy.adapt(now_s)
                 return
             self.handle_messages(self._audio)
 

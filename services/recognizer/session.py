@@ -95,11 +95,11 @@ class RecognizerSession:
         if start.media_time:
             silence = recognizer.model.inventory.silence
             self.resume_filter = ResumeFilter(to_seconds(start.media_time), silence)
-        overload = SkipPolicy(
+        skip_policy = SkipPolicy(
             max_lag_s if start.paced else math.inf,
             now_s + CATCH_UP_S if start.epoch > 1 else now_s,
         )
-        self.audio = AudioQueue(start.sample_rate_hz, overload)  # not decoded yet
+        self.audio = AudioQueue(start.sample_rate_hz, skip_policy)  # not decoded yet
         self.waits_for_network = False  # waits for the block network's thread
         self.is_scoring = False  # on the block network's thread
         self.accepted_s = now_s  # when the stream last took audio, except during scoring
@@ -226,7 +226,7 @@ class RecognizerSession:
             has_skipped = self.audio.skip_old(now_s)
             uses_light_model = self.face.settings.acoustic == AcousticModelName.LIGHT
             self.stream.set_light_model(
-                uses_light_model or self.audio.overload.needs_light_model(now_s)
+                uses_light_model or self.audio.skip_policy.needs_light_model(now_s)
             )
         chunks = self.audio.take(max_s)
         while self.can_accept and (chunk := next(chunks, None)) is not None:
@@ -247,7 +247,7 @@ class RecognizerSession:
         """Record that audio arrived; the face must not return to rest until it is processed."""
         if self.start.paced and self.silent_s > STALLED_AFTER_S:
             self._report(AudioState.RESUMED, now_s)
-            self.audio.overload.resume()
+            self.audio.skip_policy.resume()
         self.last_audio_s, self.silent_s = now_s, 0.0
 
     def _report(self, state: AudioState, now_s: float) -> None:

@@ -1,1 +1,1 @@
-"""The synthesizer service: phones and lip frames in, FAP frames out."""
+"""The synthesizer service: turns phones and lip frames into FAP frames."""

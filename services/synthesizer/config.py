@@ -39,8 +39,8 @@ class SynthesizerConfig(FaceConfig, LiveConfig):
             _DEFAULT_DELAY_MS,
         )
     )
-    """Time from a frame's audio until the frame is made, in steps of 20 ms."""
+    """Delay between a frame's audio and the frame, in steps of 20 ms."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""
     feeling: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """How strongly the face shows the feeling in the voice. 0 turns it off."""
+    """Strength of the voice's emotion on the face. 0 turns it off."""

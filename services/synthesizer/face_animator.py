@@ -1,14 +1,14 @@
-"""The face of one session, without sockets: sound events in, FAP frames out.
+"""Animates the face of one session, without sockets: turns sound events into FAP frames.
 
     events -> lip model -> modifiers -> frames
 
-Frames are clocked by media time, so they do not depend on the arrival times of events. The caller
+Frames follow media time, so they do not depend on the arrival times of events. The caller
 decides when a stream has stalled and requests frames that return to rest (`FaceAnimator.relax`).
 
 The face moves continuously when another recognizer takes over (`change_recognizer`), when this face
 replaces the face of another process (`resume`), and when the lip model changes (`set_lip_model`). A
-*transition* of all FAPs then leads the difference between old and new frames to zero. Lips that
-must close for speech close during the transition as well.
+*transition* of all FAPs then fades the difference between old and new frames to zero. Lips that
+must close for speech also close during the transition.
 """
 
 import math
@@ -21,14 +21,17 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.lip_model import LipModel, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
-from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
-from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
-from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
-from kouxing.services.synthesizer.modifiers.feeling import FeelingMotion
+from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
+from kouxing.services.synthesizer.modifiers.expression import ExpressionModifier
+from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
+from kouxing.services.synthesizer.modifiers.feeling import FeelingModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
-from kouxing.services.synthesizer.modifiers.nonverbal import NonverbalSounds
-from kouxing.services.synthesizer.modifiers.speech_motion import Behavior, SpeechMotion
-from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
+from kouxing.services.synthesizer.modifiers.nonverbal import NonverbalModifier
+from kouxing.services.synthesizer.modifiers.speech_motion import (
+    IdleMotionSettings,
+    SpeechMotionModifier,
+)
+from kouxing.services.synthesizer.phone_renumberer import PhoneRenumberer
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expression_motion import JAW, mix
@@ -43,18 +46,18 @@ from kouxing.shared.phones.events import (
 )
 
 Faps: TypeAlias = NDArray[np.float64]  # (68,)
-Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
+Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds; FAPs (68,)
 
 MAX_DELAY_S = 1.5  # at most 0.3 live; a viseme further ahead has no visible weight
 REST_S = 0.3  # duration of the return to rest after the end of the sound
 _RECENT_S = 2.0  # events that a new lip model receives
 _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
-# Frames of a resumed face before it is shown. Older levels all act in the first of them. A brow or
-# head movement that they start must end, and no longer block the next one, before the face is shown
+# Rehearsal of a resumed face before it is shown. All older levels act in its first frame. A brow
+# or head movement that they start must be over before the face is shown.
 _REHEARSAL_S = 1.6
 _MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # for mouth FAPs, for other FAPs
-_BIND_S = 0.04  # after this part of a transition, lips close fully for speech
-_VOICE_LEAD_S = 0.06  # feeling and laughter are applied this early, if known
+_CLOSE_LIPS_AFTER_S = 0.04  # from this time of a transition, lips close fully for speech
+_VOICE_LEAD_S = 0.06  # feeling and laughter act this much earlier, if known
 _SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started
 _ROUNDING = 0.01  # tolerance of media times, in frames
 
@@ -94,42 +97,42 @@ class FaceAnimator:
         self._lip_model = lip_model
         self._frame_rate_hz = frame_rate_hz
         self._delay_s = delay_s
-        self._expressiveness = Expressiveness(expressiveness)
-        self._expression = SpeechExpression()
-        self._feeling = FeelingMotion(feeling)
-        self._idle_motion = SpeechMotion(idle_motion_seed) if idle_motion_seed else None
+        self._expressiveness = ExpressivenessModifier(expressiveness)
+        self._expression = ExpressionModifier()
+        self._feeling = FeelingModifier(feeling)
+        self._idle_motion = SpeechMotionModifier(idle_motion_seed) if idle_motion_seed else None
         self._num_frames = 0  # including frames at rest
         self._first_shown = 0  # earlier frames are rehearsals
-        self._goal: Faps | None = None  # the last frame without its transition
+        self._target: Faps | None = None  # the last frame without its transition
         self._shown: Faps | None = None  # the last shown frame
         self._previously_shown: Faps = _ZERO  # the shown frame before that
-        self._is_resuming = False  # the next shown frame starts a transition from the last one
-        self._transition, self._transition_s = _NO_TRANSITION, 0.0  # and its age
+        self._is_resuming = False  # whether the next shown frame starts a transition from the last
+        self._transition, self._transition_s = _NO_TRANSITION, 0.0  # current transition; its age
         self._event_s = 0.0  # time of the last event
         self._start_at(0)
 
     def _start_at(self, number: int) -> None:
-        """Start at rest with a frame number."""
+        """Start at rest, at a frame number."""
         self._next_frame = number
         self._time_s = number / self._frame_rate_hz  # time of the last frame
         self._known_s = -math.inf  # the sound is known up to here
-        self._phones = PhoneNumbers()
+        self._phones = PhoneRenumberer()
         self._is_speaking = False  # whether there was speech at the last frame
-        self._changes: deque[SpeechChange] = deque()  # changes in future frames
+        self._speech_changes: deque[SpeechChange] = deque()  # changes in future frames
         self._levels: list[tuple[float, float]] = []  # since the last frame
         self._pitches: list[tuple[float, float]] = []  # since the last frame
-        self._voice: deque[Progress] = deque()  # current and later progress
+        self._progress: deque[Progress] = deque()  # current and later progress
         self._recent: deque[SoundEvent] = deque()
         self._lip_stream = self._lip_model.stream(
             self._time_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s
         )
         # in order of application
         self._modifiers: list[Modifier] = [
-            Amplitude(),
+            AmplitudeModifier(),
             self._expressiveness,
             self._feeling,
             self._expression,
-            NonverbalSounds(),
+            NonverbalModifier(),
         ]
         if self._idle_motion is not None:
             self._modifiers.append(self._idle_motion)
@@ -137,8 +140,8 @@ class FaceAnimator:
     def process(self, event: SoundEvent) -> list[Frame]:
         """Process an event; return the frames that are now due.
 
-        After a gap of more than ``MAX_GAP_S`` the face starts again after the gap. The end of the
-        sound returns all remaining frames and the return to rest.
+        After a gap of more than ``MAX_GAP_S``, the face restarts. At the end of the sound, all
+        remaining frames are returned, with the return to rest.
         """
         return list(self.iter_frames(event))
 
@@ -161,15 +164,15 @@ class FaceAnimator:
             yield from self._frames_until(time_s)
 
     def skip_to(self, time_s: float) -> None:
-        """Skip the frames before a media time. The face moves smoothly to that time."""
+        """Skip the frames before a media time. The face moves there smoothly."""
         self._event_s = max(self._event_s, time_s)
         number = self._frame_number(time_s - self._delay_s)
         if number > self._next_frame:
             self._next_frame = number
-            self._goal, self._is_resuming = None, True
+            self._target, self._is_resuming = None, True
 
     def change_recognizer(self) -> None:
-        """Continue with the events of another recognizer; discard phones that were not final.
+        """Continue with the events of another recognizer; discard phones that are not final.
 
         The new recognizer numbers phones from 0 and may repeat known events.
         """
@@ -180,7 +183,7 @@ class FaceAnimator:
     ) -> None:
         """Replace the face of another process, before this face has made any frames.
 
-        Events of the last seconds may be repeated; their last frames are made but not shown.
+        Events of the last seconds may be repeated. Their last frames are rehearsed, not shown.
         ``time_s`` is the media time of the other face's newest frame, ``num_frames`` is the number
         of its frames, and ``shown`` is the newest frame, FAPs (68,), if known.
         """
@@ -195,14 +198,14 @@ class FaceAnimator:
         self._shown = None if shown is None else shown.astype(np.float64)
 
     def relax(self, num_frames: int) -> list[Frame]:
-        """Return frames that return to rest while no sound arrives.
+        """Make frames that return to rest while no sound arrives.
 
         They all have the media time of the last frame. The face continues from its pose when sound
         arrives again.
         """
         step_s = 1.0 / self._frame_rate_hz
         self._update_speaking(math.inf)
-        self._voice.clear()
+        self._progress.clear()
         self._withdraw_phones()
         return [self._make_frame(self._lip_stream.relax(step_s)) for _ in range(num_frames)]
 
@@ -223,10 +226,10 @@ class FaceAnimator:
         """Set how strongly the face shows the feeling in the voice, 0 to 1."""
         self._feeling.amount = amount
 
-    def set_behavior(self, change: Behavior) -> None:
+    def set_idle_motion(self, change: IdleMotionSettings) -> None:
         """Change the idle motion of the face. A field that is None changes nothing."""
         if self._idle_motion is not None:
-            self._idle_motion.set_behavior(change)
+            self._idle_motion.set_idle_motion(change)
 
     def set_lip_model(self, lip_model: LipModel) -> None:
         """Change the lip model with a continuous transition."""
@@ -243,14 +246,14 @@ class FaceAnimator:
         self._lip_model, self._lip_stream = lip_model, stream
         if self._shown is None or self._is_resuming:
             return
-        before, self._goal = (self._pose(mouth).astype(np.float64) for mouth in mouths[-2:])
-        steps = (self._shown - self._previously_shown) - (self._goal - before)
+        before, self._target = (self._pose(mouth).astype(np.float64) for mouth in mouths[-2:])
+        steps = (self._shown - self._previously_shown) - (self._target - before)
         velocity = np.zeros(NUM_FAPS)  # FAPs outside the mouth move as before
         velocity[_MOUTH] = steps[_MOUTH] / step_s
-        self._start_transition(FapState(self._shown - self._goal, velocity))
+        self._start_transition(FapState(self._shown - self._target, velocity))
 
     def _start_transition(self, difference: FapState) -> None:
-        """Add a difference to the next frames that fades to zero."""
+        """Add a difference that fades to zero to the next frames."""
         self._transition, self._transition_s = Transition(difference, _TRANSITIONS_S), 0.0
 
     def _add_event(self, event: SoundEvent) -> None:
@@ -262,10 +265,10 @@ class FaceAnimator:
             event = self._phones.renumber(event)
         self._pass_to_lips(event)
         if isinstance(event, SpeechChange):
-            self._changes.append(event)
+            self._speech_changes.append(event)
         elif isinstance(event, Progress):
             self._levels.append((event.time_s, event.level_db))
-            self._voice.append(event)
+            self._progress.append(event)
             if event.pitch_hz > 0.0:
                 self._pitches.append((event.time_s, event.pitch_hz))
 
@@ -298,18 +301,18 @@ class FaceAnimator:
             if number >= self._first_shown:
                 yield self._make_frame(mouth)
             else:
-                self._make_goal(mouth)
+                self._make_target(mouth)
 
     def _update_speaking(self, time_s: float) -> None:
-        while self._changes and self._changes[0].time_s <= time_s:
-            change = self._changes.popleft()
+        while self._speech_changes and self._speech_changes[0].time_s <= time_s:
+            change = self._speech_changes.popleft()
             self._is_speaking = change.active
             if change.active:  # levels before speech are noise
                 self._levels = [level for level in self._levels if level[0] >= change.time_s]
 
     def _make_frame(self, mouth: MouthFrame) -> Frame:
-        rehearsed = self._goal
-        faps = self._make_goal(mouth)
+        rehearsed = self._target
+        faps = self._make_target(mouth)
         if self._is_resuming and self._shown is not None:
             self._is_resuming = False
             goal = faps if rehearsed is None else rehearsed
@@ -325,18 +328,18 @@ class FaceAnimator:
     def _add_difference(self, faps: NDArray[np.float32], difference: Faps) -> None:
         """Add the remaining difference of a transition to a frame, in place."""
         if difference.any():
-            free = max(self._expression.free, 1.0 - self._transition_s / _BIND_S)
+            free = max(self._expression.free, 1.0 - self._transition_s / _CLOSE_LIPS_AFTER_S)
             jaw = faps[JAW] + difference[JAW]  # the jaw does not open the lips
             mix(faps, difference.astype(np.float32), free)
             faps[JAW] = max(jaw, 0.0)
 
-    def _make_goal(self, mouth: MouthFrame) -> NDArray[np.float32]:
-        """Return the next frame, FAPs (68,), without the transition."""
+    def _make_target(self, mouth: MouthFrame) -> NDArray[np.float32]:
+        """Make the next frame without the transition, FAPs (68,)."""
         levels, self._levels = self._levels, []
         pitches, self._pitches = self._pitches, []
         self._num_frames += 1
         faps = self._pose(mouth, 1.0 / self._frame_rate_hz, levels, pitches)
-        self._goal = faps.astype(np.float64)
+        self._target = faps.astype(np.float64)
         return faps
 
     def _pose(
@@ -346,15 +349,17 @@ class FaceAnimator:
         levels: Sequence[tuple[float, float]] = (),
         pitches: Sequence[tuple[float, float]] = (),
     ) -> NDArray[np.float32]:
-        """Return the FAPs (68,) of a mouth after all modifiers."""
+        """Apply all modifiers to a mouth; return FAPs (68,)."""
         faps = np.zeros(NUM_FAPS, dtype=np.float32)
         faps[_MOUTH] = mouth.faps
         soon_s = self._time_s + _SPEECH_LEAD_S
-        starts_soon = any(change.active and change.time_s <= soon_s for change in self._changes)
+        starts_soon = any(
+            change.active and change.time_s <= soon_s for change in self._speech_changes
+        )
         until_s = self._time_s + _VOICE_LEAD_S
-        while len(self._voice) > 1 and self._voice[1].time_s <= until_s:
-            self._voice.popleft()
-        voice = self._voice[0] if self._voice else None
+        while len(self._progress) > 1 and self._progress[1].time_s <= until_s:
+            self._progress.popleft()
+        voice = self._progress[0] if self._progress else None
         context = FrameContext(
             time_s=self._time_s,
             known_s=self._time_s + self._delay_s,

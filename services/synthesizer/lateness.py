@@ -1,9 +1,8 @@
 """Measures the lateness of the frames of a live session.
 
-A live client sends audio in real time. The clock minus the media time of a frame is therefore
-constant for frames in time, and greater for late frames. Frames are compared with the earliest one
-of the last 10 s. Older frames are useless for this, because clocks drift and a client may lose
-audio.
+A live client sends audio in real time. Therefore, the clock minus the media time is constant for
+frames in time, and greater for late frames. Frames are compared with the earliest one of the last
+10 s. Older frames are not comparable, because clocks drift and a client may lose audio.
 """
 
 from collections import deque
@@ -12,7 +11,7 @@ from collections.abc import Iterable
 from kouxing.shared.metrics import percentile
 from kouxing.shared.wire.session import Lateness
 
-IN_TIME = Lateness(p50_ms=0.0, p95_ms=0.0, worst_ms=0.0)
+NO_LATENESS = Lateness(p50_ms=0.0, p95_ms=0.0, worst_ms=0.0)
 WINDOW_S = 10.0  # as in services/gateway/page/lateness.js
 
 

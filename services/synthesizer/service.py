@@ -1,8 +1,8 @@
-"""The synthesizer service: phones and lip frames in, FAP frames out.
+"""The synthesizer service: receives phones and lip frames, sends FAP frames.
 
-Reacts to: results, phone, lip-positions, speech, progress (recognizer), start-session,
-close-session, flush-session, set-face (control).
-Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
+Handles: results, phone, lip-positions, speech, progress (recognizer), start-session, close-session,
+flush-session, set-face (control).
+Sends: fap-frame, end-of-faps (subscribers), acknowledge (recognizer).
 
 Processed audio, not the wall clock, drives the frames. Load, or audio faster than real time,
 therefore changes only when frames appear. Only a stalled live stream uses the wall clock, to return
@@ -23,9 +23,9 @@ from kouxing.services.lip_models import lip_model_names
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
-from kouxing.services.synthesizer.lateness import IN_TIME
+from kouxing.services.synthesizer.lateness import NO_LATENESS
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.services.synthesizer.modifiers.speech_motion import Behavior
+from kouxing.services.synthesizer.modifiers.speech_motion import IdleMotionSettings
 from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
@@ -60,13 +60,13 @@ from kouxing.shared.wire.speech import (
     Results,
 )
 
-MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
-MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
+MAX_BURST_S = 0.06  # frames of one session at a time, so that a gap does not delay other sessions
+MAX_QUEUED_EVENTS = 200  # events of a session; the recognizer resends later ones
 CHECK_INTERVAL_S = 1.0  # interval between checks for stopped subscribers and for lateness
-MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
-EXPRESSIONS = frozenset(ExpressionName)
+MAX_CATCH_UP_S = 0.2  # limit for making up late frames without sound
+EXPRESSION_NAMES = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
-MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
+FAP_MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
 
 class SynthesizerService(SessionService):
@@ -83,16 +83,16 @@ class SynthesizerService(SessionService):
         )
         self._sessions: dict[str, SynthesizerSession] = {}
         self._turn = 0  # round robin of sessions with queued events
-        self._checked_s = 0.0  # last check for stopped subscribers and for lateness
+        self._last_check_s = 0.0  # last check for stopped subscribers and for lateness
         self._input = self.bus.bind_router(
             config.phone_input, "synthesizer.phone_input", PHONES, role="service"
         )
-        self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps", self._on_joined)
+        self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps", self._on_subscribe)
         self.endpoints = {
             "phone_input": config.reachable(self._input.endpoint),
             "faps": config.reachable(self._faps.endpoint),
         }
-        load_lip_model(name=config.lips)  # no delay for the first session
+        load_lip_model(name=config.lips)  # so that the first session does not wait
         handlers: dict[type[Message], Handler] = dict.fromkeys(SPEECH_MESSAGES, self._on_input)
         handlers[Results] = self._on_results
         self.register(self._input, handlers)
@@ -103,7 +103,7 @@ class SynthesizerService(SessionService):
         return super().control_handlers() | {SetFace: self._on_set_face}
 
     def start_session(self, start: StartSession) -> bool:
-        """Create a face at rest; a session that returns to this synthesizer keeps its face."""
+        """Create a face at rest. A session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
             settings = self._known_settings(start.session, start.face)
@@ -114,7 +114,7 @@ class SynthesizerService(SessionService):
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
-        self.session_started(start, to_samples(session.final.time_s))
+        self.session_started(start, to_samples(session.final_time.time_s))
         return False
 
     def _new_face(self, start: StartSession, settings: FaceSettings) -> FaceAnimator:
@@ -130,27 +130,27 @@ class SynthesizerService(SessionService):
         )
         if settings.expressions:
             face.set_expressions(settings.expressions, settings.hold_s)
-        face.set_behavior(_behavior_of(settings))
+        face.set_idle_motion(_idle_motion_settings(settings))
         return face
 
     def stop_session(self, session: str) -> None:
         """Remove a session."""
         stopped = self._sessions.pop(session, None)
         # a stopping synthesizer leaves the session to another one
-        if stopped is not None and not stopped.finished and not self.should_exit:
+        if stopped is not None and not stopped.is_finished and not self.should_exit:
             self._end(stopped)
 
     def flush_session(self, session: str) -> None:
         """Drop queued phones and lip frames; the next frames return to rest."""
         flushed = self._sessions.get(session)
         if flushed is not None:
-            flushed.queue = deque(
-                event for event in flushed.queue if not isinstance(event, Phone | LipPositions)
+            flushed.events = deque(
+                event for event in flushed.events if not isinstance(event, Phone | LipPositions)
             )
             flushed.face.flush()
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
-        """Change the settings of a face; it moves continuously."""
+        """Change the settings of a face, with continuous transitions."""
         session = self._sessions.get(message.session)
         if session is None:
             return
@@ -162,7 +162,7 @@ class SynthesizerService(SessionService):
             session.face.set_expressiveness(settings.expressiveness)
         if settings.feeling is not None:
             session.face.set_feeling(settings.feeling)
-        session.face.set_behavior(_behavior_of(settings))
+        session.face.set_idle_motion(_idle_motion_settings(settings))
         if settings.expressions is not None:
             session.face.set_expressions(settings.expressions, settings.hold_s)
         session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))
@@ -170,7 +170,7 @@ class SynthesizerService(SessionService):
     def _known_settings(self, session: str, settings: FaceSettings) -> FaceSettings:
         """Return the settings without unknown names; report unknown names."""
         unknown = {settings.lip_model} - {None, *lip_model_names()}
-        unknown |= (settings.expressions or {}).keys() - EXPRESSIONS
+        unknown |= (settings.expressions or {}).keys() - EXPRESSION_NAMES
         unknown |= {*(settings.shapes or ())} - SHAPE_SETS.keys()
         if not unknown:
             return settings
@@ -190,20 +190,20 @@ class SynthesizerService(SessionService):
         """Acknowledge messages, relax the faces of stalled live streams, and drop old frames."""
         if not self._sessions:
             return math.inf
-        if now_s >= self._checked_s + CHECK_INTERVAL_S:
-            self._checked_s = now_s
+        if now_s >= self._last_check_s + CHECK_INTERVAL_S:
+            self._last_check_s = now_s
             live = [name for name, session in self._sessions.items() if session.start.paced]
             self._faps.disconnect_stalled((FapFrame,), live)
             for session in self._sessions.values():
                 session.lateness.measure(now_s)
-        due_s = self._checked_s + CHECK_INTERVAL_S
+        due_s = self._last_check_s + CHECK_INTERVAL_S
         for name, session in self._sessions.items():
             due_s = min(due_s, session.receiver.tick(now_s))
-            self.report_skipped(name, session.overload.take_report_s(now_s))
-            if session.start.paced and not session.finished and not session.queue:
+            self.report_skipped(name, session.skip_policy.take_report_s(now_s))
+            if session.start.paced and not session.is_finished and not session.events:
                 self._relax(session, now_s)
                 due_s = min(due_s, session.relax_at_s + 1.0 / self.frame_rate_hz)
-        busy = [session for session in self._sessions.values() if session.queue]
+        busy = [session for session in self._sessions.values() if session.events]
         end_s = time.monotonic() + MAX_TURN_S
         for _ in busy:
             self._turn += 1
@@ -213,28 +213,28 @@ class SynthesizerService(SessionService):
         return now_s if busy else due_s
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Return, for each session, the end of its final phones, its lateness and skipped time."""
+        """Return each session's progress: end of its final phones, lateness and skipped time."""
         return {
             name: SessionInput(
-                media_time=to_samples(session.final.time_s),
+                media_time=to_samples(session.final_time.time_s),
                 lateness=session.lateness.newest,
-                skipped_s=session.overload.skipped_s,
+                skipped_s=session.skip_policy.skipped_s,
             )
             for name, session in self._sessions.items()
         }
 
     def gauges(self) -> dict[str, float]:
-        """Return the lateness of the session with the greatest lateness."""
+        """Return the worst lateness of all sessions."""
         measured = [session.lateness.newest for session in self._sessions.values()]
-        latest = max(filter(None, measured), key=attrgetter("worst_ms"), default=IN_TIME)
+        latest = max(filter(None, measured), key=attrgetter("worst_ms"), default=NO_LATENESS)
         return {
             f"lateness_{name}_seconds": getattr(latest, f"{name}_ms") / 1e3
             for name in ("p50", "p95", "worst")
         }
 
     def on_drain(self) -> bool:
-        """Wait until other synthesizers have taken over the sessions; end the rest."""
-        unfinished = [session for session in self._sessions.values() if not session.finished]
+        """Wait until other synthesizers have taken over sessions; end the remaining ones."""
+        unfinished = [session for session in self._sessions.values() if not session.is_finished]
         if unfinished and self.is_handing_over:
             return False
         for session in unfinished:
@@ -243,7 +243,7 @@ class SynthesizerService(SessionService):
         return True
 
     def _relax(self, session: SynthesizerSession, now_s: float) -> None:
-        # a stalled process does not make all missed frames
+        # after a stall of this process, not all missed frames are made
         session.relax_at_s = max(session.relax_at_s, now_s - MAX_CATCH_UP_S)
         num_frames = int((now_s - session.relax_at_s) * self.frame_rate_hz)
         if num_frames > 0:
@@ -269,14 +269,14 @@ class SynthesizerService(SessionService):
             state, newest_frame = message.state, message.newest_frame
         has_stalled = state == AudioState.STALLED
         if is_state_report(message):
-            session.overload.resume()
+            session.skip_policy.resume()
         session.relax_at_s = now_s if has_stalled else now_s + RECOGNIZER_TIMEOUT_S
         if message.epoch != session.input_epoch:
-            self._enter_epoch(session, message, newest_frame)
+            self._start_epoch(session, message, newest_frame)
         if not is_state_report(message):
             self._queue_event(session, message)
 
-    def _enter_epoch(
+    def _start_epoch(
         self, session: SynthesizerSession, message: SpeechMessage, newest_frame: NewestFrame | None
     ) -> None:
         """Continue a face with another recognizer, or after another synthesizer's frames."""
@@ -289,7 +289,7 @@ class SynthesizerService(SessionService):
             time_s = to_seconds(message.media_time)
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
         if message.epoch > 1:
-            session.overload.restart(time.monotonic() + CATCH_UP_S)
+            session.skip_policy.restart(time.monotonic() + CATCH_UP_S)
         session.input_epoch = message.epoch
 
     def _accept(self, message: SpeechMessage, sender: Peer) -> SynthesizerSession | None:
@@ -300,9 +300,9 @@ class SynthesizerService(SessionService):
             self.warn("unknown-session", text, message.session, logging.INFO)
         elif sender.key != key_of(session.start.endpoints.get("phones", "")):
             self.warn("foreign", "dropped phones of another recognizer", message.session)
-        elif message.epoch != session.start.epoch:  # resent until both ends have the epoch
+        elif message.epoch != session.start.epoch:  # resent until both workers have the new epoch
             self.metrics.count("other_epoch")
-        elif len(session.queue) >= MAX_QUEUED:
+        elif len(session.events) >= MAX_QUEUED_EVENTS:
             self.metrics.count("too_early")
         elif not session.receiver.receive(message, sender):
             self.metrics.count("repeated")
@@ -317,19 +317,19 @@ class SynthesizerService(SessionService):
             text = f"{event.symbol!r} is not a phone of {language}"
             self.warn("unknown-phone", text, message.session)
             return
-        session.final.update(event)
-        if not session.queue and isinstance(event, Phone | LipPositions | SpeechChange):
+        session.final_time.update(event)
+        if not session.events and isinstance(event, Phone | LipPositions | SpeechChange):
             session.face.process(event)  # makes no frames
             return
-        session.queue.append(event)
+        session.events.append(event)
         now_s = time.monotonic()
         if isinstance(event, events.Progress | AudioSkipped):
-            duration_s = max(0.0, event.time_s - session.newest_s)
-            session.overload.add(duration_s, now_s, has_waiting=len(session.queue) > 1)
-            session.newest_s = max(session.newest_s, event.time_s)
-        if session.start.paced and session.overload.is_late(now_s, for_s=MAX_LATE_FOR_S):
+            duration_s = max(0.0, event.time_s - session.newest_event_s)
+            session.skip_policy.add(duration_s, now_s, has_waiting=len(session.events) > 1)
+            session.newest_event_s = max(session.newest_event_s, event.time_s)
+        if session.start.paced and session.skip_policy.is_late(now_s, for_s=MAX_LATE_FOR_S):
             return  # newer events may have arrived
-        if len(session.queue) == 1:
+        if len(session.events) == 1:
             self._make_frames(session)
 
     def _make_frames(self, session: SynthesizerSession) -> None:
@@ -337,12 +337,12 @@ class SynthesizerService(SessionService):
         num_left = max(1, round(MAX_BURST_S * self.frame_rate_hz))
         if session.start.paced:
             session.skip_if_behind(time.monotonic())
-        while session.queue:
-            event = session.queue[0]
-            if session.frames is None:
-                session.frames = session.face.iter_frames(event)
+        while session.events:
+            event = session.events[0]
+            if session.pending_frames is None:
+                session.pending_frames = session.face.iter_frames(event)
             started_s = time.perf_counter()
-            frames = list(itertools.islice(session.frames, num_left))
+            frames = list(itertools.islice(session.pending_frames, num_left))
             self._publish(session, frames)
             if session.start.paced and not isinstance(event, EndOfSound):
                 session.lateness.add((time_s for time_s, _ in frames), time.monotonic())
@@ -351,15 +351,15 @@ class SynthesizerService(SessionService):
             num_left -= len(frames)
             if num_left == 0:
                 return
-            session.frames = None
-            session.queue.popleft()
+            session.pending_frames = None
+            session.events.popleft()
             if isinstance(event, EndOfSound):
                 self._end(session)
 
     # --- out -------------------------------------------------------------------------------------
 
     def _end(self, session: SynthesizerSession) -> None:
-        session.finished = True
+        session.is_finished = True
         session.output_sequence += 1
         end = EndOfFaps(
             session=session.start.session,
@@ -374,27 +374,27 @@ class SynthesizerService(SessionService):
         self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
             session.output_sequence += 1
-            session.newest = FapFrame(
+            session.newest_frame = FapFrame(
                 session=session.start.session,
                 epoch=session.start.epoch,
                 sequence=session.output_sequence,
                 media_time=to_samples(time_s),
                 values=faps.astype("<f4").tobytes(),
-                mask=MASK,
+                mask=FAP_MASK,
                 shapes={
                     name: SHAPE_SETS[name].weights(faps).astype("<f4").tobytes()
                     for name in session.shapes
                 },
             )
-            session.replay.send(session.newest, time.monotonic())
+            session.replay.send(session.newest_frame, time.monotonic())
 
-    def _on_joined(self, session: str) -> None:
-        joined = self._sessions.get(session)
-        if joined is not None:
-            joined.replay.repeat(time.monotonic())
+    def _on_subscribe(self, session: str) -> None:
+        subscribed = self._sessions.get(session)
+        if subscribed is not None:
+            subscribed.replay.repeat(time.monotonic())
 
 
-def _behavior_of(settings: FaceSettings) -> Behavior:
-    return Behavior(
+def _idle_motion_settings(settings: FaceSettings) -> IdleMotionSettings:
+    return IdleMotionSettings(
         still=settings.still, eye_contact=settings.eye_contact, listening=settings.listening
     )

@@ -1,4 +1,4 @@
-"""One session of the synthesizer: its face, and its position in the streams of messages."""
+"""One session of the synthesizer service: its face and the state of its message streams."""
 
 import math
 import time
@@ -22,11 +22,11 @@ from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame
 
-RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports for silent clients
+RECOGNIZER_TIMEOUT_S = 20.0  # longer than the reports for silent clients take
 
 
 class SynthesizerSession:
-    """A session, as the service keeps it."""
+    """The state of one session."""
 
     def __init__(
         self,
@@ -43,26 +43,26 @@ class SynthesizerSession:
         self.input_epoch = 0  # epoch of the newest message from the recognizer; 0 before the first
         self.relax_at_s = time.monotonic() + RECOGNIZER_TIMEOUT_S  # start of frames without sound
         self.output_sequence = 0
-        self.newest: FapFrame | None = None
-        self.final = FinalTime()
-        self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
-        self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
-        self.overload = SkipPolicy(max_lag_s)
-        self.newest_s = 0.0  # media time of the newest received event
-        self.finished = False
+        self.newest_frame: FapFrame | None = None
+        self.final_time = FinalTime()
+        self.events: deque[SoundEvent] = deque()  # frames are being made for the first event
+        self.pending_frames: Iterator[Frame] | None = None  # remaining frames of the first event
+        self.skip_policy = SkipPolicy(max_lag_s)
+        self.newest_event_s = 0.0  # media time of the newest received event
+        self.is_finished = False
         self.lateness = LatenessMeter()
         self.shapes: list[str] = []  # shape sets to publish
 
     def skip_if_behind(self, now_s: float) -> None:
-        """Skip all frames except the newest if the session is too far behind."""
+        """Skip all frames except the newest frame if the session is too far behind."""
         waiting_s, known_s = 0.0, math.inf
-        for event in self.queue:
+        for event in self.events:
             if isinstance(event, events.Progress):
                 waiting_s += max(0.0, event.time_s - known_s)
             if isinstance(event, events.Progress | AudioSkipped):
                 known_s = event.time_s
-        if self.overload.update(waiting_s, now_s):
-            self.face.skip_to(self.newest_s)
+        if self.skip_policy.update(waiting_s, now_s):
+            self.face.skip_to(self.newest_event_s)
 
     def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
         """Continue after the newest frame of another synthesizer."""
@@ -72,12 +72,12 @@ class SynthesizerSession:
     @property
     def media_time(self) -> int:
         """Media time of the newest frame, samples at 16 kHz."""
-        return self.newest.media_time if self.newest is not None else 0
+        return self.newest_frame.media_time if self.newest_frame is not None else 0
 
     def _acknowledgement(self) -> Acknowledge:
-        if (frame := self.newest) is None:
+        if (frame := self.newest_frame) is None:
             return Acknowledge()
-        newest = NewestFrame(
+        newest_frame = NewestFrame(
             sequence=frame.sequence, media_time=frame.media_time, values=frame.values
         )
-        return Acknowledge(newest_frame=newest)
+        return Acknowledge(newest_frame=newest_frame)

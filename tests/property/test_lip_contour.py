@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.ferguson.contour import (
     LINES,
     LipLine,
+    build_lip_lines,
     contour,
     faps_of,
-    lip_lines,
-    lip_points,
+    load_lip_points,
 )
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
@@ -33,13 +33,13 @@ def sample(line: LipLine) -> NDArray[np.float64]:
 def assert_no_sick_shape(openings: Sequence[float] | NDArray[np.float64]) -> None:
     """Check that lips do not cross and edges do not bend sharply or have more than one dent."""
     opening = np.asarray(openings, float)
-    x = sample(lip_lines()["inner upper"])
-    heights = np.stack([lip_lines()[name].heights(x, opening) for name in LINES])
+    x = sample(build_lip_lines()["inner upper"])
+    heights = np.stack([build_lip_lines()[name].heights(x, opening) for name in LINES])
     outer_upper, inner_upper, inner_lower, outer_lower = heights
     assert (inner_upper - inner_lower >= -1e-9).all()
     assert (outer_upper > inner_upper).all()
     assert (inner_lower > outer_lower).all()
-    for line in lip_lines().values():
+    for line in build_lip_lines().values():
         x = sample(line)
         slope, bend = (
             line.closed(x, order) + opening[:, None] * line.travel(x, order) for order in (1, 2)
@@ -69,7 +69,7 @@ def test_the_contour_moves_without_jumps(steps: list[tuple[float, float]]) -> No
 
 @given(opening=st.floats(0.0, 5.0))
 def test_feature_points_travel_as_measured(opening: float) -> None:
-    lines, points = lip_lines(), lip_points()
+    lines, points = build_lip_lines(), load_lip_points()
     faps = dict(zip(MOUTH_FAPS, faps_of([opening])[0], strict=True))
     for name, members in LINES.items():
         for member in members:

@@ -14,9 +14,12 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableSegmenter, segment_speech
-from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
-from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, build_key_frames
+from kouxing.services.synthesizer.lips.ferguson.phone_table import load_table
+from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
+    SyllableSegmenter,
+    segment_speech,
+)
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
@@ -175,7 +178,7 @@ def test_training_recovers_the_openings() -> None:
     true = dataclasses.replace(
         TABLE, opening={**TABLE.opening, "b": 0.0, "a": 5.0, "i": 1.5, "d": 2.5}
     )
-    opening = key_frames_of(phones, true, INVENTORY.silence).openings_at(time_s)
+    opening = build_key_frames(phones, true, INVENTORY.silence).openings_at(time_s)
     clip = clip_of(time_s, faps_of(opening))
     relative = relative_openings([clip])[0]
     scale = 5.0 / np.percentile(opening, 98)  # the speaker's widest opening is 5

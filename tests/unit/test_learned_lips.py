@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
-from kouxing.services.synthesizer.lips.learned.rest import CLOSE_S, HOLD_S
+from kouxing.services.synthesizer.lips.learned.resting_lips import CLOSE_S, HOLD_S
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange

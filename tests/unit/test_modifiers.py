@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
-from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
-from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
+from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import ExpressionName, check_expressions
 from kouxing.shared.face.faps import NUM_FAPS
@@ -105,7 +105,7 @@ DEFAULT = SynthesizerConfig().expressiveness
 
 def expressed(faps: NDArray[np.float32], amount: float) -> NDArray[np.float32]:
     changed = faps.copy()
-    Expressiveness(amount).apply(changed)
+    ExpressivenessModifier(amount).apply(changed)
     return changed
 
 
@@ -134,7 +134,7 @@ def test_the_mouth_opens_further_up_to_a_limit(viseme: str) -> None:
 
 def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[float]:
     """Return the gain of every frame, one level per frame."""
-    amplitude = Amplitude()
+    amplitude = AmplitudeModifier()
     gains = []
     for k, level_db in enumerate(levels_db):
         level = (k * FRAME_S, level_db)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.learned.rest import (
+from kouxing.services.synthesizer.lips.learned.resting_lips import (
     AJAR,
     CERTAIN,
     LEAD_S,
@@ -41,7 +41,7 @@ def ajar_amounts(
         lips.add_event(Progress(time_s=time_s, level_db=level_at(time_s)))
         if number >= delay:
             frame_s = (number - delay) * FRAME_S
-            lips.follow_voice(frame_s)
+            lips.process_until(frame_s)
             is_phone = phone_s <= frame_s < phone_s + 0.1
             lips.doubt_at(frame_s, closure if frame_s > SOUND_S else 0.1, 2.0 * is_phone)
             amounts.append(lips.amount_at(frame_s))

@@ -13,7 +13,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     check_visemes,
     visemes_of,
 )
-from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.ferguson.phone_table import load_table
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS, NUM_FAPS

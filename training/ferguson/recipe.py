@@ -36,9 +36,9 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
-from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
-from kouxing.services.synthesizer.lips.ferguson.key_frames import anchors_of
-from kouxing.services.synthesizer.lips.ferguson.table import COLUMNS, MAX_OPENING, PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.contour import load_lip_points
+from kouxing.services.synthesizer.lips.ferguson.key_frames import build_anchors
+from kouxing.services.synthesizer.lips.ferguson.phone_table import COLUMNS, MAX_OPENING, PhoneTable
 from kouxing.services.synthesizer.lips.ferguson.timing import OnsetCrossings
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
@@ -198,7 +198,7 @@ def measure_travel(clips: Sequence[LipClip]) -> Array:
 
 def _opening_weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneInventory) -> Array:
     """Compute the weight of each phone's opening in R at some times, (num_times, num_phones)."""
-    anchors = anchors_of(phones, inventory.silence)
+    anchors = build_anchors(phones, inventory.silence)
     weights = np.zeros((len(times_s), len(inventory)))
     anchors_s = [time_s for time_s, _ in anchors]
     for number, (_, symbol) in enumerate(anchors):

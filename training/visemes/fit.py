@@ -40,7 +40,10 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import
     CONSONANTS,
     initial_parameters,
 )
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, columns
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
+    VisemeParameters,
+    fap_columns,
+)
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
@@ -286,7 +289,9 @@ def fit_parameters(frames: FrameTable) -> VisemeParameters:
         if not np.isnan(frames.faps[:, column]).all() and MOUTH_FAPS[column] not in MIRROR
     ]
 
-    informative = [column for column in columns((3, 5, 6)) if column in measured] or measured[:1]
+    informative = [column for column in fap_columns((3, 5, 6)) if column in measured] or measured[
+        :1
+    ]
 
     def first_stage_loss(c: float) -> float:
         start = initial_parameters(c)

@@ -18,7 +18,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     PER_SILENCE,
     PER_VISEME,
     VisemeParameters,
-    columns,
+    fap_columns,
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
@@ -75,7 +75,7 @@ def closure_reach(
 
     C cannot be estimated, because all values above 20 give the same closed lips.
     """
-    lips = columns((4, 5))
+    lips = fap_columns((4, 5))
 
     def loss(reach_s: float) -> float:
         error = 0.0

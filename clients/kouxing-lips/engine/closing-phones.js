@@ -1,4 +1,4 @@
-// Recognized phones that close the lips; services/synthesizer/lips/learned/closures.py has the rules.
+// Recognized phones that close the lips; services/synthesizer/lips/learned/closure_rule.py has the rules.
 
 /** The recognized phones of one kind of closure: "b" (b p m) or "f". */
 export class ClosingPhones {

@@ -1,4 +1,4 @@
-// Lips in pauses; services/synthesizer/lips/learned/rest.py has the rules.
+// Lips in pauses; services/synthesizer/lips/learned/resting_lips.py has the rules.
 
 import { Transition } from "./trajectory.js";
 

@@ -1,5 +1,5 @@
 // Position and velocity of values, transitions between trajectories, and the track of lip frames;
-// services/synthesizer/lips has the formulas in trajectory.py and learned/track.py.
+// services/synthesizer/lips has the formulas in trajectory.py and learned/lip_track.py.
 
 /** Return a state { value, velocity } at rest. */
 export function stateAtRest(value) {

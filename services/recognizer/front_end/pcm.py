@@ -12,7 +12,7 @@ from kouxing.shared.phones.events import Progress
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 FULL_SCALE = 32768.0
-SLICE_SAMPLES = 320  # samples at 16 kHz: 20 ms, one FAP frame
+SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
 
 
 class BadAudio(ValueError):
@@ -44,7 +44,7 @@ def split_slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDAr
     """Split samples, (n,), at multiples of 20 ms of the stream; ``num_before`` samples precede."""
     begin = 0
     while begin < len(samples):
-        end = begin + SLICE_SAMPLES - (num_before + begin) % SLICE_SAMPLES
+        end = begin + SLICE - (num_before + begin) % SLICE
         yield samples[begin:end]
         begin = end
 
@@ -85,7 +85,7 @@ class SliceMeter:
         self.media_time = start  # end of the audio so far
         self._start = start
         self._pieces: list[NDArray[np.float32]] = []  # pieces of the incomplete slice
-        self._pitch = PitchTracker(start // SLICE_SAMPLES)
+        self._pitch = PitchTracker(start // SLICE)
 
     def accept_waveform(
         self, samples: NDArray[np.float32]
@@ -94,7 +94,7 @@ class SliceMeter:
         for piece in split_slices(samples, self.media_time - self._start):
             self.media_time += len(piece)
             self._pieces.append(piece)
-            if (self.media_time - self._start) % SLICE_SAMPLES:
+            if (self.media_time - self._start) % SLICE:
                 yield piece, None
                 continue
             newest = np.concatenate(self._pieces)

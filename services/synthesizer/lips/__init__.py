@@ -1,1 +1,1 @@
-"""Lip models: mouth FAPs from sound events."""
+"""Lip models: compute mouth FAPs from sound events."""

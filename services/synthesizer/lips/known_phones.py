@@ -1,11 +1,11 @@
-"""The known phones of a session, each in its newest revision."""
+"""Keeps the known phones of a session, each in its newest revision."""
 
 import math
 
 from kouxing.shared.phones.events import Phone, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
 
-_MIN_AGE_S = 0.02  # minimum age of a phone that ends with the speech
+_MIN_AGE_S = 0.02  # minimum duration of a phone that ends with the speech
 
 
 class KnownPhones:
@@ -69,6 +69,6 @@ class KnownPhones:
         self.speech_ends_s = [end_s for end_s in self.speech_ends_s if end_s >= time_s]
         return forgotten
 
-    def in_order(self) -> list[Phone]:
+    def sorted_by_onset(self) -> list[Phone]:
         """Return all known phones by onset."""
         return sorted(self._phones.values(), key=lambda phone: (phone.onset_s, phone.index))

@@ -1,4 +1,4 @@
-"""The interface of lip models: mouth FAPs from sound events.
+"""The interface of lip models, which compute mouth FAPs from sound events.
 
 A lip model is loaded once and shared by all sessions; each session has its own stream. To add a lip
 model, add a package like ``dynamic_visemes`` whose ``__init__`` defines ``LIP_MODEL``, see
@@ -15,7 +15,7 @@ from kouxing.shared.records import Record
 
 
 class Articulation(Protocol):
-    """Data about the current speech that modifiers use."""
+    """Data about the current speech for modifiers."""
 
     @property
     def syllable_onsets_s(self) -> NDArray[np.float64]:

@@ -26,12 +26,12 @@ class FapState(Record, frozen=True):
         return FapState(self.value - other.value, self.velocity - other.velocity)
 
 
-def still(value: Array) -> FapState:
-    """Return FAPs (num_mouth_faps,) that do not move."""
+def stationary_state(value: Array) -> FapState:
+    """Return the state of FAPs (num_mouth_faps,) that do not move."""
     return FapState(value, np.zeros(NUM_MOUTH_FAPS))
 
 
-def clip(state: FapState, lowest: Array, highest: Array) -> FapState:
+def clip_state(state: FapState, lowest: Array, highest: Array) -> FapState:
     """Clip FAPs to their limits. The velocity of a clipped FAP is 0."""
     value = np.minimum(np.maximum(state.value, lowest), highest)
     return FapState(value, np.where(value == state.value, state.velocity, 0.0))
@@ -51,7 +51,7 @@ class Transition:
     def at(self, elapsed_s: float) -> FapState:
         """Return the remaining difference after ``elapsed_s``."""
         if elapsed_s >= self.longest_s:
-            return still(np.zeros(len(self.duration_s)))
+            return stationary_state(np.zeros(len(self.duration_s)))
         u = np.minimum(elapsed_s / self.duration_s, 1.0)
         velocity = (1.0 - u) * (
             -6.0 * u * self.difference.value / self.duration_s
@@ -72,14 +72,14 @@ class Transition:
         return value
 
 
-NO_TRANSITION = Transition(still(np.zeros(NUM_MOUTH_FAPS)), np.ones(NUM_MOUTH_FAPS))
+NO_TRANSITION = Transition(stationary_state(np.zeros(NUM_MOUTH_FAPS)), np.ones(NUM_MOUTH_FAPS))
 
 
 class RestTransition:
-    """Leads the mouth to rest while media time does not advance."""
+    """Moves the mouth to rest while media time does not advance."""
 
     def __init__(self, mouth: FapState, neutral: Array, duration_s: float) -> None:
-        self._neutral = still(neutral)
+        self._neutral = stationary_state(neutral)
         self._transition = Transition(mouth - self._neutral, np.full(NUM_MOUTH_FAPS, duration_s))
         self._elapsed_s = 0.0
 

@@ -5,11 +5,10 @@ Louder speech opens jaw and lips further (Lombard speech; Schulman 1989), fast s
 
 The level is compared with the usual level of the current viseme, because open vowels are naturally
 louder than closed ones, and with the speaker's mean, so that microphone gain has no effect. Levels
-are known immediately, phones about 0.1 s later. With a short delay, a level above the known phone's
-therefore predicts the next vowel.
-
-The rate acts twice. Blending makes fast visemes miss their targets, which explains about half of
-the reduction in real lips; `_PER_RATE` is the other half (see docs/visemes.md).
+are known immediately, phones about 0.1 s later. With a short delay, a level above the usual level
+of the known phone therefore predicts the next vowel. The speaking rate acts twice. Blending makes
+fast visemes miss their targets, which explains about half of the reduction in real lips;
+`_PER_RATE` is the other half (see docs/visemes.md).
 """
 
 import math
@@ -28,7 +27,7 @@ _PAUSE_DB = 25.0  # levels this far below the mean are not speech
 _INITIAL_MEAN_DB = -26.0  # dBFS
 _INITIAL_MEAN_LEVELS = 10.0  # weight of the initial mean, in levels
 _MAX_MEAN_LEVELS = 300.0  # adaptation period of the speaker's mean, in levels
-_LEAD_S = 0.05  # levels act this long before their frame, if known: the delay of the filter
+_LEAD_S = 0.05  # levels act this much earlier, if known, to compensate for the filter
 _FILTER_S = 0.025  # time constant of each pole; slower filters match real lips less well
 
 _USUAL_RATE_HZ = 5.0  # syllables per second
@@ -43,8 +42,8 @@ _OPENING_FAPS = np.array(list(_OPENING)) - 1
 _OPENING_SIGNS = np.array(list(_OPENING.values()), dtype=np.float32)
 
 
-class Amplitude:
-    """A smooth gain for mouth openings."""
+class AmplitudeModifier:
+    """Multiplies mouth openings by a smooth gain."""
 
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()

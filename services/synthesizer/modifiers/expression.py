@@ -1,4 +1,4 @@
-"""Requested expressions on a face that speaks."""
+"""Adds requested expressions to a speaking face."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.expression_motion import ExpressionMotion
 
 
-class SpeechExpression(ExpressionMotion):
+class ExpressionModifier(ExpressionMotion):
     """Expressions that leave the lips to speech."""
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:

@@ -1,7 +1,7 @@
-"""Scales mouth movements, like a caricature.
+"""Exaggerates or reduces mouth movements.
 
-Differences from the usual mouth of speech grow: open lips open further, narrow lips become
-narrower, spread lips wider, and protruding lips protrude further.
+Exaggeration increases differences from the usual mouth of speech: open lips open further, narrow
+lips become narrower, spread lips wider, and protruding lips protrude further.
 
 ======  ==============================================  ========  =====
 symbol  meaning                                         unit      shape
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.expression_motion import CLOSED, JAW, LOWER, OPEN, UPPER
 
-_WIDEST = 900.0  # openings of this size do not grow
+_WIDEST = 900.0  # openings of this size or more do not grow
 _USUAL_WIDTH = -40.0  # FAP of a mouth corner in speech, from the dynamic visemes
 _USUAL_PUSH = 40.0
 _SIDEWAYS = 2.0
@@ -38,7 +38,7 @@ _WIDTH = (5, 6, 52, 53)  # FAP 6, 7, 53 and 54; positive is outward
 _PUSH = (15, 16)  # FAP 16 and 17; positive is forward
 
 
-class Expressiveness:
+class ExpressivenessModifier:
     """Scales mouth movements by ``amount``, 0.5 to 2; 1 changes nothing."""
 
     def __init__(self, amount: float) -> None:
@@ -48,7 +48,7 @@ class Expressiveness:
         """Scale the mouth of FAPs (68,), in place."""
         if self.amount == 1.0:
             return
-        # Few numbers: floats take less time than arrays.
+        # For so few numbers, floats are faster than arrays.
         values = faps.tolist()
         more = self.amount - 1.0
         is_open = 0.0  # at the middle of the inner lips, 0 to 1
@@ -71,7 +71,7 @@ class Expressiveness:
         for fap in _WIDTH:
             before = values[fap]
             width = before - _USUAL_WIDTH
-            # at rest the mouth is wider than in speech, but not spread
+            # at rest, the mouth is wider than in speech, but not spread
             change = _SIDEWAYS * more * width * (is_open if width > 0.0 else 1.0)
             faps[fap] = max(before + change, min(before, _MIN_WIDTH))
         for fap in _PUSH:

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.smoothing import TwoPoleFilter
@@ -20,11 +20,11 @@ from kouxing.shared.face.smoothing import TwoPoleFilter
 _GAIN = 2.5  # usual voices differ from their mean by up to 0.4
 _FILTER_S = 0.4  # time constant of each filter pole
 _VISIBLE = 1e-3  # weaker feelings are not shown
-_SIZE = 0.25  # scale of the mouth's movements grows by this much at full arousal
+_SIZE = 0.25  # increase of the mouth's movements at full arousal
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
-def _faps(**units: float) -> NDArray[np.float32]:
+def _named_faps(**units: float) -> NDArray[np.float32]:
     """Return FAPs (68,) from units by name; ``S`` in a name means both sides."""
     faps = np.zeros(NUM_FAPS, np.float32)
     for name, value in units.items():
@@ -34,26 +34,26 @@ def _faps(**units: float) -> NDArray[np.float32]:
 
 
 # FAP units at full arousal and valence, upwards and downwards
-_AROUSED = _faps(
+_AROUSED = _named_faps(
     raise_S_i_eyebrow=30.0,
     raise_S_m_eyebrow=50.0,
     raise_S_o_eyebrow=45.0,
     close_t_S_eyelid=-110.0,
     head_pitch=-1.5 * _DEGREE,
 )
-_TIRED = _faps(
+_TIRED = _named_faps(
     raise_S_m_eyebrow=-15.0,
     raise_S_o_eyebrow=-25.0,
     close_t_S_eyelid=170.0,
     head_pitch=2.0 * _DEGREE,
 )
-_PLEASANT = _faps(
+_PLEASANT = _named_faps(
     raise_S_cornerlip=110.0,
     raise_S_cornerlip_o=110.0,
     close_b_S_eyelid=90.0,
     lift_S_cheek=40.0,
 )
-_UNPLEASANT = _faps(
+_UNPLEASANT = _named_faps(
     raise_S_cornerlip=-60.0,
     raise_S_cornerlip_o=-60.0,
     squeeze_S_eyebrow=35.0,
@@ -61,13 +61,13 @@ _UNPLEASANT = _faps(
 )
 
 
-class FeelingMotion:
+class FeelingModifier:
     """Shows the feeling in the voice with a strength of ``amount``, 0 to 1; 0 turns it off."""
 
     def __init__(self, amount: float) -> None:
         self.amount = amount
         self._arousal, self._valence = TwoPoleFilter(0.0), TwoPoleFilter(0.0)
-        self._size = Expressiveness(1.0)
+        self._size = ExpressivenessModifier(1.0)
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add the feeling to a frame, FAPs (68,), in place."""

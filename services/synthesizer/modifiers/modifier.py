@@ -11,7 +11,7 @@ from kouxing.shared.records import Record
 
 
 class FrameContext(Record, frozen=True, kw_only=True):
-    """Information about a frame that modifiers use."""
+    """Information about a frame for modifiers."""
 
     time_s: float  # media time of the frame
     known_s: float  # media time up to which the audio is known
@@ -28,7 +28,7 @@ class FrameContext(Record, frozen=True, kw_only=True):
 
 
 class Modifier(Protocol):
-    """Changes the frames of one session; it may have state."""
+    """Changes the frames of one session; may have state."""
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Change a frame, FAPs (68,) in FAP units, in place."""

@@ -7,8 +7,8 @@ Mouth and head follow the level ``L`` of the notes relative to the loudest recen
 
     loudness = 1 + (L - P) / 30    limited to 0 to 1
 
-A breath parts the lips, widens the nostrils and lifts the head. It usually precedes speech. Lips
-that speech has closed stay closed.
+A breath opens the lips, widens the nostrils and lifts the head. It usually precedes speech. Lips
+that are closed for speech stay closed.
 """
 
 import math
@@ -17,9 +17,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.modifiers.expression import SpeechExpression
+from kouxing.services.synthesizer.modifiers.expression import ExpressionModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.services.synthesizer.modifiers.prosody import take_until
+from kouxing.services.synthesizer.modifiers.prosody import pop_until
 from kouxing.shared.face.expression_motion import EXPRESSION_FAPS
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
@@ -28,36 +28,36 @@ from kouxing.shared.face.high_level import VISEME_NAMES, VISEMES
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
 _BREATH_OPENING = 0.3  # fraction of an open vowel's opening
 _LAUGH_OPENING = (0.12, 0.58)  # the same, in silence and added by the loudest notes
-_LAUGH_SQUINT = 0.5  # how far the lower lids rise, as a share of a squint
-_LAUGH_DEG, _BREATH_DEG = (-2.5, -2.0), -1.2  # the head's pitch; upwards
-_LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filter
+_LAUGH_SQUINT = 0.5  # rise of the lower lids, as a fraction of a squint
+_LAUGH_DEG, _BREATH_DEG = (-2.5, -2.0), -1.2  # pitch of the head; negative is upward
+_LEAD_S = 0.06  # levels act this much earlier, if known, to compensate for the filter
 _LAUGH_EASE_S = 0.045  # time constant of each filter pole; notes remain visible
-_LOUDNESS_DB, _FORGET_DB_S = 30.0, 6.0  # range of the loudness; fall of P per second
+_LOUDNESS_DB, _FORGET_DB_S = 30.0, 6.0  # range of the loudness; decay of P per second
 _NOSTRILS = 60.0  # FAP units
 _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 _OPEN_VOWEL = VISEMES[VISEME_NAMES.index("A:")]
 _HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
 
 
-def _opened(amount: float, pitch_deg: float) -> NDArray[np.float32]:
+def _open_mouth(amount: float, pitch_deg: float) -> NDArray[np.float32]:
     """Return FAPs (68,) of an open mouth and a lifted head."""
     faps: NDArray[np.float32] = np.float32(amount) * _OPEN_VOWEL
     faps[_HEAD_PITCH] = pitch_deg * _DEGREE
     return faps
 
 
-def _breath() -> NDArray[np.float32]:
-    faps = _opened(_BREATH_OPENING, _BREATH_DEG)
+def _make_breath() -> NDArray[np.float32]:
+    faps = _open_mouth(_BREATH_OPENING, _BREATH_DEG)
     for name in ("stretch_l_nose", "stretch_r_nose"):
         faps[FAP_NUMBER[name] - 1] = _NOSTRILS
     return faps
 
 
-class NonverbalSounds:
-    """Shows laughter and breaths while they last."""
+class NonverbalModifier:
+    """Adds laughter and breaths to the face while they last."""
 
     def __init__(self) -> None:
-        self._laughter, self._breath = SpeechExpression(_LAUGH_EASE_S), SpeechExpression()
+        self._laughter, self._breath = ExpressionModifier(_LAUGH_EASE_S), ExpressionModifier()
         self._levels: deque[tuple[float, float]] = deque()
         self._loudest_db = -math.inf
         self._loudness = 0.0
@@ -67,7 +67,7 @@ class NonverbalSounds:
         self._levels += [level for level in context.levels if math.isfinite(level[1])]
         until_s = min(context.known_s, context.time_s + _LEAD_S)
         self._loudest_db -= _FORGET_DB_S * context.step_s
-        for _, level_db in take_until(self._levels, until_s):
+        for _, level_db in pop_until(self._levels, until_s):
             self._loudest_db = max(self._loudest_db, level_db)
             self._loudness = max(1.0 + (level_db - self._loudest_db) / _LOUDNESS_DB, 0.0)
         if context.is_laughter:
@@ -78,10 +78,10 @@ class NonverbalSounds:
         self._breath.apply(faps, context)
 
 
-_BREATH = _breath()
+_BREATH = _make_breath()
 _SMILING = (
     EXPRESSION_FAPS[ExpressionName.JOY]
     + np.float32(_LAUGH_SQUINT) * EXPRESSION_FAPS[ExpressionName.SQUINT]
-    + _opened(_LAUGH_OPENING[0], _LAUGH_DEG[0])
+    + _open_mouth(_LAUGH_OPENING[0], _LAUGH_DEG[0])
 )
-_LOUD_NOTE = _opened(_LAUGH_OPENING[1], _LAUGH_DEG[1])
+_LOUD_NOTE = _open_mouth(_LAUGH_OPENING[1], _LAUGH_DEG[1])

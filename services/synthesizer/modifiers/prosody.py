@@ -1,6 +1,6 @@
 """Finds stressed syllables, ends of phrases and questions from levels and pitches.
 
-A syllable is stressed while its level and pitch stand out from the last seconds:
+A syllable is stressed while its level and pitch exceed those of the last seconds:
 
     p = (level - mean) / spread + (pitch - mean) / spread > 1.2
 
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.smoothing import smoothing_gain
 
-_LEAD_S = 0.06  # levels act this long before their frame, if known: the delay of the filters
+_LEAD_S = 0.06  # levels act this much earlier, if known, to compensate for the filters
 _LEVEL_S = 0.03  # time constant of the level
 _MEAN_S = 3.0  # time constant of means and spreads
 _INITIAL_DB, _INITIAL_SPREAD_DB = -26.0, 5.0  # dBFS
@@ -40,13 +40,13 @@ class Prosody:
     stress: float = 0.0  # p of the current stressed syllable, otherwise 0
     silence_s: float = math.inf  # since the last speech
     phrase_s: float = 0.0  # duration of speech in the current phrase
-    raised: float = 0.0  # pitch above the mean, in spreads, -1 to 1
-    has_ended: bool = False  # a phrase has ended at this frame
-    is_question: bool = False  # it has ended with a rising pitch
+    relative_pitch: float = 0.0  # pitch relative to the mean, in spreads, -1 to 1
+    phrase_ended: bool = False  # whether a phrase has ended at this frame
+    is_question: bool = False  # the phrase has ended with a rising pitch
 
 
 class ProsodyTracker:
-    """Follows the prosody of one session, frame by frame."""
+    """Tracks the prosody of one session, frame by frame."""
 
     def __init__(self) -> None:
         self._now = Prosody()
@@ -68,15 +68,15 @@ class ProsodyTracker:
         until_s = min(context.known_s, context.time_s + _LEAD_S)
         before_s = now.silence_s
         now.silence_s += context.step_s
-        for time_s, pitch_hz in take_until(self._pitches, until_s):
+        for time_s, pitch_hz in pop_until(self._pitches, until_s):
             self._add_pitch(time_s, pitch_hz)
-        for time_s, level_db in take_until(self._levels, until_s):
+        for time_s, level_db in pop_until(self._levels, until_s):
             if context.is_speaking:  # otherwise it is noise
                 self._add_level(time_s, level_db)
-        now.has_ended = now.phrase_s > _PHRASE_S and before_s < _PHRASE_END_S <= now.silence_s
-        now.is_question = now.has_ended and self._rises()
+        now.phrase_ended = now.phrase_s > _PHRASE_S and before_s < _PHRASE_END_S <= now.silence_s
+        now.is_question = now.phrase_ended and self._pitch_rises()
         if now.silence_s >= _PHRASE_END_S:
-            now.phrase_s = 0.0 if now.has_ended else now.phrase_s
+            now.phrase_s = 0.0 if now.phrase_ended else now.phrase_s
             now.stress = 0.0
         return now
 
@@ -88,7 +88,7 @@ class ProsodyTracker:
             self._mean_st = pitch_st
         above_st = pitch_st - self._mean_st
         spread_st = max(self._spread_st, _MIN_SPREAD_ST)
-        self._now.raised = min(max(above_st / spread_st, -1.0), 1.0)
+        self._now.relative_pitch = min(max(above_st / spread_st, -1.0), 1.0)
         self._mean_st += above_st * smoothing_gain(elapsed_s, _MEAN_S)
         self._spread_st += (abs(above_st) - self._spread_st) * smoothing_gain(elapsed_s, _MEAN_S)
         self._recent.append((time_s, pitch_st))
@@ -108,10 +108,10 @@ class ProsodyTracker:
         now.phrase_s += elapsed_s
         self._mean_db += above_db * smoothing_gain(elapsed_s, _MEAN_S)
         self._spread_db += (abs(above_db) - self._spread_db) * smoothing_gain(elapsed_s, _MEAN_S)
-        prominence = above_db / max(self._spread_db, _MIN_SPREAD_DB) + now.raised
+        prominence = above_db / max(self._spread_db, _MIN_SPREAD_DB) + now.relative_pitch
         now.stress = prominence if prominence > _STRESS else 0.0
 
-    def _rises(self) -> bool:
+    def _pitch_rises(self) -> bool:
         final = [pitch for time_s, pitch in self._recent if time_s > self._pitch_s - _FINAL_S]
         if not final:
             return False
@@ -121,7 +121,7 @@ class ProsodyTracker:
         return final_st > max(high_st, lowest_st + _RISE_ST)
 
 
-def take_until(values: deque[tuple[float, float]], until_s: float) -> Iterable[tuple[float, float]]:
+def pop_until(values: deque[tuple[float, float]], until_s: float) -> Iterable[tuple[float, float]]:
     """Remove and yield the values up to a media time."""
     while values and values[0][0] <= until_s:
         yield values.popleft()

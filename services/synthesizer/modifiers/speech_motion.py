@@ -37,8 +37,8 @@ from kouxing.shared.face.faps import RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.idle_motion import EYES_PITCH, EYES_YAW, IdleMotion, State, fap_slice
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
-_NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # prominence of syllables with these movements
-_MAX_EXCESS = 1.2  # prominence of the largest nod above the weakest nod
+_NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # minimum prominence of syllables with these movements
+_MAX_EXCESS = 1.2  # difference in prominence of the largest and the weakest nod
 _MIN_NOD_INTERVAL_S, _MIN_BROW_INTERVAL_S = 1.0, 2.5
 _MIN_SIZE = 0.5  # size of the weakest nod, relative to the largest one
 _STARTING_S = 0.9  # duration of speech after a pause
@@ -63,15 +63,15 @@ _DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Behavior:
-    """Idle motion in speech and while listening. A field that is None changes nothing."""
+class IdleMotionSettings:
+    """Settings of the idle motion. A field that is None changes nothing."""
 
-    still: bool | None = None  # the head and the brows do not move
-    eye_contact: bool | None = None  # the eyes do not leave the viewer
-    listening: bool | None = None  # another person speaks
+    still: bool | None = None  # whether the head and the brows hold still
+    eye_contact: bool | None = None  # whether the eyes stay on the viewer
+    listening: bool | None = None  # whether another person speaks
 
 
-class SpeechMotion:
+class SpeechMotionModifier:
     """Idle motion with movements that accompany speech; seed and sound define the motion."""
 
     def __init__(self, seed: int) -> None:
@@ -86,8 +86,8 @@ class SpeechMotion:
         self._tilt, self._turn = _Movement(_SLOW_S), _Movement(_SLOW_S)
         self._lift = TwoPoleFilter(0.0)
 
-    def set_behavior(self, change: Behavior) -> None:
-        """Change the behavior; fields that are None stay as they are."""
+    def set_idle_motion(self, change: IdleMotionSettings) -> None:
+        """Change the settings; fields that are None change nothing."""
         if change.still is not None:
             self._is_still = self._idle.is_still = change.still
         if change.eye_contact is not None:
@@ -114,7 +114,7 @@ class SpeechMotion:
             faps[_BROWS] += np.float32(brow) * _BROW_UNITS
         is_voiced = prosody.silence_s < step_s
         is_lifted = is_voiced and not self._is_still
-        lift = self._lift.step(prosody.raised if is_lifted else 0.0, step_s, _SLOW_S)
+        lift = self._lift.step(prosody.relative_pitch if is_lifted else 0.0, step_s, _SLOW_S)
         lift = lift if abs(lift) > _VISIBLE else 0.0
         pitch = self._nod.at(now_s, step_s) - _LIFT_DEG * lift
         yaw, roll = self._turn.at(now_s, step_s), self._tilt.at(now_s, step_s)
@@ -127,7 +127,7 @@ class SpeechMotion:
     def _start_movements(self, prosody: Prosody, now_s: float, *, starts: bool) -> None:
         may_nod = now_s - self._nod_s > _MIN_NOD_INTERVAL_S
         is_accent = prosody.stress > _NOD_STRESS
-        if may_nod and (is_accent or prosody.has_ended or self._has_heard_pause):
+        if may_nod and (is_accent or prosody.phrase_ended or self._has_heard_pause):
             self._nod_s = now_s
             excess = min(max(prosody.stress - _NOD_STRESS, 0.0) / _MAX_EXCESS, 1.0)
             size = _NOD_DEG * (_MIN_SIZE + (1.0 - _MIN_SIZE) * excess)
@@ -156,7 +156,7 @@ class SpeechMotion:
 
 
 class _Movement:
-    """Moves to a size, stays until a time, and returns."""
+    """A movement to a size and back, with a hold in between."""
 
     def __init__(self, filter_s: float) -> None:
         self._size, self._until_s = 0.0, -math.inf

@@ -1,7 +1,7 @@
 """Blends visemes by their dominance.
 
 Source: Wang & Cai 2003, eq. 6 (all visemes and silences); Li et al. 2011, eq. 9-11 (the pair of
-visemes around a time, which is sufficient for a live synthesizer).
+visemes around a time, which suffices for a live synthesizer).
 
 Both are the same quotient over different sets of visemes, so one function blends and another
 selects. A softmax over log weights replaces the quotient, because the silences' weights would
@@ -41,8 +41,10 @@ class SequenceParameters(Record, frozen=True, kw_only=True):
     closing: list[tuple[int, NDArray[np.intp]]]  # closing visemes, and the FAPs that close
 
 
-def sequence_parameters(parameters: VisemeParameters, timeline: Timeline) -> SequenceParameters:
-    """Return the parameters of a timeline's visemes and silences; times do not affect them."""
+def build_sequence_parameters(
+    parameters: VisemeParameters, timeline: Timeline
+) -> SequenceParameters:
+    """Return the parameters of a timeline's visemes and silences. They do not depend on times."""
     viseme = timeline.viseme
     offset_s, log_alpha, theta_minus, theta_plus = parameters.dominance[viseme, :, None].swapaxes(
         0, 1
@@ -93,7 +95,7 @@ def log_weights(
     )
     edges_s = np.array([timeline.silence_start_s, timeline.silence_end_s])[..., None, None]
     inside_s = edges_s + p.silence_offset_s - time  # (2, S, F, P)
-    inside_s[1] *= -1.0  # its speech follows
+    inside_s[1] *= -1.0  # speech follows this edge
     # before and after all speech, one of the two is infinite and only the other remains
     right, left = log_silence(inside_s, p.silence_log_alpha, p.silence_theta, c)
     silent = log_pause(right, left, edges_s[1] - edges_s[0])
@@ -136,12 +138,12 @@ def blend(
 ) -> NDArray[np.float64]:
     """Return the mouth FAPs (num_times, num_mouth_faps) of a timeline at times (num_times,).
 
-    ``sequence`` is ``sequence_parameters`` of the timeline, if known.
+    ``sequence`` is ``build_sequence_parameters`` of the timeline, if known.
     With all visemes this is Wang & Cai 2003, eq. 6; with the pair around a time, Li 2011, eq. 11.
     """
     if not len(timeline.viseme) + len(timeline.silence_start_s):
         return np.tile(parameters.neutral, (len(time_s), 1))
-    sequence = sequence or sequence_parameters(parameters, timeline)
+    sequence = sequence or build_sequence_parameters(parameters, timeline)
     weights = softmax(log_weights(parameters, sequence, timeline, time_s))  # (E + S, F, P)
     weights *= sequence.target[:, None]
     curves: NDArray[np.float64] = np.add.reduce(weights)  # Wang & Cai 2003, eq. 6
@@ -166,7 +168,7 @@ def states_at(
     times_s: Sequence[float],
     sequence: SequenceParameters,
 ) -> list[FapState]:
-    """Return position and velocity of the mouth FAPs at media times. Arguments as of `blend`."""
+    """Return position and velocity of the mouth FAPs at media times; parameters as in `blend`."""
     times = np.array(times_s)[:, None] + np.array([-_STEP_S, 0.0, _STEP_S])
     curves = blend(parameters, timeline, times.reshape(-1), sequence)
     return [

@@ -47,9 +47,9 @@ def log_silence(inside_s: Array, log_alpha: Array | float, theta: Array, c: floa
 def log_pause(log_right: Array, log_left: Array, pause_s: Array) -> Array:
     """Return the log dominance of the silence between two words.
 
-    Wang & Cai 2003, section 3 say in words: the silence between neighbors is where the two models
-    intersect, it is stronger in longer pauses, and it vanishes when the neighbors touch. The
-    formula is half the harmonic mean of both models (a smooth minimum) times ``1 - exp(-pause /
+    Wang & Cai 2003, section 3, give no formula: the silence is where the models of both neighbors
+    intersect, it is stronger in longer pauses, and it vanishes when the neighbors touch. This
+    function is half the harmonic mean of both models (a smooth minimum) times ``1 - exp(-pause /
     scale)``. A model at an infinite distance has no effect.
     """
     strength: Array = np.log(-np.expm1(-pause_s / _PAUSE_SCALE_S))
@@ -64,7 +64,7 @@ def log_closure(
 
     Wang & Cai 2003, eq. 7 interpolates linearly from the viseme's own dominance at ``reach_s`` to
     ``closure_ratio`` times the sum of all others at the apex. Its corners would be visible as
-    jerks. This function uses a smooth step between the same ends in the log domain.
+    jerks. This function uses a smooth step in the log domain between the same end points.
 
     ``log_viseme`` is the dominance by eq. 5, ``log_others`` the sum of all others, ``reach_s`` is T
     and ``closure_ratio`` is C of eq. 7.

@@ -1,14 +1,17 @@
 """Initial parameters of the dynamic visemes, set by hand; training starts from them.
 
 Static targets are published values (``targets.tsv``). Dominances and decays are estimates. The
-feature that defines a consonant dominates (closed lips for labials, closed teeth for sibilants).
-Its other features yield to the vowel, more for consonants that are articulated further back.
+feature that defines a consonant dominates: closed lips for labials, closed teeth for sibilants.
+Its other features yield to the vowel, especially in consonants that are articulated further back.
 """
 
 import numpy as np
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.derived import add_derived
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, columns
+from kouxing.services.synthesizer.lips.dynamic_visemes.derived_visemes import append_derived_visemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
+    VisemeParameters,
+    fap_columns,
+)
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     REST,
@@ -40,7 +43,7 @@ _ROUNDED_THETA_MINUS = 28.0  # lips start rounding early
 _SILENCE_THETA = 40.0
 _SILENCE_OFFSET_S = 0.12  # the mouth opens before the voice and closes after it
 _INITIAL_C = 1.3
-_MEAN_DISTANCE_S = 0.115  # mean distance of apexes, where the decays of all exponents are equal
+_MEAN_DISTANCE_S = 0.115  # mean distance of apexes; there, all exponents have the same decay
 _CONSONANT_LEVEL_DB = -12.0  # relative to vowels
 
 
@@ -57,14 +60,14 @@ def initial_parameters(c: float = _INITIAL_C) -> VisemeParameters:
             lips, jaw, rounding, theta = CONSONANTS[group]
             level_db[row] = _CONSONANT_LEVEL_DB
             alpha[row] = lips
-            alpha[row, columns(_JAW_FAPS)] = jaw
-            alpha[row, columns(_ROUNDING_FAPS)] = 2.0 * rounding if variant else rounding
-            alpha[row, columns(_TONGUE_FAPS)] = 1.5
+            alpha[row, fap_columns(_JAW_FAPS)] = jaw
+            alpha[row, fap_columns(_ROUNDING_FAPS)] = 2.0 * rounding if variant else rounding
+            alpha[row, fap_columns(_TONGUE_FAPS)] = 1.5
             theta_minus[row] = theta_plus[row] = theta
         elif viseme in ROUNDED_VISEMES:
-            alpha[row, columns(_ROUNDING_FAPS)] = _ROUNDED_ALPHA
-            theta_minus[row, columns(_ROUNDING_FAPS)] = _ROUNDED_THETA_MINUS
-        closes[row, columns(CLOSURE_FAPS.get(viseme, ()))] = 1.0
+            alpha[row, fap_columns(_ROUNDING_FAPS)] = _ROUNDED_ALPHA
+            theta_minus[row, fap_columns(_ROUNDING_FAPS)] = _ROUNDED_THETA_MINUS
+        closes[row, fap_columns(CLOSURE_FAPS.get(viseme, ()))] = 1.0
     trained = {
         "alpha": alpha,
         "theta_minus": theta_minus * decay,
@@ -76,7 +79,7 @@ def initial_parameters(c: float = _INITIAL_C) -> VisemeParameters:
     targets = static_targets()
     per_fap = np.ones(NUM_MOUTH_FAPS)
     return VisemeParameters(
-        **add_derived(trained, VISEME_INDEX),
+        **append_derived_visemes(trained, VISEME_INDEX),
         target=targets,
         alpha_left=per_fap,
         alpha_right=per_fap,

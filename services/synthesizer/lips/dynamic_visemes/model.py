@@ -1,19 +1,19 @@
-"""Live dynamic visemes: recognized phones in, mouth FAPs out.
+"""Live dynamic visemes: turns recognized phones into mouth FAPs.
 
 Source: Li et al. 2011, 2.3.3 (blend the last two phones from apex to apex: L1 from silence to the
 first phone, L2, L3, ..., L4 to silence).
 
 The known phones define the *target trajectory*. Each revision by the live recognizer changes it. A
-*transition* then leads the difference between the old and new trajectory to zero, so the mouth is
-continuous in position and velocity. It is shorter if a lip must close earlier.
+*transition* then fades the difference between the old and new trajectory to zero, so the mouth is
+continuous in position and velocity. The transition is shorter if a lip must close earlier.
 
-A frame is made when the audio is known up to ``delay_s`` after it, with all phones known at that
-time. Visemes within that reach act in addition to the pair of eq. 11, so a longer delay is closer
-to the full model (Wang & Cai 2003, eq. 6).
+A frame is made when the audio is known up to ``delay_s`` after it, from all phones known at that
+time. In addition to the pair of eq. 11, visemes within ``delay_s`` act. A longer delay is
+therefore closer to the full model (Wang & Cai 2003, eq. 6).
 
 Lips move before the sound, but a phone is recognized about 0.1 s after its onset. Therefore the
 mouth starts moving towards an expected viseme after the last phone (`timeline`). While no phone
-follows, the expected viseme stays just ahead of the time up to which a phone would have been
+follows, the expected viseme stays just after the time at which a new phone would already be
 recognized. This halves the lag of the lips at short delays.
 """
 
@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     active_visemes,
-    sequence_parameters,
+    build_sequence_parameters,
     states_at,
 )
-from kouxing.services.synthesizer.lips.dynamic_visemes.closures import ClosureTracker
+from kouxing.services.synthesizer.lips.dynamic_visemes.closure_tracker import ClosureTracker
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import check_visemes
@@ -42,18 +42,18 @@ from kouxing.services.synthesizer.lips.trajectory import (
     FapState,
     RestTransition,
     Transition,
-    clip,
-    still,
+    clip_state,
+    stationary_state,
 )
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.records import Record
 
-_REST_S = 0.3  # duration of the way to rest without sound
+_REST_S = 0.3  # duration of the return to rest without sound
 _TRANSITION_S = 0.04  # duration of the change to a new target trajectory
 _SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
-_MEMORY_S = 1.5  # phones that ended earlier have no weight
+_MEMORY_S = 1.5  # phones that ended earlier have no effect
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class DynamicVisemes:
         check_visemes(self.inventory)
 
     def stream(self, start_s: float, *, frame_rate_hz: float, delay_s: float) -> VisemeStream:
-        """Start a session at rest, as ``LipModel.stream``."""
+        """Start a session at rest; see ``LipModel.stream``."""
         return VisemeStream(self, start_s, frame_rate_hz=frame_rate_hz, delay_s=delay_s)
 
 
@@ -84,7 +84,7 @@ class VisemeArticulation(Record, frozen=True):
 
     @property
     def syllable_onsets_s(self) -> NDArray[np.float64]:
-        """As in ``Articulation``."""
+        """Syllable onsets; see ``Articulation``."""
         return self.timeline.syllable_s
 
     def usual_level_db(self, time_s: float) -> float | None:
@@ -111,12 +111,12 @@ class VisemeStream:
         self._timeline = self._build_timeline()
         self._current = self._timeline  # with open phone extended and late closures moved
         self._active = self._timeline  # visemes that act at the time of the last frame
-        self._sequence = sequence_parameters(parameters, self._timeline)
+        self._sequence = build_sequence_parameters(parameters, self._timeline)
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # set while media time does not advance
         self._time_s = start_s  # time of the last frame
-        self._mouth: Callable[[], FapState] = lambda: still(parameters.neutral)
+        self._mouth: Callable[[], FapState] = lambda: stationary_state(parameters.neutral)
 
     def add_event(self, event: SoundEvent) -> None:
         """Add a phone, a revision, or the end of speech."""
@@ -141,9 +141,9 @@ class VisemeStream:
         self._current, is_postponed = self._closures.postpone(extended, self._time_s, time_s)
         active = self._current.select(active_visemes(self._current, time_s, self._delay_s))
         before, self._active = self._active, active
-        is_same = active.same_visemes(before)
+        is_same = active.has_same_visemes(before)
         if not is_same or len(active.silence_start_s) != len(before.silence_start_s):
-            self._sequence = sequence_parameters(self._parameters, active)
+            self._sequence = build_sequence_parameters(self._parameters, active)
         has_changed = self._pending_s is not None or is_postponed or not is_same
         times_s = [time_s]
         if has_changed or self._rest is not None:
@@ -153,7 +153,7 @@ class VisemeStream:
             self._start_transition(*start)
         transition, elapsed_s = self._transition, time_s - self._transition_start_s
         # most frames need no velocity
-        self._mouth = lambda: self._within_hull(target + transition.at(elapsed_s))
+        self._mouth = lambda: self._clip_to_hull(target + transition.at(elapsed_s))
         faps = self._clip(target.value + transition.value_at(elapsed_s))
         self._time_s = time_s
         self._closures.record_closures(active, time_s, faps)
@@ -164,16 +164,16 @@ class VisemeStream:
         if self._rest is None:
             duration_s = _REST_S if len(self._known) else _SLOW_TRANSITION_S
             self._rest = RestTransition(self._mouth(), self._parameters.neutral, duration_s)
-        mouth = self._within_hull(self._rest.step(step_s))
+        mouth = self._clip_to_hull(self._rest.step(step_s))
         self._mouth = lambda: mouth
         return self._frame(mouth.value)
 
     def _build_timeline(self) -> Timeline:
-        phones = self._known.in_order()
+        phones = self._known.sorted_by_onset()
         return build_timeline(phones, self._inventory, self._known.speech_ends_s, live=True)
 
     def _start_transition(self, target: FapState) -> None:
-        """Start a transition from the current mouth to the target trajectory, now at ``target``."""
+        """Start a transition from the current mouth to ``target`` on the target trajectory."""
         requested_s = self._pending_s or _TRANSITION_S
         duration_s = _SLOW_TRANSITION_S if self._rest is not None else requested_s
         self._transition = Transition(
@@ -183,8 +183,8 @@ class VisemeStream:
         self._transition_start_s = self._time_s
         self._pending_s = self._rest = None
 
-    def _within_hull(self, state: FapState) -> FapState:
-        return clip(state, self._lowest, self._highest)
+    def _clip_to_hull(self, state: FapState) -> FapState:
+        return clip_state(state, self._lowest, self._highest)
 
     def _clip(self, faps: NDArray[np.float64]) -> NDArray[np.float64]:
         clipped: NDArray[np.float64] = np.minimum(np.maximum(faps, self._lowest), self._highest)

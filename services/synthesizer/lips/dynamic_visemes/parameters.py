@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.derived import add_derived
+from kouxing.services.synthesizer.lips.dynamic_visemes.derived_visemes import append_derived_visemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     TRAINED_VISEMES,
     VISEME_INDEX,
@@ -75,7 +75,7 @@ class VisemeParameters:
     dominance: NDArray[np.float64] = dataclasses.field(
         init=False
     )  # (num_visemes, 4, num_mouth_faps)
-    # of the silence after speech, then before it, (2, 1, 1, num_mouth_faps)
+    # silence after speech, then before it, (2, 1, 1, num_mouth_faps)
     silence_log_alpha: NDArray[np.float64] = dataclasses.field(init=False)
     silence_theta: NDArray[np.float64] = dataclasses.field(init=False)
     silence_offset_s: NDArray[np.float64] = dataclasses.field(init=False)
@@ -117,7 +117,7 @@ class VisemeParameters:
 
 
 def load_parameters(path: Path | None = None) -> VisemeParameters:
-    """Read parameters from a file, or the built-in parameters.
+    """Read parameters from a file, by default the built-in parameters.
 
     Raises ``UserError`` if the file cannot be read, or its contents are invalid.
     """
@@ -125,12 +125,12 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
     with check_content(path or _BUILT_IN, "a file from 'kouxing train visemes'"):
         if data["format"] != FORMAT or data["faps"] != list(MOUTH_FAPS):
             raise ValueError(f"the format is not '{FORMAT}'")
-        _clips_of(data)
+        _clip_names(data)
         arrays = {
             name: np.array([data["visemes"][viseme][name] for viseme in TRAINED_VISEMES], float)
             for name in (*PER_VISEME, "level_db")
         }
-        arrays = add_derived(arrays, VISEME_INDEX)
+        arrays = append_derived_visemes(arrays, VISEME_INDEX)
         arrays |= {name: np.array(data["silence"][name], dtype=float) for name in PER_SILENCE}
         return VisemeParameters(
             **arrays,
@@ -140,12 +140,12 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
         )
 
 
-def clips_seen(path: Path | None = None) -> frozenset[str]:
+def training_clip_names(path: Path | None = None) -> frozenset[str]:
     """Return the names of the clips that were used for training or selection."""
-    return _clips_of(_read(path))
+    return _clip_names(_read(path))
 
 
-def _clips_of(data: dict[str, Any]) -> frozenset[str]:
+def _clip_names(data: dict[str, Any]) -> frozenset[str]:
     return frozenset((*data["learned_from"], *data["chosen_with"]))
 
 
@@ -157,6 +157,6 @@ def _read(path: Path | None) -> dict[str, Any]:
     return data
 
 
-def columns(faps: Sequence[int]) -> NDArray[np.intp]:
+def fap_columns(faps: Sequence[int]) -> NDArray[np.intp]:
     """Return the columns of FAPs in the parameter arrays."""
     return np.array([MOUTH_FAPS.index(fap) for fap in faps], dtype=np.intp)

@@ -7,7 +7,7 @@ The *apex* of a viseme is the time of its maximum effect (the papers' center). D
 of a viseme longer than twice ``EDGE_S`` is an interval, so that a long vowel is held instead of
 fading from its middle. Eq. 5 then uses the distance to the nearer end. Live, an expected viseme
 follows the last known phone, because a vowel follows every initial and an initial follows most
-vowels. The mouth thus starts in time for a phone that will be recognized late.
+vowels. The mouth therefore starts in time for a phone that will be recognized late.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.records import Record, replace
 
 EXPECTED = -1
-MAX_HOLD_S = 1.5  # a phone lasts up to this long beyond its estimate if nothing follows
+MAX_HOLD_S = 1.5  # limit for extending a phone beyond its estimated end if nothing follows
 _HOLD_SOFTNESS_S = 0.03
-_HOLD_FACTOR = 2.0  # with lower values a long vowel closes halfway before it is held
+_HOLD_FACTOR = 2.0  # with lower values, a long vowel half closes before it is held
 _RECOGNIZED_AFTER_S = 0.09  # most phones are recognized within this time after their onset
 _EXPECTED_AFTER_S = 0.3  # the mouth relaxes after the expected viseme has lasted this long
 # expected visemes: a medium vowel; after a vowel, a less open mouth that keeps its rounding
@@ -42,12 +42,11 @@ _EXPECTED_EDGE_S = 0.02
 class OpenPhone(Record, frozen=True):
     """The last phone, if its successor is unknown.
 
-    The last two visemes of the timeline are this phone's last viseme and the expected viseme. The
-    last silence follows them.
+    It is the second-last viseme of the timeline, before the expected viseme and the last silence.
     """
 
     end_s: float  # estimated, seconds
-    is_held: bool  # its last viseme is a vowel's, which may be held
+    is_held: bool  # whether it ends in a vowel, which may be held
 
 
 class Timeline(Record, frozen=True, kw_only=True):
@@ -74,8 +73,8 @@ class Timeline(Record, frozen=True, kw_only=True):
             syllable_s=self.syllable_s,
         )
 
-    def same_visemes(self, other: Timeline) -> bool:
-        """Return whether another timeline has the same visemes of the same phones, at any times."""
+    def has_same_visemes(self, other: Timeline) -> bool:
+        """Return whether another timeline has the same visemes and phones; times may differ."""
         return (self.viseme.tobytes(), self.phone_index.tobytes()) == (
             other.viseme.tobytes(),
             other.phone_index.tobytes(),
@@ -125,7 +124,7 @@ def build_timeline(
 ) -> Timeline:
     """Place visemes and silences.
 
-    ``phones`` may be in any order; silence ends the speech before it, and so do ``speech_ends_s``.
+    ``phones`` may be in any order. Silence and ``speech_ends_s`` end the speech before them.
     With ``live`` more phones may follow: the last phone is open unless speech has ended, and the
     durations of phones that are not final are estimates.
     """
@@ -159,7 +158,7 @@ def build_timeline(
             silences.append((silent_s, next_onset_s))
         end_s = max(end_s, phone.onset_s + _MIN_PHONE_S)
         next_symbol = following.symbol if following is not None and touching else None
-        visemes += _placed_visemes(phone, next_symbol, end_s, inventory)
+        visemes += _place_visemes(phone, next_symbol, end_s, inventory)
     visemes.sort(key=lambda row: row[1:])
     if open_phone is not None:
         visemes.append(
@@ -188,7 +187,7 @@ def build_timeline(
 _PlacedViseme: TypeAlias = tuple[int, float, float, int]
 
 
-def _placed_visemes(
+def _place_visemes(
     phone: Phone, next_symbol: str | None, end_s: float, inventory: PhoneInventory
 ) -> list[_PlacedViseme]:
     """Place the visemes of a phone that lasts until ``end_s``."""

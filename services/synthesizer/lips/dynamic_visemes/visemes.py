@@ -1,4 +1,4 @@
-"""The visemes of this lip model, and the conversion of phones to visemes.
+"""The visemes of this lip model; converts phones to visemes.
 
 The language's inventory lists the visemes of each phone. The visemes follow Li et al. 2011,
 table 1, each named after a phone. The rounded variants of consonants before rounded vowels, and the
@@ -9,9 +9,9 @@ of other languages have visemes that are derived from these (``derived``).
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.derived import (
-    derived_targets,
-    derived_visemes,
+from kouxing.services.synthesizer.lips.dynamic_visemes.derived_visemes import (
+    compute_derived_targets,
+    load_derived_visemes,
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, VisemeFractions
@@ -23,7 +23,7 @@ TRAINED_VISEMES = (
     *"b f d d_rounded l l_rounded g g_rounded j j_rounded zh zh_rounded z z_rounded".split(),
     *"a ai ao o ou e ei er i u v".split(),
 )
-VISEMES = (*TRAINED_VISEMES, *(viseme.name for viseme in derived_visemes()))
+VISEMES = (*TRAINED_VISEMES, *(viseme.name for viseme in load_derived_visemes()))
 VISEME_INDEX = {viseme: index for index, viseme in enumerate(VISEMES)}
 
 LIP_HEIGHT_FAPS = (4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)  # lips meet
@@ -64,8 +64,8 @@ def check_visemes(inventory: PhoneInventory) -> None:
 
 
 def static_targets() -> NDArray[np.float64]:
-    """Return the static targets T (num_visemes, num_mouth_faps), FAP units, by MOUTH_FAPS."""
+    """Return the static targets T (num_visemes, num_mouth_faps), FAP units, as MOUTH_FAPS."""
     table = (list(row.values()) for row in read_table(__package__, "targets.tsv"))
     rows = {viseme: [float(value) for value in values] for viseme, *values in table}
     trained = np.array([rows[viseme] for viseme in TRAINED_VISEMES])
-    return np.concatenate([trained, derived_targets(trained, VISEME_INDEX)])
+    return np.concatenate([trained, compute_derived_targets(trained, VISEME_INDEX)])

@@ -1,4 +1,4 @@
-"""Lips with a single opening R, drawn as Ferguson curves: Zhang et al. 2021."""
+"""Ferguson lips (Zhang et al. 2021): a single opening R, drawn as Ferguson curves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # importing NumPy would slow down every command
 
 def _load(inventory: PhoneInventory) -> LipModel:
     from kouxing.services.synthesizer.lips.ferguson.model import FergusonLips
-    from kouxing.services.synthesizer.lips.ferguson.table import load_table
+    from kouxing.services.synthesizer.lips.ferguson.phone_table import load_table
 
     return FergusonLips(load_table(inventory), inventory)
 

@@ -1,4 +1,4 @@
-"""The lip contour and the FAPs at an opening R.
+"""Computes the lip contour and the FAPs at an opening R.
 
 Source: Zhang et al. 2021, section 3. Four lines of five MPEG-4 feature points with shared corners
 have 16 points. The upward travel of each point was measured once. A Ferguson curve, a piecewise
@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING
+from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
 from kouxing.shared.tables import read_table
 
@@ -43,7 +43,7 @@ LINES = {
     "inner lower": ("2.5", "2.9", "2.3", "2.8", "2.4"),
     "outer lower": ("8.4", "8.8", "8.2", "8.7", "8.3"),
 }
-_ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without travel
+_STATIC_POINTS = {"outer upper": ("8.9", "8.10")}  # points of the closed line that do not travel
 _MOUTH_WIDTHS_PER_MNS = 0.39  # for the head "woman"
 _WIDTH_RANGE = (0.6, 1.2)  # from rounded to spread lips
 _FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
@@ -82,7 +82,7 @@ class LipLine:
 
 
 @lru_cache
-def lip_points() -> dict[str, LipPoint]:
+def load_lip_points() -> dict[str, LipPoint]:
     """Return the points of ``lip_points.tsv`` by name."""
     return {
         row["point"]: LipPoint(
@@ -96,16 +96,16 @@ def lip_points() -> dict[str, LipPoint]:
 
 
 @lru_cache
-def lip_lines() -> dict[str, LipLine]:
+def build_lip_lines() -> dict[str, LipLine]:
     """Return the four lines by name."""
     return {name: _line(name) for name in LINES}
 
 
 def _line(name: str) -> LipLine:
-    points = lip_points()
+    points = load_lip_points()
     moving = [points[point] for point in LINES[name]]
-    still = [points[point] for point in _ONLY_CLOSED.get(name, ())]
-    closed = sorted([*moving, *still], key=lambda point: point.x)
+    static = [points[point] for point in _STATIC_POINTS.get(name, ())]
+    closed = sorted([*moving, *static], key=lambda point: point.x)
     x, y = zip(*((point.x, point.y) for point in closed), strict=True)
     moving_x, rise = zip(*((point.x, point.rise) for point in moving), strict=True)
     return LipLine(
@@ -120,14 +120,14 @@ def contour(openings: ArrayLike, num_points: int = 41) -> Array:
     widths of points that are evenly spaced along x.
     """
     points = np.empty((len(np.asarray(openings)), len(LINES), num_points, 2))
-    for row, line in enumerate(lip_lines().values()):
+    for row, line in enumerate(build_lip_lines().values()):
         x = np.linspace(line.travel.x[0], line.travel.x[-1], num_points)
         points[:, row, :, 0] = x
         points[:, row, :, 1] = line.heights(x, openings)
     return points
 
 
-def rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int = 41) -> Array:
+def compute_rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int = 41) -> Array:
     """Return the lip contour for openings R and widths (num_frames,), like :func:`contour`.
 
     A width is the distance of the corners relative to the mouth at rest. If they approach each
@@ -142,12 +142,12 @@ def rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int = 41
     return points
 
 
-def faps_of(openings: ArrayLike) -> Array:
+def opening_to_faps(openings: ArrayLike) -> Array:
     """Return the mouth FAPs (num_frames, num_mouth_faps) for openings R (num_frames,), 0 to 5.
 
     Jaw and lip feature points travel as measured; the other FAPs are 0.
     """
-    travels = {point.fap: point.travel for point in lip_points().values()}
+    travels = {point.fap: point.travel for point in load_lip_points().values()}
     travel_of_fap = np.array([travels.get(fap, 0.0) for fap in MOUTH_FAPS])
     faps: Array = np.asarray(openings, dtype=np.float64)[:, None] / MAX_OPENING * travel_of_fap
     return faps

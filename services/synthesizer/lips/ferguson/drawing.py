@@ -1,7 +1,7 @@
 """Draws the mouth in two dimensions, as SVG text or pictures.
 
-A drawing is a list of outlines and labels, in pixels, y downwards. ``to_svg`` and ``rasterize``
-convert it to the text of a file and to a picture.
+A drawing is a list of outlines and labels, in pixels, with y downward. ``to_svg`` and
+``rasterize`` convert it to SVG text and to a picture.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from kouxing.services.synthesizer.lips.ferguson.contour import rounded_contour
+from kouxing.services.synthesizer.lips.ferguson.contour import compute_rounded_contour
 from kouxing.shared.fonts import text_runs
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def draw_mouth(
     ``width_px`` is the distance of the corners at rest, and ``width`` their distance relative to
     it: less than 1 if the lips are rounded.
     """
-    lines = rounded_contour([opening], [width], _POINTS_OF_LINE)[0]
+    lines = compute_rounded_contour([opening], [width], _POINTS_OF_LINE)[0]
     outer_upper, inner_upper, inner_lower, outer_lower = lines
     x, top, bottom = inner_upper[:, 0], inner_upper[:, 1], inner_lower[:, 1]
     # the upper teeth do not move; the lips uncover them
@@ -163,7 +163,7 @@ def draw_strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float
 
 
 def _fit(label: Label, left: float, cell_px: float, room_px: float) -> Label:
-    """Return a label that is wider than its cell, from ``left`` on and within ``room_px``."""
+    """Start a label wider than its cell at ``left``, and shrink it to ``room_px``."""
     width_px = _PX_PER_CHARACTER * label.size_px * len(label.text)
     if width_px <= cell_px:
         return label

@@ -1,8 +1,8 @@
 """The opening of the mouth over time, and its key frames from timed phones.
 
 Source: Zhang et al. 2021, sections 4 and 5, eq. 6. Each initial and final has an opening R, 0
-(closed) to 5. The mouth has this opening when the phone starts; in between, R is linear. Before and
-after speech the mouth is closed, and it starts moving shortly before the first sound.
+(closed) to 5. The mouth has this opening when the phone starts; in between, R is linear. The mouth
+is closed before and after speech. It starts moving shortly before the first sound.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.phone_table import PhoneTable
 from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ _MIN_STEP_S = 1e-3  # minimum time between key frames
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyFrames:
-    """The openings R(t) of a mouth; constant before the first and after the last key frame."""
+    """The opening R(t) of a mouth; constant before the first and after the last key frame."""
 
     times_s: Array  # (num_key_frames,) strictly ascending, at least one
     openings: Array  # (num_key_frames,) R at these times, 0 to MAX_OPENING
@@ -35,7 +35,7 @@ class KeyFrames:
         return openings
 
 
-def anchors_of(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]:
+def build_anchors(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]:
     """Return ascending times at which the mouth has the opening of a phone.
 
     ``phones`` are sorted by time; gaps and ``silence``, the phone of a closed mouth, are pauses.
@@ -59,9 +59,9 @@ def anchors_of(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]
     return rising
 
 
-def key_frames_of(phones: Sequence[Phone], table: PhoneTable, silence: str) -> KeyFrames:
-    """Return the key frames of phones, see ``anchors_of``; without phones the mouth is closed."""
-    anchors = anchors_of(phones, silence) or [(0.0, silence)]
+def build_key_frames(phones: Sequence[Phone], table: PhoneTable, silence: str) -> KeyFrames:
+    """Build key frames from ``build_anchors``; without phones, the mouth is closed."""
+    anchors = build_anchors(phones, silence) or [(0.0, silence)]
     return KeyFrames(
         np.array([time_s for time_s, _ in anchors]),
         np.array([table.opening[symbol] for _, symbol in anchors]),

@@ -1,15 +1,15 @@
-"""Live Ferguson lips: energy and zero crossings give syllable times, phones give mouth shapes.
+"""Live Ferguson lips: syllable times from energy and zero crossings, mouth shapes from phones.
 
     level, zero crossings -> segments --+
                                         +-> key frames -> R(t) -> transition -> FAPs
     recognized phones ------------------+
 
-Source: Zhang et al. 2021, sections 4 and 5, without its text: a recognized syllable starts at the
-start of its segment, and its final follows by the influence factor.
+Source: Zhang et al. 2021, sections 4 and 5. The paper knows the text; here, phones are recognized.
+A recognized syllable starts with its segment, and the influence factor places its final.
 
-A segment is known before its phones. Until then the mouth moves towards an average syllable. The
-last known phone is followed by an average phone in the same way. When segments or phones change, a
-*transition* keeps the mouth continuous in position and velocity.
+A segment is known before its phones. Until its phones are known, the mouth moves toward an average
+syllable. Likewise, an average phone follows the last known phone. When segments or phones change,
+a *transition* keeps the mouth continuous in position and velocity.
 """
 
 from __future__ import annotations
@@ -22,15 +22,18 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.endpoints import EnergySegment, SyllableSegmenter
+from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps
 from kouxing.services.synthesizer.lips.ferguson.key_frames import (
     OPENING_TIME_S,
     PAUSE_S,
     KeyFrames,
-    anchors_of,
+    build_anchors,
 )
-from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING, PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
+    EnergySegment,
+    SyllableSegmenter,
+)
 from kouxing.services.synthesizer.lips.known_phones import KnownPhones
 from kouxing.services.synthesizer.lips.lip_model import MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import (
@@ -38,8 +41,8 @@ from kouxing.services.synthesizer.lips.trajectory import (
     FapState,
     RestTransition,
     Transition,
-    clip,
-    still,
+    clip_state,
+    stationary_state,
 )
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
@@ -50,12 +53,12 @@ Array = NDArray[np.float64]
 
 _SNAP_S = 0.06  # a syllable this close to the start of a segment starts with the segment
 _RECOGNIZED_AFTER_S = 0.09  # most phones are recognized within this time after their onset
-_EXPECTED_S = 0.15  # the mouth waits this long for an expected phone before it closes
+_EXPECTED_S = 0.15  # wait for an expected phone before the mouth closes
 _CLOSING_S = 0.1
 _MEMORY_S = 1.5
 _TRANSITION_S = 0.04  # duration of the change to new key frames
 _SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
-_REST_S = 0.15  # duration of the way to rest without sound
+_REST_S = 0.15  # duration of the return to rest without sound
 _DERIVATIVE_STEP_S = 1e-3
 
 
@@ -69,7 +72,7 @@ class FergusonLips:
     inventory: PhoneInventory
 
     def stream(self, start_s: float, *, frame_rate_hz: float, delay_s: float) -> FergusonStream:
-        """Start a session at rest, as ``LipModel.stream``."""
+        """Start a session at rest; see ``LipModel.stream``."""
         del frame_rate_hz
         return FergusonStream(self, start_s, delay_s=delay_s)
 
@@ -87,8 +90,8 @@ class FergusonLips:
 
 
 @dataclass(frozen=True, slots=True)
-class Syllables:
-    """Syllables without usual levels; implements ``Articulation``."""
+class SyllableArticulation:
+    """Syllable onsets without usual levels; implements ``Articulation``."""
 
     syllable_onsets_s: Array
 
@@ -108,14 +111,14 @@ class FergusonStream:
         self._segmenter = SyllableSegmenter()
         self._segments: list[EnergySegment] = []
         self._known_s = start_s  # the audio is known up to here
-        self._has_ended = True  # no speech
-        self._has_expected = False  # the key frames end with an expected phone
+        self._has_ended = True  # whether speech has ended
+        self._has_expected = False  # whether the key frames end with an expected phone
         self._key_frames = KeyFrames(np.zeros(1), np.zeros(1))
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # set while media time does not advance
         self._time_s = start_s  # time of the last frame
-        self._mouth = still(np.zeros(NUM_MOUTH_FAPS))
+        self._mouth = stationary_state(np.zeros(NUM_MOUTH_FAPS))
 
     def add_event(self, event: SoundEvent) -> None:
         """Add the sound's progress, a phone, a revision, or a change of voice activity."""
@@ -160,16 +163,16 @@ class FergusonStream:
             self._transition_start_s = self._time_s
             self._pending_s = self._rest = None
         difference = self._transition.at(time_s - self._transition_start_s)
-        self._mouth = _within_limits(self._target_at(time_s) + difference)
+        self._mouth = _clip_to_limits(self._target_at(time_s) + difference)
         self._time_s = time_s
-        return MouthFrame(self._mouth.value, self._syllables(phones))
+        return MouthFrame(self._mouth.value, self._articulation(phones))
 
     def relax(self, step_s: float) -> MouthFrame:
         """Return the mouth one step closer to rest."""
         if self._rest is None:
             self._rest = RestTransition(self._mouth, np.zeros(NUM_MOUTH_FAPS), _REST_S)
-        self._mouth = _within_limits(self._rest.step(step_s))
-        return MouthFrame(self._mouth.value, self._syllables(self._snap_phones()))
+        self._mouth = _clip_to_limits(self._rest.step(step_s))
+        return MouthFrame(self._mouth.value, self._articulation(self._snap_phones()))
 
     def _request_transition(self, duration_s: float) -> None:
         self._pending_s = max(self._pending_s or 0.0, duration_s)
@@ -177,23 +180,25 @@ class FergusonStream:
     def _target_at(self, time_s: float) -> FapState:
         step_s = _DERIVATIVE_STEP_S
         times_s = np.array([time_s - step_s, time_s, time_s + step_s])
-        before, here, after = faps_of(self._key_frames.openings_at(times_s))
+        before, here, after = opening_to_faps(self._key_frames.openings_at(times_s))
         return FapState(here, (after - before) / (2.0 * step_s))
 
-    def _syllables(self, phones: Sequence[Phone]) -> Syllables:
+    def _articulation(self, phones: Sequence[Phone]) -> SyllableArticulation:
         vowels = self._model.inventory.vowels
-        return Syllables(np.array([phone.onset_s for phone in phones if phone.symbol in vowels]))
+        return SyllableArticulation(
+            np.array([phone.onset_s for phone in phones if phone.symbol in vowels])
+        )
 
     def _snap_phones(self) -> list[Phone]:
-        """Return the known phones; syllables start with their segments.
+        """Return the known phones, with syllables moved to the starts of their segments.
 
-        The last phone, while its end is an estimate, lasts as long as its segment.
+        While the end of the last phone is an estimate, it lasts as long as its segment.
         """
         inventory = self._model.inventory
         starts_s = np.array([segment.start_s for segment in self._segments])
         if self._segmenter.start_s is not None:
             starts_s = np.append(starts_s, self._segmenter.start_s)
-        phones = self._known.in_order()
+        phones = self._known.sorted_by_onset()
         snapped: list[Phone] = []
         for number, phone in enumerate(phones):
             onset_s = phone.onset_s
@@ -218,27 +223,27 @@ class FergusonStream:
         return self._segments[-1].end_s if self._segments else -np.inf
 
     def _make_key_frames(self, phones: Sequence[Phone]) -> KeyFrames:
-        """Return the key frames of the known audio, followed by an expected phone's."""
+        """Return the key frames of the known phones, followed by those of an expected phone."""
         silence, opening = self._model.inventory.silence, self._model.table.opening
-        frames = [(time_s, opening[symbol]) for time_s, symbol in anchors_of(phones, silence)]
+        frames = [(time_s, opening[symbol]) for time_s, symbol in build_anchors(phones, silence)]
         expected: list[tuple[float, float]] = []
         if not self._has_ended and not self._is_silent_after(phones):
-            expected = self._expected(frames, phones)
+            expected = self._expected_key_frames(frames, phones)
         if bool(expected) != self._has_expected:
             self._has_expected = bool(expected)
             self._request_transition(_TRANSITION_S if expected else _SLOW_TRANSITION_S)
-        frames = _rising([*frames, *expected] or [(0.0, 0.0)])
+        frames = _drop_unordered([*frames, *expected] or [(0.0, 0.0)])
         return KeyFrames(
             np.array([time_s for time_s, _ in frames]), np.array([r for _, r in frames])
         )
 
     def _is_silent_after(self, phones: Sequence[Phone]) -> bool:
-        """Return whether the last phone has ended by its energy, and no segment has started."""
+        """Return whether the last phone's segment has ended, and no new segment has started."""
         if self._segmenter.start_s is not None or not self._segments:
             return False
         return not phones or phones[-1].onset_s < self._segments[-1].end_s
 
-    def _expected(
+    def _expected_key_frames(
         self, frames: list[tuple[float, float]], phones: Sequence[Phone]
     ) -> list[tuple[float, float]]:
         """Return the key frames of an average phone after the last one, or of a new segment.
@@ -271,7 +276,7 @@ class FergusonStream:
         return [*expected, (next_s, next_opening), (closed_s, 0.0)]
 
 
-def _rising(frames: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def _drop_unordered(frames: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Drop key frames that are not later than their predecessor."""
     rising = [frames[0]]
     for frame in frames[1:]:
@@ -280,6 +285,6 @@ def _rising(frames: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return rising
 
 
-def _within_limits(state: FapState) -> FapState:
-    widest = faps_of([MAX_OPENING])[0]
-    return clip(state, np.minimum(widest, 0.0), np.maximum(widest, 0.0))
+def _clip_to_limits(state: FapState) -> FapState:
+    widest = opening_to_faps([MAX_OPENING])[0]
+    return clip_state(state, np.minimum(widest, 0.0), np.maximum(widest, 0.0))

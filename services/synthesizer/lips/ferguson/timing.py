@@ -1,4 +1,4 @@
-"""Times of the phones of a known text, from the segments of its recording.
+"""Times the phones of a known text, from the segments of its recording.
 
 Source: Zhang et al. 2021, section 5, eq. 5 (*reconstructed*): in a syllable that starts at T_x and
 lasts T_l, phone n starts at T_n = T_x + D T_l. The influence factor D has four levels; finals of a
@@ -18,19 +18,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.ferguson.endpoints import (
+from kouxing.services.synthesizer.lips.ferguson.phone_table import PhoneTable
+from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
     SLICE_S,
     EnergySegment,
     segment_speech,
 )
-from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import Syllable
 
 Array = NDArray[np.float64]
 
-# Chosen on recordings of the training split, by the error of syllable onsets.
+# Tuned on the training split for the error of syllable onsets.
 _DURATION_SD = 0.5  # standard deviation of a syllable's log duration
 _HISS_SD = 0.12  # standard deviation of the zero-crossing rate at a syllable onset
 _MAX_HISS_COST = 8.0
@@ -92,9 +92,9 @@ def speech_ratio(
 def phone_onsets(
     syllable: Syllable, start_s: float, end_s: float, table: PhoneTable
 ) -> list[float]:
-    """Return the onsets of the phones of a syllable, seconds (eq. 5).
+    """Return the onsets of a syllable's phones, seconds (eq. 5).
 
-    The final follows its initial by its influence factor. A third phone (r-coloring) gets its
+    The influence factor places the final after its initial. A third phone (r-coloring) has its
     typical fraction of the remaining time.
     """
     onsets_s = [start_s]
@@ -118,7 +118,7 @@ def syllable_times(
     segments = segment_speech(slices)
     if not segments:
         raise UserError("no speech was found; check that the text matches the recording")
-    text = _Text(
+    text = _TypicalValues(
         duration_s=_typical_durations(syllables, table),
         crossings=np.array([table.crossings[phones[0]] for phones in syllables]),
     )
@@ -133,7 +133,7 @@ def syllable_times(
 
 
 @dataclass(frozen=True, slots=True)
-class _Text:
+class _TypicalValues:
     """Typical values of each syllable."""
 
     duration_s: Array  # (num_syllables,)
@@ -141,8 +141,8 @@ class _Text:
 
 
 @dataclass(frozen=True, slots=True)
-class _Group:
-    """Segments and syllables that belong together: one segment or one syllable."""
+class _Assignment:
+    """Segments assigned to syllables: one segment with syllables, or one syllable with segments."""
 
     first_segment: int
     last_segment: int
@@ -167,8 +167,8 @@ class OnsetCrossings:
 
 
 def _cheapest_assignment(
-    segments: Sequence[EnergySegment], text: _Text, onset_crossings: OnsetCrossings
-) -> list[_Group]:
+    segments: Sequence[EnergySegment], text: _TypicalValues, onset_crossings: OnsetCrossings
+) -> list[_Assignment]:
     """Assign every syllable; total_cost[n, s] is for the first n segments and s syllables."""
     num_segments, num_syllables = len(segments), len(text.duration_s)
     until_s = np.concatenate([[0.0], np.cumsum(text.duration_s)])
@@ -197,7 +197,7 @@ def _cheapest_assignment(
         consider(row, 1, 0, _NOISE_COST + length_s / _NOISE_COST_S)
         for num in range(1, max_split + 1):
             typical_s = until_s[num:] - until_s[:-num]
-            cost = num * _misfit(length_s / (rate * typical_s)) + _SPLIT_COST * (num - 1)
+            cost = num * _duration_cost(length_s / (rate * typical_s)) + _SPLIT_COST * (num - 1)
             for first in range(num):
                 before_s = until_s[first : first + len(typical_s)] - until_s[: len(typical_s)]
                 cost += hiss_cost(start_s + length_s * before_s / typical_s, first, num)
@@ -206,7 +206,7 @@ def _cheapest_assignment(
             group = segments[row - merged : row]
             pause_s = sum(after.start_s - before.end_s for before, after in pairwise(group))
             group_s = group[-1].end_s - group[0].start_s
-            cost = _misfit(group_s / (rate * text.duration_s)) + _MERGE_COST * (merged - 1)
+            cost = _duration_cost(group_s / (rate * text.duration_s)) + _MERGE_COST * (merged - 1)
             cost += hiss_cost(np.full(num_syllables, group[0].start_s), 0, 1)
             consider(row, merged, 1, cost + pause_s / _PAUSE_COST_S)
     return _trace_back(best)
@@ -220,18 +220,18 @@ def _typical_durations(syllables: Sequence[Syllable], table: PhoneTable) -> Arra
     return np.array([sum(table.duration_s[phone] for phone in phones) for phones in syllables])
 
 
-def _misfit(ratio: Array) -> Array:
-    """Return the cost of a duration relative to the typical one."""
+def _duration_cost(ratio: Array) -> Array:
+    """Return the cost of a duration, given its ratio to the typical duration."""
     misfit: Array = 0.5 * (np.log(ratio) / _DURATION_SD) ** 2
     return misfit
 
 
-def _trace_back(best: NDArray[np.int16]) -> list[_Group]:
+def _trace_back(best: NDArray[np.int16]) -> list[_Assignment]:
     row, column = best.shape[0] - 1, best.shape[1] - 1
     groups = []
     while row:
         merged, num = (int(value) for value in best[row, column])
         if num:
-            groups.append(_Group(row - merged, row - 1, slice(column - num, column)))
+            groups.append(_Assignment(row - merged, row - 1, slice(column - num, column)))
         row, column = row - merged, column - num
     return groups[::-1]

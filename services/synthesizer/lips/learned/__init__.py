@@ -1,4 +1,4 @@
-"""Learned lips: predicted from the audio, with closures and tongue from recognized phones."""
+"""Learned lips: predicted from the audio; recognized phones add closures and the tongue."""
 
 from __future__ import annotations
 

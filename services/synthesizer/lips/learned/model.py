@@ -1,18 +1,18 @@
-"""Live learned lips: predicted lip frames and phones in, mouth FAPs out.
+"""Live learned lips: turns predicted lip frames and phones into mouth FAPs.
 
     lip frames -> stabilize -> closures -> lip track -> transition -> rest
     phones -> dynamic visemes -> tongue
 
 The recognizer predicts ``LipPositions`` from the audio, 50 per second during speech. Small changes
-are reduced, because they are jitter. Recognized phones take part in the decision about closures
-(`closures`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which
-cameras do not track, come from the dynamic visemes. The lip frames already contain the effect of
-loudness, so the amplitude modifier is off.
+are reduced, because they are jitter. Closures depend on lip frames and on recognized phones
+(`closure_rule`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which cameras
+do not track, come from the dynamic visemes. The lip frames already contain the effect of loudness,
+so the amplitude modifier is off.
 
 A lip frame is processed once, when its FAP frame is due, without waiting for the next lip frame. If
 lip frames are late, a *transition* keeps the mouth continuous in position and velocity. After the
-last lip frame the track closes within 150 ms. In pauses the lips stay ajar (`rest`). Until the
-first lip frame arrives, the dynamic visemes move the whole mouth.
+last lip frame the track closes within 150 ms. In pauses, the lips stay ajar (`resting_lips`).
+Until the first lip frame arrives, the dynamic visemes move the whole mouth.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.learned.closures import (
+from kouxing.services.synthesizer.lips.learned.closure_rule import (
     ClosingPhones,
     ClosureRule,
     close_lips,
-    closure_amount,
-    lip_to_teeth,
+    compute_closure_amount,
     log_odds_of,
+    move_lip_to_teeth,
     separate_lips,
 )
-from kouxing.services.synthesizer.lips.learned.rest import RestingLips, part_lips
-from kouxing.services.synthesizer.lips.learned.track import HOLD_S, MAX_GAP_S, LipTrack
+from kouxing.services.synthesizer.lips.learned.lip_track import HOLD_S, MAX_GAP_S, LipTrack
+from kouxing.services.synthesizer.lips.learned.resting_lips import RestingLips, blend_with_ajar
 from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import (
     NO_TRANSITION,
     FapState,
     RestTransition,
     Transition,
-    still,
+    stationary_state,
 )
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent, SpeechChange
@@ -53,16 +53,16 @@ Array = NDArray[np.float64]
 _UNTRACKED_FAPS = (14, 44, 45, 46, 47)  # jaw thrust and tongue
 _TRANSITION_S = 0.04  # duration of the change to a new track
 _SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
-_REST_S = 0.15  # duration of the way to rest without sound
-_FLUSHED_S = 0.3  # audio whose lip frames may arrive after an interruption
+_REST_S = 0.15  # duration of the return to rest without sound
+_FLUSHED_S = 0.3  # lip frames of this much audio may arrive after an interruption
 _MEMORY_S = 0.5
 _TEETH_LOG_ODDS = 1.0  # threshold for a phone f
-_CLOSED_FRACTION = 0.5  # lips count as closed from this fraction of the way to a closure
+_CLOSED_FRACTION = 0.5  # lips count as closed from this closure amount
 _JITTER = 10.0  # FAP units: changes of this size are halved, smaller changes are reduced further
 _MAX_FAP = 4000.0  # FAP units; larger values are invalid
 _EPSILON = 1e-6  # FAP units, and FAP units per second
 
-_WIDTH_FAPS = (6, 7, 53, 54)  # mouth corners, which move a third as far
+_WIDTH_FAPS = (6, 7, 53, 54)  # mouth corners, whose movements are a third as large
 _UNTRACKED = np.array([MOUTH_FAPS.index(fap) for fap in _UNTRACKED_FAPS])
 _JITTER_SQUARED = np.array(
     [(_JITTER / 3.0 if fap in _WIDTH_FAPS else _JITTER) ** 2 for fap in MOUTH_FAPS]
@@ -79,7 +79,7 @@ class LearnedLips:
     closures: ClosureRule = field(default_factory=ClosureRule)
 
     def stream(self, start_s: float, *, frame_rate_hz: float, delay_s: float) -> LearnedStream:
-        """Start a session at rest, as ``LipModel.stream``."""
+        """Start a session at rest; see ``LipModel.stream``."""
         return LearnedStream(
             self.visemes, self.closures, start_s, frame_rate_hz=frame_rate_hz, delay_s=delay_s
         )
@@ -110,17 +110,17 @@ class LearnedStream:
         self._closing = (0.0, 0.0)  # closure fractions of the last two lip frames
         self._has_lip_frames = False
         self._is_speaking = False
-        self._flushed_until_s = -np.inf  # ignore lip frames of the audio up to here
-        self._known_s = start_s  # the newest lip frame depends on the audio up to here
+        self._flushed_until_s = -np.inf  # lip frames of earlier audio are ignored
+        self._known_s = start_s  # end of the audio on which the newest lip frame depends
         self._track = LipTrack(self._neutral)
-        self._on_track = still(self._neutral)  # the track at the last frame
+        self._on_track = stationary_state(self._neutral)  # the track at the last frame
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
         self._rest: RestTransition | None = None  # set while media time does not advance
         self._resting = RestingLips()
         self._ajar = 0.0  # fraction of the ajar mouth at the last frame
         self._late_s = 0.0  # lateness of the newest lip frame
         self._time_s = start_s  # time of the last frame
-        self._mouth = still(self._neutral)
+        self._mouth = stationary_state(self._neutral)
         self._tongue = self._neutral
 
     def add_event(self, event: SoundEvent) -> None:
@@ -155,17 +155,17 @@ class LearnedStream:
         self._queue.clear()
         for phones in (self._bilabials, self._labiodentals):
             phones.clear()
-        self._track, self._on_track = LipTrack(self._neutral), still(self._neutral)
+        self._track, self._on_track = LipTrack(self._neutral), stationary_state(self._neutral)
         self._flushed_until_s = self._known_s + _FLUSHED_S
-        self._start_transition(still(self._neutral), _SLOW_TRANSITION_S)
+        self._start_transition(stationary_state(self._neutral), _SLOW_TRANSITION_S)
 
     def frame_at(self, time_s: float) -> MouthFrame:
         """Return the mouth at a media time, seconds; times increase."""
         visemes = self._visemes.frame_at(time_s)
         self._tongue = visemes.faps
-        self._resting.follow_voice(time_s)
+        self._resting.process_until(time_s)
         if self._has_lip_frames:
-            self._follow_track(time_s)
+            self._update_mouth(time_s)
         else:
             step_s = max(time_s - self._time_s, 1e-3)
             self._mouth = FapState(visemes.faps, (visemes.faps - self._mouth.value) / step_s)
@@ -184,7 +184,7 @@ class LearnedStream:
         self._mouth = self._rest.step(step_s)
         return self._frame(visemes.articulation)
 
-    def _follow_track(self, time_s: float) -> None:
+    def _update_mouth(self, time_s: float) -> None:
         continues = self._track.end_s >= self._time_s
         self._extend_track(time_s)
         if self._rest is not None or not continues:
@@ -230,9 +230,9 @@ class LearnedStream:
         teeth = self._labiodentals.log_odds(frame.time_s) - _TEETH_LOG_ODDS
         phones = self._bilabials.log_odds(frame.time_s)
         closure = rule.log_odds(faps, log_odds_of(frame.closure), phones)
-        closure -= self._resting.doubt_at(frame.time_s, frame.closure, phones)
-        lip_to_teeth(faps, closure_amount(teeth, rule.doubt))
-        closing = closure_amount(closure, rule.doubt)
+        closure -= self._resting.silence_penalty_at(frame.time_s, frame.closure, phones)
+        move_lip_to_teeth(faps, compute_closure_amount(teeth, rule.doubt))
+        closing = compute_closure_amount(closure, rule.doubt)
         before, newest = self._closing
         if before < _CLOSED_FRACTION <= newest:  # a new closure lasts at least two frames
             closing = max(closing, newest)
@@ -242,7 +242,7 @@ class LearnedStream:
 
     def _frame(self, articulation: Articulation) -> MouthFrame:
         faps = self._mouth.value.copy()
-        part_lips(faps, self._ajar)
+        blend_with_ajar(faps, self._ajar)
         faps[_UNTRACKED] = self._tongue[_UNTRACKED]
         return MouthFrame(faps, articulation)
 

@@ -1,4 +1,4 @@
-"""A continuous mouth trajectory from lip frames.
+"""Joins lip frames to a continuous mouth trajectory.
 
 Lip frames are joined by cubic Hermite splines. The velocity at a frame is the slope of the line
 from the previous frame, so position and velocity are continuous without waiting for the next frame.
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.trajectory import FapState, still
+from kouxing.services.synthesizer.lips.trajectory import FapState, stationary_state
 
 Array = NDArray[np.float64]
 
@@ -31,8 +31,8 @@ class LipTrack:
     """A mouth trajectory that starts at rest, mouth FAPs (num_mouth_faps,)."""
 
     def __init__(self, neutral: Array) -> None:
-        self.hold_s = 0.0  # how long the last frame is held before the mouth moves to rest
-        self._rest = still(neutral)
+        self.hold_s = 0.0  # time for which the last frame is held before the mouth moves to rest
+        self._rest = stationary_state(neutral)
         self._knots: list[_Knot] = []
 
     @property
@@ -52,7 +52,7 @@ class LipTrack:
         self._knots.append(_Knot(time_s, FapState(faps, velocity)))
 
     def forget_before(self, time_s: float) -> None:
-        """Drop frames that are not needed after a time."""
+        """Drop frames that are no longer needed after a time."""
         first = bisect_right(self._knots, time_s, key=lambda knot: knot.time_s) - 1
         del self._knots[: max(0, first)]
 
@@ -73,7 +73,7 @@ class LipTrack:
         rest = _Knot(self.end_s + self.hold_s + CLOSE_S, self._rest)
         if self.hold_s == 0.0:
             return [rest]
-        return [_Knot(self.end_s + self.hold_s, still(value)), rest]
+        return [_Knot(self.end_s + self.hold_s, stationary_state(value)), rest]
 
 
 def _interpolate(before: _Knot, after: _Knot, time_s: float) -> FapState:

@@ -1,4 +1,4 @@
-"""Syllable endpoints by energy and zero crossings.
+"""Finds syllable endpoints from energy and zero crossings.
 
 Source: Zhang et al. 2021, section 2.2: short-time energy and zero-crossing rate, with two
 thresholds each. The states, for slices of 20 ms:
@@ -17,7 +17,7 @@ Z_n      zero crossings as a fraction of the samples, 0 to 1              ``zero
 
 Deviations: The paper detects short gaps between words. Real syllables seldom have gaps, so a
 segment also ends at a dip of the *sonority*, which is the level minus a penalty for zero crossings
-above their low threshold. Unvoiced consonants therefore also are dips. The level thresholds are
+above their low threshold. Unvoiced consonants are therefore also dips. The level thresholds are
 above the noise floor, which is the quietest slice of the last 3 s (as in minimum statistics:
 Martin, "Noise power spectral density estimation based on optimal smoothing and minimum statistics",
 2001). They are proportional to the range of recent levels, because speech rises less above the
@@ -32,8 +32,7 @@ from kouxing.shared.phones.events import Progress
 
 SLICE_S = 0.02
 
-# Chosen on recordings of the training split, by boundaries found within 50 ms; no value is
-# critical.
+# Tuned on the training split for boundaries found within 50 ms; no value is critical.
 HIGH_FRACTION = 0.4  # high threshold, relative to the range of recent levels
 MIN_HIGH_DB = 4.0  # more than the variation of steady noise
 LOW_FRACTION = 0.5  # low threshold, relative to the high threshold
@@ -42,7 +41,7 @@ HANGOVER_S = 0.06
 DIP_DB = 3.0  # fall and rise that separate two segments
 MIN_SEGMENT_S = 0.1
 _HISS_DB = 30.0  # sonority penalty for a zero-crossing rate of 1
-_DESCENT = 0.5  # a segment ends at this height between dip and peak
+_DESCENT = 0.5  # a segment ends at this fraction of the height between dip and peak
 _ONSET_S = 0.1  # speech may start this long before it is loud
 _RANGE_SLICES = 150  # 3 s; in this time speech has gaps that show the noise floor
 _MIN_LEVEL_DB = -75.0
@@ -53,14 +52,14 @@ _MAX_GAP_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class EnergySegment:
-    """A segment of speech about as long as a syllable."""
+    """A segment of speech, about as long as a syllable."""
 
     start_s: float
     end_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class _Loudness:
+class _AveragedSlice:
     """A slice, averaged with the previous slice."""
 
     end_s: float
@@ -79,10 +78,10 @@ class SyllableSegmenter:
         self.start_s: float | None = None  # start of the current segment; None in silence
         self._levels_db = deque([_INITIAL_LEVEL_DB] * _RANGE_SLICES, maxlen=_RANGE_SLICES)
         self._before: Progress | None = None
-        self._recent: deque[_Loudness] = deque(maxlen=_MEMORY_SLICES)
+        self._recent: deque[_AveragedSlice] = deque(maxlen=_MEMORY_SLICES)
         self._loud_until_s = 0.0
-        self._peak: _Loudness | None = None  # in the current segment
-        self._dip: _Loudness | None = None  # after the peak; None until sonority falls
+        self._peak: _AveragedSlice | None = None  # in the current segment
+        self._dip: _AveragedSlice | None = None  # after the peak; None until sonority falls
 
     def add_slice(self, new: Progress) -> list[EnergySegment]:
         """Add the next slice; return completed segments. A time gap ends a segment."""
@@ -136,8 +135,8 @@ class SyllableSegmenter:
             return []
         return [EnergySegment(start_s, self._loud_until_s)]
 
-    def _follow_sonority(self, now: _Loudness) -> list[EnergySegment]:
-        """Track peak and dip; split between them when the sonority has risen again."""
+    def _follow_sonority(self, now: _AveragedSlice) -> list[EnergySegment]:
+        """Track peak and dip; split between them when the sonority rises again."""
         peak, dip = self._peak, self._dip
         if peak is None or (dip is None and now.sonority_db > peak.sonority_db):
             self._peak = now
@@ -151,7 +150,7 @@ class SyllableSegmenter:
             return self._split(peak, dip)
         return []
 
-    def _split(self, peak: _Loudness, dip: _Loudness) -> list[EnergySegment]:
+    def _split(self, peak: _AveragedSlice, dip: _AveragedSlice) -> list[EnergySegment]:
         """Split on the way down from a peak to a dip."""
         edge_db = dip.sonority_db + _DESCENT * (peak.sonority_db - dip.sonority_db)
         descent = [slice_ for slice_ in self._recent if peak.end_s < slice_.end_s <= dip.end_s]
@@ -174,8 +173,8 @@ def segment_speech(slices: Iterable[Progress]) -> list[EnergySegment]:
     return segments + segmenter.finish()
 
 
-def _average(before: Progress, now: Progress) -> _Loudness:
-    return _Loudness(
+def _average(before: Progress, now: Progress) -> _AveragedSlice:
+    return _AveragedSlice(
         now.time_s,
         0.5 * (before.level_db + now.level_db),
         0.5 * (before.zero_crossing_rate + now.zero_crossing_rate),

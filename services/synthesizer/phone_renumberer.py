@@ -1,4 +1,4 @@
-"""Renumbers the phones of successive recognizers as if they came from one recognizer.
+"""Renumbers the phones of successive recognizers, as if one recognizer had numbered them.
 
 A recognizer that replaces a lost one numbers phones from 0. Phones of the lost recognizer that were
 not final are void. If the new recognizer finds a void phone again, the phone keeps its index.
@@ -7,10 +7,10 @@ not final are void. If the new recognizer finds a void phone again, the phone ke
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.records import replace
 
-_SAME_S = 0.05  # maximum onset difference of a phone found by two recognizers
+_MAX_ONSET_DIFFERENCE_S = 0.05  # maximum onset difference of a phone found by two recognizers
 
 
-class PhoneNumbers:
+class PhoneRenumberer:
     """Gives each phone of a session a unique index."""
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class PhoneNumbers:
         self._void: dict[int, Phone] = {}  # phones of lost recognizers that were not final
 
     def restart(self) -> None:
-        """Start with another recognizer."""
+        """Prepare for the phones of another recognizer."""
         self._void |= self._open
         self._open.clear()
         self._indices.clear()
@@ -49,4 +49,4 @@ class PhoneNumbers:
 
 
 def _is_same(one: Phone, other: Phone) -> bool:
-    return one.symbol == other.symbol and abs(one.onset_s - other.onset_s) < _SAME_S
+    return one.symbol == other.symbol and abs(one.onset_s - other.onset_s) < _MAX_ONSET_DIFFERENCE_S

@@ -1,15 +1,14 @@
-"""Decides about closures from predicted lips and recognized phones together.
+"""Decides from predicted lips and recognized phones when the lips close.
 
 Both sources have errors: phone recognition confuses p with t, and the lip predictor smooths
 closures. Their evidence is added as log odds. A recognized b, p or m raises the odds of a closure;
 a high predicted probability needs no phone. Without a phone, the odds decrease with the predicted
 opening, so that lips open in time, and with rounding, because lips nearly meet in u and w. Phones
-are no evidence against a closure, so a p recognized as t cannot open closed lips. A phone on its
-own cannot close lips that are predicted to be wide open. In a complete recording phones are more
-reliable: other phones open the lips, also in the middle of a vowel between two closing phones.
-
-Only phones decide about lower lip to upper teeth (f), which the lip predictor does not predict
-well.
+are not evidence against a closure, so a p recognized as t cannot open closed lips. A phone alone
+cannot close lips that are predicted to be wide open. In a complete recording, phones are more
+reliable: other phones open the lips, even in the middle of a vowel between two closing phones.
+Only phones move the lower lip to the upper teeth (f), because the lip predictor does not predict
+this well.
 """
 
 import math
@@ -25,7 +24,7 @@ from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
-_MIN_PROBABILITY, _MAX_PROBABILITY = 0.002, 0.998  # others are clipped
+_MIN_PROBABILITY, _MAX_PROBABILITY = 0.002, 0.998  # probabilities are clipped to this range
 _HOLD_S = 0.08  # maximum duration of a closure after the onset of its phone
 _LATE_HOLD_S = 0.04  # minimum duration after the phone is known
 _MAX_LATE_S = 0.1  # phones known later than this after their onset are not held longer
@@ -38,10 +37,7 @@ _INNER_UPPER, _INNER_LOWER, _LEFT_CORNER, _RIGHT_CORNER = map(MOUTH_FAPS.index, 
 
 @dataclass(frozen=True, slots=True)
 class ClosureRule:
-    """Weights of the evidence.
-
-    They were chosen on speakers that were not used for training.
-    """
+    """Weights of the evidence, tuned on held-out speakers."""
 
     sound: float = 2.0  # added to the predictor's log odds, because it misses closures
     phone: float = 4.0  # maximum log odds added by a closing phone
@@ -55,8 +51,8 @@ class ClosureRule:
     def log_odds(self, faps: Array, sound: float, phones: float) -> float:
         """Return the log odds of a closure.
 
-        ``faps`` are the predicted mouth FAPs (num_mouth_faps,), ``sound`` are the predicted log
-        odds and ``phones`` those added by the recognized phones.
+        ``faps`` are the predicted mouth FAPs (num_mouth_faps,). ``sound`` are the predicted log
+        odds, and ``phones`` are the log odds that recognized phones add.
         """
         opening = -float(faps[_INNER_UPPER] + faps[_INNER_LOWER])
         width = float(faps[_LEFT_CORNER] + faps[_RIGHT_CORNER])
@@ -77,7 +73,7 @@ _BOTH = np.stack([_UPPER, _UPPER_OUTER, _LOWER, _LOWER_OUTER])
 
 
 class ClosingPhones:
-    """The recognized phones of one kind of closure; their first viseme is "b" (b p m) or "f"."""
+    """The recognized phones with one kind of closure: their first viseme is "b" (b p m) or "f"."""
 
     def __init__(self, inventory: PhoneInventory, viseme: str, rule: ClosureRule) -> None:
         self._rule = rule
@@ -158,18 +154,18 @@ def log_odds_of(probability: float) -> float:
     return math.log(clipped / (1.0 - clipped))
 
 
-def closure_amount(log_odds: float, doubt: float) -> float:
+def compute_closure_amount(log_odds: float, doubt: float) -> float:
     """Return how far lips move to their closure, from 0 (unchanged) to 1 (closed)."""
     return smooth_step(0.5 + 0.5 * log_odds / doubt)
 
 
 def close_lips(faps: Array, amount: float) -> None:
-    """Move both lips, FAPs (num_mouth_faps,), towards their closure, in place."""
+    """Move both lips, FAPs (num_mouth_faps,), toward their closure, in place."""
     _move_to_rest(faps, amount, _INNER, _OUTER)
 
 
-def lip_to_teeth(faps: Array, amount: float) -> None:
-    """Move the lower lip towards the upper teeth, in place."""
+def move_lip_to_teeth(faps: Array, amount: float) -> None:
+    """Move the lower lip toward the upper teeth, in place."""
     _move_to_rest(faps, amount, _LOWER, _LOWER_OUTER)
 
 
@@ -183,7 +179,7 @@ def separate_lips(faps: Array) -> None:
 def _move_to_rest(
     faps: Array, amount: float, inner: NDArray[np.intp], outer: NDArray[np.intp]
 ) -> None:
-    """Move inner lips towards rest, and the outer lips by the same distance."""
+    """Move inner lips toward rest, and the outer lips by the same distance."""
     if amount > 0.0:
         moved = amount * faps[inner]
         faps[inner] -= moved

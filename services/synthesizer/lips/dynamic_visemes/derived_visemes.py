@@ -1,4 +1,4 @@
-"""Visemes of sounds that Mandarin lacks, derived from the trained ones by ``derived.tsv``."""
+"""Visemes of sounds that Mandarin lacks, derived from trained visemes (``derived.tsv``)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _TONGUE = (44, 45, 46, 47)
 
 @dataclass(frozen=True, slots=True)
 class DerivedViseme:
-    """The difference of a viseme from its base, a trained viseme."""
+    """A viseme described by its difference from its base, a trained viseme."""
 
     name: str
     base: str
@@ -29,8 +29,8 @@ class DerivedViseme:
 
 
 @cache
-def derived_visemes() -> tuple[DerivedViseme, ...]:
-    """Read the table."""
+def load_derived_visemes() -> tuple[DerivedViseme, ...]:
+    """Read the derived visemes from ``derived.tsv``."""
     return tuple(
         DerivedViseme(
             row["viseme"],
@@ -44,28 +44,30 @@ def derived_visemes() -> tuple[DerivedViseme, ...]:
     )
 
 
-def add_derived(arrays: Mapping[str, Array], index: Mapping[str, int]) -> dict[str, Array]:
+def append_derived_visemes(
+    arrays: Mapping[str, Array], index: Mapping[str, int]
+) -> dict[str, Array]:
     """Append the rows of the derived visemes to arrays with a row for each trained viseme.
 
     ``index`` is the row of each trained viseme. A derived viseme has the dominance of its base and
     its own target. It does not close the lips.
     """
-    bases = [index[viseme.base] for viseme in derived_visemes()]
+    bases = [index[viseme.base] for viseme in load_derived_visemes()]
     rows = {name: array[bases] for name, array in arrays.items()}
     if "target" in arrays:
-        rows["target"] = derived_targets(arrays["target"], index)
+        rows["target"] = compute_derived_targets(arrays["target"], index)
     if "closes" in arrays:
         rows["closes"] = np.zeros_like(rows["closes"])
     return {name: np.concatenate([array, rows[name]]) for name, array in arrays.items()}
 
 
-def derived_targets(targets: Array, index: Mapping[str, int]) -> Array:
+def compute_derived_targets(targets: Array, index: Mapping[str, int]) -> Array:
     """Return the targets (num_derived, num_mouth_faps) from the trained visemes' targets."""
-    made = np.empty((len(derived_visemes()), len(MOUTH_FAPS)))
+    made = np.empty((len(load_derived_visemes()), len(MOUTH_FAPS)))
     opening, width, protrusion, tongue = (
         [MOUTH_FAPS.index(fap) for fap in faps] for faps in (_OPENING, _WIDTH, _PROTRUSION, _TONGUE)
     )
-    for row, viseme in zip(made, derived_visemes(), strict=True):
+    for row, viseme in zip(made, load_derived_visemes(), strict=True):
         row[:] = targets[index[viseme.base]]
         row[opening] *= viseme.opening
         row[width] = row[width] * viseme.rounding + viseme.spread

@@ -1,6 +1,6 @@
-"""Closures (b p m, f) that are recognized after their apex are shown late instead of never.
+"""Postpones closures (b p m, f) that are recognized after their apex.
 
-A closure that is late by less than ``_MAX_LATE_S`` is postponed to a time at which it can be shown.
+A closure that is less than ``_MAX_LATE_S`` late is moved to a time at which it can be shown.
 """
 
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ from kouxing.shared.records import replace
 _MAX_LATE_S = 0.1  # closures recognized later than this after their apex are not shown
 _CATCH_UP_S = 0.04  # time from the last frame to a postponed apex
 _MIN_TRANSITION_S = 0.02  # shortest transition to a closure
-_CLOSED = 10.0  # lip counts as closed within this distance of its target, FAP units
+_CLOSED = 10.0  # a lip counts as closed within this distance of its target, FAP units
 
 
 class ClosureTracker:
@@ -27,7 +27,7 @@ class ClosureTracker:
         self._closes: NDArray[np.bool_] = parameters.closes > 0.0  # (num_visemes, num_mouth_faps)
         self._any_closes = parameters.any_closes
         self._shown: set[int] = set()  # phone indices
-        self._postponed_s: dict[int, float] = {}  # phone index -> apex
+        self._postponed_s: dict[int, float] = {}  # apex by phone index
 
     def postpone(self, timeline: Timeline, last_s: float, time_s: float) -> tuple[Timeline, bool]:
         """Move closures whose apex passed before they were recognized.

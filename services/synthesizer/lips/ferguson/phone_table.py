@@ -1,7 +1,7 @@
-"""The table of this lip model: typical values of each phone.
+"""Reads the table of this lip model: typical values of each phone.
 
 Each language has one file in this package, such as ``mandarin.tsv``. ``kouxing train ferguson``
-writes it, and its first lines name the training data. Languages with universal phones share
+writes this file; its first lines name the training data. Languages with universal phones share
 ``universal.tsv``.
 
 =============== ===================================================================================

@@ -1,8 +1,8 @@
-"""Lips in pauses: they stay slightly open (*ajar*), close slowly, and part before the next sound.
+"""Moves the lips in pauses: slightly open (*ajar*) at first, closed later, open before sound.
 
-Filmed speakers hold 0.4 to 0.6 of their range in a pause within a turn. They close in 0.4 s if it
-lasts, and part 0.3 s before the next sound. The lip predictor shows little of this, because half of
-its training data rests closed.
+Filmed speakers hold 0.4 to 0.6 of their range in a pause within a turn. They close within 0.4 s if
+the pause lasts, and open 0.3 s before the next sound. The lip predictor shows little of this,
+because half of its training data rests closed.
 
 ======  =======================================================  ====
 symbol  meaning                                                  unit
@@ -15,10 +15,10 @@ s       0 for the predicted mouth, 1 for a slightly open mouth   1
                 0  otherwise
 
 ``s`` follows cubics, so the mouth moves smoothly. A sound is a level at most
-``_RANGE_DB`` below the loudest recent one. Silence is a pause once ``_MIN_PAUSE_S`` of it are
-known, because the closure of a stop is shorter. In a pause, lips close for a phone and for a likely
-closure shortly before a sound. If the lip predictor is nearly certain that they are closed, they
-stay closed until the next sound. All times are media times.
+``_RANGE_DB`` below the loudest recent one. Silence longer than ``_MIN_PAUSE_S`` is a pause,
+because the closure of a stop is shorter. In a pause, lips close for a phone, and for a likely
+closure shortly before a sound. If the lip predictor is nearly certain of a closure, they stay
+closed until the next sound. All times are media times.
 """
 
 import math
@@ -32,7 +32,7 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, SpeechChange
 
 HOLD_S = 0.85  # lips stay ajar until this time after the last sound
-LEAD_S = 0.36  # lips part this long before voice activity, if it is known
+LEAD_S = 0.36  # lips open this long before voice activity, if known
 PART_S, CLOSE_S = 0.15, 0.4  # time to open the mouth slightly, and to close it if the pause lasts
 CERTAIN = 0.98  # probability from which the lip predictor closes lips in a pause
 _YIELD_S = 0.06  # closing time before a sound, or when the predictor closes the lips
@@ -40,9 +40,9 @@ _END_S = 0.25  # closing time after the end of the audio
 _RELAX_S = 0.12  # closing time while no audio arrives
 _MIN_PAUSE_S = 0.12
 _RANGE_DB = 25.0
-_FADE_DB = 0.2  # per level; the loudest one fades, so a bang counts only for a short time
-_LAST_SOUND_S = 0.03  # silence known this long after a lip frame makes its closure doubtful
-_ONSET_S, _LIKELY = 0.15, 0.8  # this shortly before a sound, a closure this probable counts
+_FADE_DB = 0.2  # decay of the loudest level per level, so that a bang counts only briefly
+_LAST_SOUND_S = 0.03  # silence until this long after a lip frame makes its closure doubtful
+_ONSET_S, _LIKELY = 0.15, 0.8  # time before a sound, and the probability that counts then
 _DOUBT = 3.0  # log odds
 
 _AJAR_FAPS = {
@@ -60,17 +60,17 @@ AJAR = np.array([_AJAR_FAPS.get(fap, 0.0) for fap in MOUTH_FAPS])  # (num_mouth_
 
 
 class RestingLips:
-    """Tracks how far the mouth is ajar in one session."""
+    """Tracks how far the mouth of one session is ajar."""
 
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()  # levels of future frames: time s, dB
-        self._changes: deque[SpeechChange] = deque()  # changes in future frames
+        self._speech_changes: deque[SpeechChange] = deque()  # changes in future frames
         self._is_voice = self._has_ended = False
         self._loudest_db = -math.inf
         self._known_s = -math.inf  # the levels are known up to here
         self._sound_s = -math.inf  # end of the last sound, or start of the voice activity
-        self._stays_shut = True  # until the next sound
-        self._is_phone = False  # a phone closes the lips
+        self._stays_shut = True  # lips stay closed until the next sound
+        self._is_phone = False  # whether a phone closes the lips
         self._time_s = math.inf  # time of the last frame
         self._goal = 0.0
         self._transition, self._elapsed_s = _transition_to(0.0, 0.0, 0.0, 1.0), 0.0
@@ -83,20 +83,20 @@ class RestingLips:
                 self._loudest_db = max(event.level_db, self._loudest_db - _FADE_DB)
                 self._known_s = event.time_s
             case SpeechChange():
-                self._changes.append(event)
+                self._speech_changes.append(event)
             case EndOfSound():
                 self._has_ended = True
 
     def flush(self) -> None:
         """Drop the known events; the next frames return to rest."""
         self._levels.clear()
-        self._changes.clear()
+        self._speech_changes.clear()
         self._is_voice, self._sound_s = False, -math.inf
 
-    def follow_voice(self, time_s: float) -> None:
+    def process_until(self, time_s: float) -> None:
         """Process the events up to the time of a frame; times increase."""
-        while self._changes and self._changes[0].time_s <= time_s:
-            change = self._changes.popleft()
+        while self._speech_changes and self._speech_changes[0].time_s <= time_s:
+            change = self._speech_changes.popleft()
             if change.active and not self._is_voice:
                 self._sound_s, self._stays_shut = change.time_s, False
             self._is_voice = change.active
@@ -105,7 +105,7 @@ class RestingLips:
             if self._is_sound(level_db):
                 self._sound_s, self._stays_shut = level_s, False
 
-    def doubt_at(self, time_s: float, closure: float, phones: float) -> float:
+    def silence_penalty_at(self, time_s: float, closure: float, phones: float) -> float:
         """Return the log odds that silence subtracts from a closure at a lip frame's time.
 
         ``closure`` is the predicted probability, and ``phones`` are the log odds that phones add.
@@ -124,12 +124,12 @@ class RestingLips:
         return _DOUBT if is_silent else 0.0
 
     def amount_at(self, time_s: float) -> float:
-        """Return the amount at the time of a frame."""
+        """Return how far the mouth is ajar at the time of a frame, 0 to 1."""
         next_s = self._next_sound_s()
         soon_s = time_s + LEAD_S
         if self._has_ended:
             self._set_goal(0.0, _END_S)
-        elif any(change.active and change.time_s <= soon_s for change in self._changes):
+        elif any(change.active and change.time_s <= soon_s for change in self._speech_changes):
             self._set_goal(1.0, PART_S)
         elif self._is_phone or self._stays_shut or next_s <= time_s + _YIELD_S:
             self._set_goal(0.0, _YIELD_S)
@@ -142,7 +142,7 @@ class RestingLips:
         return self._amount()
 
     def relax(self, step_s: float) -> float:
-        """Return the amount one step closer to rest while media time does not advance."""
+        """Return the amount, one step closer to rest, while media time does not advance."""
         self._set_goal(0.0, _RELAX_S)
         self._elapsed_s += step_s
         return self._amount()
@@ -169,6 +169,6 @@ def _transition_to(goal: float, amount: float, velocity: float, duration_s: floa
     return Transition(difference, np.array([duration_s]))
 
 
-def part_lips(faps: NDArray[np.float64], amount: float) -> None:
-    """Move the mouth, FAPs (num_mouth_faps,), toward the ajar one, in place."""
+def blend_with_ajar(faps: NDArray[np.float64], amount: float) -> None:
+    """Move the mouth, FAPs (num_mouth_faps,), toward the ajar mouth, in place."""
     faps += amount * (AJAR - faps)
