@@ -25,7 +25,7 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
-from kouxing.services.mouth_profiles.lip_tracks import lip_tracks
+from kouxing.services.mouth_profiles.lip_tracks import select_lip_faps
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.offline_recognition import recognize_recording
@@ -110,7 +110,7 @@ class LipClip:
     def filmed_speech(self) -> FilmedSpeech:
         """Return the clip as input for learning a mouth profile."""
         return FilmedSpeech(
-            samples=self.samples, frame_s=self.time_s, lip_track=lip_tracks(self.faps)
+            samples=self.samples, frame_s=self.time_s, lip_track=select_lip_faps(self.faps)
         )
 
 

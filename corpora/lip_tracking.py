@@ -14,9 +14,9 @@ from kouxing.corpora.face_mesh import FaceMesh
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
 from kouxing.services.driver import picture
 from kouxing.services.mono_audio import read_mono_16k
-from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, expand_mouth_faps
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
-from kouxing.services.mouth_profiles.lip_tracks import level_track
+from kouxing.services.mouth_profiles.lip_tracks import measure_levels
 from kouxing.shared.audio_file import MAX_FILE_BYTES, check_video
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS

@@ -30,7 +30,7 @@ from kouxing.corpora.emotions import FEELINGS, EmotionRecording, speakers_of
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.evaluation.lips.effort_measures import opening_range
 from kouxing.evaluation.tables import format_number, percent
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
@@ -156,7 +156,7 @@ def _animate(
     model: AcousticModel, recordings: Sequence[EmotionRecording], config: SynthesizerConfig
 ) -> _Session:
     """Stream the recordings of a speaker as one session."""
-    chain = LiveChain(model, load_lip_model(name=config.lips), synthesizer=config)
+    chain = LivePipeline(model, load_lip_model(name=config.lips), synthesizer=config)
     pause = np.zeros(round(_PAUSE_S * MEDIA_RATE_HZ), np.float32)
     frames, spans, stressed = [], [], []
     start = 0  # samples

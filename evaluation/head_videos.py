@@ -13,7 +13,7 @@ from kouxing.evaluation.lips.scheme_videos import VIDEO_PX, write_video
 from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -32,7 +32,7 @@ def write_head_videos(folder: Path, model: AcousticModel, recordings: Sequence[P
     """
     loaded = {name: scene.load_head(name) for name in HEAD_NAMES}
     samples = join_recordings([read_mono_16k(path) for path in recordings])
-    chain = LiveChain(model, load_lip_model(model.inventory.language))
+    chain = LivePipeline(model, load_lip_model(model.inventory.language))
     show = partial(track, description="recognizing", console=CONSOLE, transient=True)
     frames = chain.animate(samples, show)
     for name, head in track(loaded.items(), "drawing", console=CONSOLE, transient=True):

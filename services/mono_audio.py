@@ -1,4 +1,4 @@
-"""Reads sound files as the recognizer needs them: 16 kHz, mono."""
+"""Reads sound files as 16 kHz mono, the format of the recognizer."""
 
 import math
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ from kouxing.shared.terminal import print_message
 def read_mono_16k(
     path: Path, track: int | None = None, progress: Progress | None = None
 ) -> NDArray[np.float32]:
-    """Return a file's samples as the recognizer uses them: 16 kHz mono, shape ``(n,)``.
+    """Return a file's samples, 16 kHz mono, shape ``(n,)``.
 
     Prints a message if the file is truncated or clipped, or has other tracks. Raises ``UserError``
     as ``kouxing.shared.audio_file.read_audio``.
@@ -26,7 +26,7 @@ def read_mono_16k(
     for notice in source.notices:
         print_message(notice)
     resampler = Resampler(source.sample_rate_hz, source.num_channels)
-    content = bytearray()  # grows in place: joining parts would need twice the memory
+    content = bytearray()  # grows in place, because joining pieces would need twice the memory
     num_samples = clipped = 0
     blocks: Iterable[Samples] = limited_blocks(source)
     if progress is not None:

@@ -1,6 +1,7 @@
 """Runs a service as a process: ``python -m kouxing.services.process KIND``.
 
-Slow imports are inside functions: they run after Ctrl-C is set up to exit without a traceback.
+Slow imports are inside functions, so that they run after Ctrl-C is set up to exit without a
+traceback.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
-    """Run one of ``services.kinds.KINDS`` with ``KEY=VALUE`` assignments; return the exit status.
+    """Run one of ``KINDS`` with ``KEY=VALUE`` assignments; return the exit status.
 
     Raises ``UserError`` if the configuration is invalid.
     """
@@ -27,7 +28,7 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
     from kouxing.shared.priority import raise_priority, use_one_thread
 
     use_one_thread()
-    from kouxing.services.kinds import KINDS, read_settings
+    from kouxing.services.service_kinds import KINDS, read_settings
     from kouxing.shared.config import parse_assignments
 
     kind = KINDS[name]
@@ -64,7 +65,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
         return 2
     try:
         service.run()
-    except Exception:  # also a UserError, which is not the user's mistake any more
+    except Exception:  # at this point, even a UserError is an internal error
         LOG.critical("internal error", exc_info=True, extra={"session": service.current_session})
         return 1
     if service.has_new_key:
@@ -75,10 +76,10 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
 
 
 def main() -> None:
-    """Run the service that the command line names. It starts faster than ``kouxing KIND``."""
-    gc.disable()  # until the service runs: collection frees nothing, and takes a tenth of the start
+    """Run the service named on the command line; starts faster than ``kouxing KIND``."""
+    gc.disable()  # until the service runs: it frees nothing, and takes a tenth of the startup time
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from kouxing.services.kinds import KINDS
+    from kouxing.services.service_kinds import KINDS
     from kouxing.shared.errors import UserError, with_name
 
     parser = argparse.ArgumentParser(prog="python -m kouxing.services.process")

@@ -193,7 +193,7 @@ class ServiceConfig(BaseModel):
     machines can read them."""
 
     @property
-    def own_host(self) -> str:
+    def advertised_host(self) -> str:
         """Host by which others reach a service that binds every address of this host."""
         host, _ = split_endpoint(self.control, "control")
         return local_address() if is_loopback(host) else local_address(host)
@@ -201,7 +201,7 @@ class ServiceConfig(BaseModel):
     def reachable(self, endpoint: str) -> str:
         """Return the endpoint by which others reach a bound endpoint."""
         host, _ = split_endpoint(endpoint, "endpoint")
-        bound_host = self.own_host if host in WILDCARDS and not self.advertise else host
+        bound_host = self.advertised_host if host in WILDCARDS and not self.advertise else host
         return with_host(endpoint, self.advertise or bound_host)
 
     @property

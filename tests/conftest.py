@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from tests.system import System
 from tests.videos import write_video
 

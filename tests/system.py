@@ -20,7 +20,7 @@ from rich.console import Console
 
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.cli.service_process import ServiceProcess
-from kouxing.services.kinds import KINDS, free_port_environment, kind_of
+from kouxing.services.service_kinds import KINDS, free_port_environment, kind_of
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.config import variable
 

@@ -5,7 +5,7 @@
 3. Live: what the services send.
 4. Live, but a phone counts only once the next one starts.
 
-Schemes 1 and 2 use the product's offline chain (``services.recording_chain``). Schemes 3 and 4 use
+Schemes 1 and 2 use the offline pipeline (``services.recording_pipeline``). Schemes 3 and 4 use
 its live chain with the default delay of each lip model. Scheme 1 always uses the default acoustic
 model. In the paper, too, the alignment does not depend on the recognizer.
 
@@ -30,7 +30,11 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline_recognition import recognize_recording
-from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
+from kouxing.services.recording_pipeline import (
+    AnalyzedRecording,
+    analyze_recording,
+    animate_recording,
+)
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.scoring import is_emitted
-from kouxing.services.live_chain import sound_events
+from kouxing.services.live_pipeline import recognize_events
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import LipFrameModel, LipFrameStream, choose_delay
@@ -50,10 +50,10 @@ def live_events(
     The recognizer runs once. With None for ``lips``, there are no lip positions.
     """
     if lips is None:
-        return dict.fromkeys(delays_s, sound_events(model, samples, None, config=config))
+        return dict.fromkeys(delays_s, recognize_events(model, samples, None, config=config))
     chosen_s = {delay_s: choose_delay(lips.delays_s, delay_s) for delay_s in delays_s}
     several = _MultiDelayPredictor(lips, [*chosen_s.values()])
-    events = sound_events(model, samples, several, config=config)
+    events = recognize_events(model, samples, several, config=config)
     return {
         delay_s: [
             event

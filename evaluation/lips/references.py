@@ -14,7 +14,7 @@ from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips, train
 from kouxing.corpora.scoring import final_hypothesis
 from kouxing.evaluation.lips.curves import is_near
 from kouxing.evaluation.lips.mouths import CURVES, Mouth, real_faps, real_mouth
-from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
+from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import training_clip_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
@@ -45,7 +45,7 @@ class Reference:
     @cached_property
     def loud_s(self) -> Array:
         """When the sound is less than 30 dB below the loudest, seconds."""
-        end_s, level_db = np.array(level_track(self.clip.samples)).reshape(-1, 2).T
+        end_s, level_db = np.array(measure_levels(self.clip.samples)).reshape(-1, 2).T
         if not len(end_s):
             return end_s
         is_loud = level_db > np.percentile(level_db, 95) - _SPEECH_RANGE_DB

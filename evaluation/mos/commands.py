@@ -76,7 +76,7 @@ def serve(
     from kouxing.evaluation.mos.store import AnswerStore
     from kouxing.evaluation.mos.study import load_study
     from kouxing.services.gateway.config import GatewayConfig
-    from kouxing.services.kinds import read_settings
+    from kouxing.services.service_kinds import read_settings
     from kouxing.shared.config import parse_assignments
 
     overrides = parse_assignments(assignments or [], "gateway")

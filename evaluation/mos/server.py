@@ -17,7 +17,7 @@ from aiohttp import web
 
 from kouxing.evaluation.mos.store import Answer, AnswerStore
 from kouxing.evaluation.mos.study import LANGUAGES, SCALES, Study, places_of_judge
-from kouxing.services.gateway import http
+from kouxing.services.gateway import web_application
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
@@ -27,7 +27,8 @@ from kouxing.shared.user_file import parse_json
 FOLDER = Path(__file__).parent / "page"
 FILES = {name: FOLDER / name for name in ("index.html", "main.js", "style.css")}
 FILES |= {
-    name: http.PAGE / name for name in ("language.js", "texts.js", "gateway-texts.js", "icon.svg")
+    name: web_application.PAGE_FOLDER / name
+    for name in ("language.js", "texts.js", "gateway-texts.js", "icon.svg")
 }
 MAX_BODY_BYTES = 1024
 _POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
@@ -76,7 +77,7 @@ class ListeningTest:
         if place is None or request.match_info["place"] != str(place):
             raise web.HTTPNotFound
         file = self._study.files[places_of_judge(judge, self._study)[place]]
-        return web.FileResponse(file, http.CHUNK_BYTES)
+        return web.FileResponse(file, web_application.CHUNK_BYTES)
 
     async def _add_answer(self, request: web.Request) -> web.Response:
         judge, answer = self._judge(request), await _read_answer(request)

@@ -28,8 +28,8 @@ from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import percentiles, stream
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.evaluation.tables import format_number
-from kouxing.services.kinds import KINDS
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ

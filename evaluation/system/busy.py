@@ -23,8 +23,8 @@ from rich.console import Console
 
 from kouxing.evaluation.system.load import SETTLE_S, LoadGenerator, Speaker
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.services.kinds import KINDS
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.control_client import connect

@@ -28,7 +28,7 @@ from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording, align
 from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.tables import format_number, percent
 from kouxing.services.cli.web_model import web_model
-from kouxing.services.live_chain import sound_events
+from kouxing.services.live_pipeline import recognize_events
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
@@ -113,7 +113,7 @@ def server_events(samples: Samples, acoustic: str = "light") -> list[SoundEvent]
     """Return the events of the server's recognizer, for a face with the default delay."""
     delay_s = SynthesizerConfig().delay_ms / 1e3
     config = RecognizerConfig(acoustic=acoustic)
-    return sound_events(load_model(acoustic), samples, load_lip_predictor(), delay_s, config)
+    return recognize_events(load_model(acoustic), samples, load_lip_predictor(), delay_s, config)
 
 
 def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> Faps:

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from kouxing.evaluation.system.network import Network
 from kouxing.services.cli.supervisor import Supervisor
-from kouxing.services.kinds import (
+from kouxing.services.service_kinds import (
     KINDS,
     extra_worker_environments,
     free_port_environment,

@@ -16,7 +16,7 @@ from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
 from kouxing.services.cli.spoken_text import read_text, report_mismatch
 from kouxing.services.driver.video import film
 from kouxing.services.driver.video.time_stretch import stretch
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
@@ -24,7 +24,7 @@ from kouxing.services.recognizer.alignment import align_syllables
 from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
 from kouxing.services.recognizer.offline_recognition import recognize_recording
-from kouxing.services.recording_chain import analyze_recording, animate_recording
+from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -129,7 +129,7 @@ def animate(
     events: Sequence[SoundEvent]
     if live:
         chains = [
-            LiveChain(model, lip_model, synthesizer=config, lip_predictor=predictor)
+            LivePipeline(model, lip_model, synthesizer=config, lip_predictor=predictor)
             for lip_model, config in zip(models, settings, strict=True)
         ]
         with_progress = partial(progress.track, description="recognizing")

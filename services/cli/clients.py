@@ -17,7 +17,7 @@ from kouxing.services.cli.options import (
     PhoneAlphabet,
 )
 from kouxing.services.cli.running_system import find_control
-from kouxing.services.kinds import read_settings
+from kouxing.services.service_kinds import read_settings
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError

@@ -6,7 +6,7 @@ import typer
 from rich.console import Console
 
 from kouxing.services.cli.options import ConfigFile, ServiceAssignments
-from kouxing.services.kinds import KINDS, read_settings
+from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.shared.config import parse_assignments
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.terminal import print_table

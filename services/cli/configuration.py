@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from kouxing.services.cli.options import Assignments, ConfigFile
-from kouxing.services.kinds import CONFIG_TYPES, read_settings
+from kouxing.services.service_kinds import CONFIG_TYPES, read_settings
 from kouxing.shared.config import COMMON, Setting, Settings, parse_assignments
 from kouxing.shared.errors import UserError
 

@@ -12,7 +12,7 @@ from kouxing_client.reach import reach_error
 
 from kouxing.services.cli.clients import find_system
 from kouxing.services.cli.running_system import find_control
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.control_client import connect
 from kouxing.shared.endpoints import split_endpoint, with_key

@@ -18,7 +18,7 @@ from kouxing.services.cli.export import app as export_app
 from kouxing.services.cli.heads import app as head_app
 from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.options import Assignments, ConfigFile, Panel
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
 from kouxing.shared.service_kind import ServiceKind

@@ -27,7 +27,7 @@ from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline_recognition import WithProgress, recognize_recording
 from kouxing.services.recognizer.transcriber import Transcriber
-from kouxing.services.recording_chain import analyze_recording, animate_recording
+from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.ferguson import drawing
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, compute_rounded_contour

@@ -18,7 +18,7 @@ from typing import Self
 import ray
 
 from kouxing.services.cli.service_process import POLL_S, ServiceProcess
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.config import BindAddress, Settings, bound_keys, variable
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import key_text, load_key

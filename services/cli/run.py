@@ -18,7 +18,7 @@ from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, Servi
 from kouxing.services.cli.running_system import announce, find_control, reserve, starting
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
-from kouxing.services.kinds import (
+from kouxing.services.service_kinds import (
     KINDS,
     available_port_environment,
     extra_worker_environments,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from kouxing_client import Client, FapFrame, KouxingError, Results, Session
 
-from kouxing.services.senders.senders import Senders
+from kouxing.services.senders.sender_pool import SenderPool
 from kouxing.services.senders.target import Target
 from kouxing.shared.control_client import connect
 from kouxing.shared.interrupt import catch_interrupt, install_interrupt
@@ -31,7 +31,7 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
     install_interrupt()  # a background shell ignores SIGINT
     with (
         connect(control) as client,
-        contextlib.closing(Senders(idle_motion_seed, _report)) as senders,
+        contextlib.closing(SenderPool(idle_motion_seed, _report)) as senders,
         catch_interrupt(),
     ):
         client.status()
@@ -61,7 +61,7 @@ class _SessionFinder:
     The targets' face at rest shows the expressions that control reports.
     """
 
-    def __init__(self, session: str, client: Client, senders: Senders) -> None:
+    def __init__(self, session: str, client: Client, senders: SenderPool) -> None:
         self.newest: _OpenedSession | None = None
         self._session = session
         self._client = client
@@ -98,7 +98,7 @@ class _SessionFinder:
                     self._senders.express(face["expressions"], face["hold_s"])
 
 
-def _send_frames(search: _SessionFinder, client: Client, senders: Senders) -> None:
+def _send_frames(search: _SessionFinder, client: Client, senders: SenderPool) -> None:
     """Send the frames of the session that was found last, forever."""
     followed: _OpenedSession | None = None
     session: Session | None = None

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from kouxing.services.cli.log_file import LogFile
 from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
-from kouxing.services.kinds import KINDS, WORKERS, kind_of
+from kouxing.services.service_kinds import KINDS, WORKERS, kind_of
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import USER_ERROR, UserError, with_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
@@ -34,7 +34,7 @@ class Supervisor:
     Warnings also go to the console. ``arguments`` are the command-line arguments of every service,
     and ``environment`` is added to this process's. ``more`` names additional workers, such as
     ``recognizer-2``, with their additions to the environment
-    (`services.kinds.extra_worker_environments`).
+    (`services.service_kinds.extra_worker_environments`).
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""Control: sessions, placement, health and speech events."""
+"""Control: places sessions on workers, checks the health of services, and publishes events."""

@@ -41,7 +41,7 @@ class ControlConfig(ServiceConfig):
         return self.control if is_own else with_host(self.control, "0.0.0.0")  # noqa: S104 - documented
 
     @property
-    def own_host(self) -> str:
+    def advertised_host(self) -> str:
         """Host name of control and its events for other machines."""
         host, _ = split_endpoint(self.control, "control")
         return local_address() if is_loopback(host) or host in WILDCARDS else host

@@ -2,10 +2,10 @@
 
 from collections.abc import Collection, Mapping
 
-from kouxing.services.control.load import EQUAL_LOAD, RETRY_AFTER_S
-from kouxing.services.control.refusal import Refusal
-from kouxing.services.control.registry import Registry, ServiceRecord
-from kouxing.services.kinds import PROVIDERS
+from kouxing.services.control.rejection import RequestRejected
+from kouxing.services.control.service_registry import ServiceRecord, ServiceRegistry
+from kouxing.services.control.worker_load import EQUAL_LOAD, RETRY_AFTER_S
+from kouxing.services.service_kinds import PROVIDERS
 from kouxing.shared.wire.session import ErrorCode
 
 CLIENT_NEEDS = ("audio", "phones", "faps")  # endpoints that a client needs
@@ -15,7 +15,7 @@ UNPACED_AUDIO = "unpaced_audio"  # replaces "audio" for sessions that are not pa
 class Placement:
     """Places sessions on the workers with the least load."""
 
-    def __init__(self, registry: Registry, max_load: float) -> None:
+    def __init__(self, registry: ServiceRegistry, max_load: float) -> None:
         self._registry = registry
         self._max_load = max_load  # fraction of a worker's time for sessions
 
@@ -30,9 +30,11 @@ class Placement:
         """Return a worker for each endpoint that a client or a chosen worker needs.
 
         A worker that is chosen for one endpoint also serves its other endpoints. Workers in
-        ``kept`` stay. A session needs workers of its ``language``, if it has one. A session that
-        moves needs no room. Raises ``Refusal`` if no ready worker provides one of the endpoints, or
-        none has room for ``min_room`` sessions.
+        ``kept`` stay. If ``language`` is set, the workers must have this language. A moved session
+        needs no room.
+
+        Raises ``RequestRejected`` if no ready worker provides an endpoint, or no worker has room
+        for ``min_room`` sessions.
         """
         workers: dict[str, str] = {}
         needed = list(CLIENT_NEEDS)
@@ -65,12 +67,12 @@ class Placement:
         kind = PROVIDERS.get(endpoint)
         if not names and providers and language is not None:
             text = f"no {kind} has the language {language}; choose another one"
-            raise Refusal(ErrorCode.BAD_LANGUAGE, text)
+            raise RequestRejected(ErrorCode.BAD_LANGUAGE, text)
         if not names:
             missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
             start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
             text = f"{missing}; {start} (or everything with 'kouxing run')"
-            raise Refusal(ErrorCode.NO_SERVICE, text)
+            raise RequestRejected(ErrorCode.NO_SERVICE, text)
         best = min(names, key=lambda name: self._rank(name, now_s))
         load = self._registry.load(best)
         if not load.has_room(min_room, now_s, self._max_load):
@@ -80,7 +82,7 @@ class Placement:
                 f"every {kind or f'provider of {endpoint}'} is busy: {needed:.0f} % of its time "
                 f"must be free, but only {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
             )
-            raise Refusal(ErrorCode.BUSY, text, RETRY_AFTER_S)
+            raise RequestRejected(ErrorCode.BUSY, text, RETRY_AFTER_S)
         return best
 
     def _rank(self, instance: str, now_s: float) -> tuple[int, int, str]:

@@ -1,4 +1,4 @@
-"""Control: opens sessions, places them on workers, and reports what happens.
+"""Control: opens sessions, places them on workers, and publishes events.
 
 Li et al. 2011, section 2: the control module initializes the others, passes messages between them
 and synchronizes them. Audio, phones and FAPs do not pass through it.
@@ -12,16 +12,16 @@ from collections.abc import Callable
 from typing import Any
 
 from kouxing.services.control.config import ControlConfig
-from kouxing.services.control.faults import FaultLog
+from kouxing.services.control.fault_log import FaultLog
 from kouxing.services.control.kind import KIND
-from kouxing.services.control.lifecycle import Lifecycle
 from kouxing.services.control.placement import Placement
-from kouxing.services.control.refusal import Refusal
-from kouxing.services.control.registry import Registry
-from kouxing.services.control.requests import Requests
-from kouxing.services.control.sessions import Sessions
-from kouxing.services.control.status import Status
-from kouxing.services.control.takeover import RestartRecovery
+from kouxing.services.control.rejection import RequestRejected
+from kouxing.services.control.request_handler import RequestHandler
+from kouxing.services.control.restart_recovery import RestartRecovery
+from kouxing.services.control.service_registry import ServiceRegistry
+from kouxing.services.control.session_lifecycle import SessionLifecycle
+from kouxing.services.control.session_table import SessionTable
+from kouxing.services.control.status_reporter import StatusReporter
 from kouxing.shared.bus import COMMANDS
 from kouxing.shared.clock import StallDetector, now_ns
 from kouxing.shared.endpoints import with_key
@@ -64,16 +64,16 @@ class ControlService(Service):
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(config, has_control=False, extra_connections=config.max_sessions)
         now_s = time.monotonic()
-        self._registry = Registry(config.lost_after_s)
+        self._registry = ServiceRegistry(config.lost_after_s)
         placement = Placement(self._registry, config.max_load)
-        self._sessions = Sessions(self._registry, placement, config.max_sessions)
-        self._status = Status(self._registry, self._sessions)
-        self._process_id = secrets.token_hex(8)  # the instance may be a setting
+        self._sessions = SessionTable(self._registry, placement, config.max_sessions)
+        self._status = StatusReporter(self._registry, self._sessions)
+        self._process_id = secrets.token_hex(8)  # not the instance name, which may be a setting
         self._faults = FaultLog()
         self._resting_face = CurrentFace(FaceSettings(), now_s)
-        self._takeover = RestartRecovery(self._registry, now_s)
+        self._recovery = RestartRecovery(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
-        self._keys_version = (0, 0)  # version of the list whose revoked keys have no sessions
+        self._keys_version = (0, 0)  # version of the key list for which revoked sessions have ended
         self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
         self._sleep_s = 0.0  # planned time until the next tick
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
@@ -83,9 +83,9 @@ class ControlService(Service):
             name: with_key(config.reachable(socket.endpoint), public)
             for name, socket in (("commands", self._commands), ("events", self._events))
         }
-        requests = self._requests = Requests(self.bus, self._commands, self.metrics)
+        requests = self._requests = RequestHandler(self.bus, self._commands, self.metrics)
         requests.defers = True
-        self._lifecycle = Lifecycle(
+        self._lifecycle = SessionLifecycle(
             self._registry,
             self._sessions,
             requests,
@@ -104,7 +104,7 @@ class ControlService(Service):
                 StatusRequest: requests.handler(self._report_status),
                 Heartbeat: self._on_heartbeat,
                 SessionStarted: self._service_handler(self._on_session_started),
-                Error: self._service_handler(self._on_start_refused),
+                Error: self._service_handler(self._on_start_rejected),
                 Speech: self._service_handler(self._on_speech),
                 Event: self._service_handler(self._on_service_event),
             },
@@ -120,7 +120,7 @@ class ControlService(Service):
         return {"sessions": len(self._sessions), "services": len(self._registry)}
 
     def on_tick(self, now_s: float) -> float:
-        """Find lost services, sessions that wait too long, and keys that changed."""
+        """Check for lost services, sessions that wait too long, and changed keys."""
         pause_s = self._tick_stall.check(now_s, expected_s=self._sleep_s)
         self._registry.exclude_pause(pause_s - MAX_PAUSE_S)
         if self.bus.zap is not None:
@@ -128,19 +128,19 @@ class ControlService(Service):
             if self.bus.zap.version != self._keys_version:
                 self._keys_version = self.bus.zap.version
                 self._lifecycle.end_revoked()
-        if self._takeover.is_active and now_s > self._takeover.end_s:
-            self._takeover.is_active = self._requests.defers = False
+        if self._recovery.is_active and now_s > self._recovery.end_s:
+            self._recovery.is_active = self._requests.defers = False
             self._restore_sessions()
         for connection in self._commands.ended():
-            if instance := self._registry.instance_on(connection):
+            if instance := self._registry.instance_by_connection(connection):
                 has_stopped = self._registry[instance].state == "draining"
                 reason = STOPPED if has_stopped else "its connection closed"
                 self._on_service_lost(instance, reason)
-        for instance in self._registry.overdue(now_s):
+        for instance in self._registry.overdue_services(now_s):
             self._on_service_lost(instance, "no heartbeat")
         self._faults.report(now_s)
         moves_due_s = self._lifecycle.on_tick(now_s)
-        due_s = min(now_s + CHECK_S, self._registry.overdue_s(), moves_due_s)
+        due_s = min(now_s + CHECK_S, self._registry.next_overdue_s(), moves_due_s)
         self._sleep_s = max(0.0, due_s - now_s)
         return due_s
 
@@ -158,7 +158,9 @@ class ControlService(Service):
             return known.opened_message(self.endpoints["events"])
         if known is not None and not self._commands.is_open(known.client.connection):
             known.client = sender  # the client has reconnected
-            if known.announced and known.next_sequence == 1:  # the client may have lost its token
+            if (
+                known.announced and known.next_sequence == 1
+            ):  # the client may not have received its token
                 self._lifecycle.end(known, "its client was disconnected before the answer arrived")
                 known = None
         if known is not None and not known.announced:
@@ -169,18 +171,18 @@ class ControlService(Service):
         return None
 
     def _close_session(self, message: CloseSession, _sender: Peer) -> Message | None:
-        record = self._sessions.find_owned(message.session, message.token or "")
+        record = self._sessions.find_authorized(message.session, message.token or "")
         self._lifecycle.end(record, "closed by its client")
         return _done(message)
 
     def _flush_session(self, message: FlushSession, _sender: Peer) -> Message | None:
-        record = self._sessions.find_owned(message.session, message.token)
+        record = self._sessions.find_authorized(message.session, message.token)
         self._lifecycle.send_to_participants(record, replace(message, epoch=record.epoch))
         self._lifecycle.publish(EventName.SESSION_FLUSHED, record.name)
         return _done(message)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
-        if message.session == "":  # for the face at rest, which only observers show
+        if message.session == "":  # the face at rest, which only observers show
             self._resting_face.change(message.face, time.monotonic())
             for instance in self._registry.observers():
                 peer = self._registry[instance].peer
@@ -204,10 +206,10 @@ class ControlService(Service):
     # --- messages of services ---
 
     def _service_handler(self, handle: Callable[[Any, str], None]) -> Handler:
-        """Return a handler that passes on messages of registered services, with the instance."""
+        """Return a handler that passes messages of registered services on, with their instance."""
 
         def on_message(message: Message, sender: Peer) -> None:
-            instance = self._registry.instance_of(sender)
+            instance = self._registry.instance_by_peer(sender)
             if instance is not None:
                 handle(message, instance)
             else:
@@ -223,9 +225,9 @@ class ControlService(Service):
             self._requests.check_role(sender, f"service:{heartbeat.service}")
             self._registry.check(heartbeat, sender)
             is_other = self._registry.is_other_process(heartbeat, sender)
-        except Refusal as refusal:
-            self.warn(refusal.code, f"{instance}: {refusal.text}")
-            self._commands.send(Error(code=refusal.code, text=refusal.text), to=sender)
+        except RequestRejected as rejection:
+            self.warn(rejection.code, f"{instance}: {rejection.text}")
+            self._commands.send(Error(code=rejection.code, text=rejection.text), to=sender)
             return
         if is_other:
             self._on_service_lost(instance, "it restarted")
@@ -234,15 +236,15 @@ class ControlService(Service):
         if is_new and is_gone:
             self._check_sessions(heartbeat, sender)  # sessions that have moved
             return
-        replaced = self._registry.replaced_by(heartbeat, sender) if is_new else None
+        replaced = self._registry.find_replaced_worker(heartbeat, sender) if is_new else None
         num_speaking = self._sessions.num_speaking(instance)
         self._registry.add(heartbeat, sender, time.monotonic(), num_speaking)
-        self._takeover.record_observer(heartbeat)
+        self._recovery.record_observer(heartbeat)
         self._check_sessions(heartbeat, sender)  # before other sessions are placed on this worker
         if is_new:
             was_lost = self._registry.reclaim_lost(instance, sender) and not is_other
             self._on_new_service(heartbeat, sender, replaced, was_lost=was_lost)
-        # The reply is last, so that a stalled service first receives which sessions have moved.
+        # The reply is sent last, so that a stalled service first learns which sessions have moved.
         reply = HeartbeatReply(
             sent_ns=heartbeat.sent_ns,
             received_ns=received_ns,
@@ -259,7 +261,7 @@ class ControlService(Service):
     def _on_new_service(
         self, heartbeat: Heartbeat, sender: Peer, replaced: str | None, *, was_lost: bool
     ) -> None:
-        """Give a new service the sessions that lack a worker, or all sessions to an observer.
+        """Assign sessions that lack a worker to a new worker, or all sessions to a new observer.
 
         A worker that was declared lost by mistake keeps the sessions that have not moved.
         """
@@ -286,10 +288,10 @@ class ControlService(Service):
             self._commands.send(record.start_message(time.monotonic()), to=sender)
 
     def _check_sessions(self, heartbeat: Heartbeat, sender: Peer) -> None:
-        """Stop sessions that a service should not serve, and end sessions without input."""
+        """Stop sessions that a service must not serve, and end sessions without input."""
         for name in heartbeat.sessions:
             record = self._sessions.get(name)
-            if record is None and self._takeover.is_active:
+            if record is None and self._recovery.is_active:
                 continue
             if record is not None and heartbeat.instance in record.lost:
                 continue  # the session has not moved yet
@@ -303,7 +305,7 @@ class ControlService(Service):
     def _on_session_started(self, started: SessionStarted, instance: str) -> None:
         record = self._sessions.get(started.session)
         if started.start is not None and record is None:
-            if self._takeover.add(started.start, instance):
+            if self._recovery.add(started.start, instance):
                 self._restore_sessions()
             else:
                 text = f"{instance} may not report this session"
@@ -313,19 +315,19 @@ class ControlService(Service):
             self._lifecycle.send_start(record, deferred)
             self._lifecycle.announce_if_started(record)
 
-    def _on_start_refused(self, error: Error, instance: str) -> None:
+    def _on_start_rejected(self, error: Error, instance: str) -> None:
         """Reject a session that a service rejected, unless its client already uses it."""
         record = self._sessions.get(error.session)
         if record is None or record.announced or error.request != record.start_request:
             return
         if instance in record.waiting_for:
-            self._lifecycle.refuse(record, error)
+            self._lifecycle.reject(record, error)
 
     def _on_speech(self, speech: Speech, instance: str) -> None:
         record = self._sessions.get(speech.session)
         if record is None or (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
             return
-        if not record.speaking:  # a new recognizer repeats that speech has started
+        if not record.speaking:  # a new recognizer repeats the start of speech
             record.speech_time = speech.media_time
         record.speaking = speech.active
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
@@ -367,12 +369,12 @@ class ControlService(Service):
 
     def _restore_sessions(self) -> None:
         """Restore sessions whose workers are all back; at the deadline, restore the rest."""
-        for start in self._takeover.pop_complete():
+        for start in self._recovery.pop_complete():
             if self._sessions.get(start.session) is not None:
                 continue
             record = self._sessions.restore(start, time.monotonic())
             LOG.info("session restored", extra={"session": record.name})
-            missed_start = self._takeover.observers_without_start(record.name)
+            missed_start = self._recovery.observers_that_missed_start(record.name)
             self._lifecycle.send_start(record, record.waiting_for | missed_start)
             if record.lost:
                 self._lifecycle.move(record)
@@ -381,7 +383,7 @@ class ControlService(Service):
 
 
 def _done(message: CloseSession | FlushSession | SetFace) -> Done | None:
-    """Return the answer to a request that was carried out; None if no answer is needed."""
+    """Return the answer to a completed request; None if no answer is needed."""
     if message.request is None:
         return None
     return Done(session=message.session, request=message.request)

@@ -1,4 +1,4 @@
-"""One session at control, and the messages that describe it."""
+"""Control's record of one session, and the messages about the session."""
 
 from dataclasses import dataclass, field
 
@@ -18,10 +18,10 @@ from kouxing.shared.wire.session import (
 
 @dataclass(slots=True)
 class SessionRecord:
-    """One session."""
+    """Control's record of one session."""
 
     name: str
-    number: int  # grows from session to session
+    number: int  # ascending in order of opening
     token: str
     opening: OpenSession
     client: Peer  # on control's socket
@@ -29,18 +29,18 @@ class SessionRecord:
     started_s: float  # time of the newest start message, or loss of a worker
     workers: dict[str, str]  # instance by endpoint, including lost workers
     endpoints: dict[str, str]  # address by endpoint
-    facts: SessionFacts  # as stated by its workers
+    facts: SessionFacts  # as reported by its workers
     face: CurrentFace
     waiting_for: set[str]  # instances that have not started the session yet
-    deferred: set[str] = field(default_factory=set)  # subset of `waiting_for` to be notified last
+    deferred: set[str] = field(default_factory=set)  # part of `waiting_for`, notified last
     lost: set[str] = field(default_factory=set)  # lost workers
     epoch: int = 1
-    announced: bool = False  # the client has its endpoints
-    moved: bool = False  # placed again, but the client is not notified yet
-    restored: bool = False  # opened by an earlier control
+    announced: bool = False  # whether the client has the endpoints
+    moved: bool = False  # whether it was placed again and the client is not notified yet
+    restored: bool = False  # whether an earlier control process opened it
     speaking: bool = False
     speech_time: int = 0  # media time at which the newest speech started
-    next_sequence: int = 1  # first audio message that a new recognizer would need
+    next_sequence: int = 1  # first audio message that a replacement recognizer would need
     resume_sequence: int | None = None  # first message to resend; None: same recognizer
     media_time: int = 0  # phones are final up to this media time
     lateness: Lateness | None = None  # lateness of the session's frames in the last 10 s
@@ -48,12 +48,12 @@ class SessionRecord:
 
     @property
     def start_request(self) -> str:
-        """The request that services confirm. Every session of this name has a different request."""
+        """The request that services confirm. It differs for every session with this name."""
         return f"start-{self.number}-{self.epoch}"
 
     @property
     def is_settled(self) -> bool:
-        """Whether no service and no client has to confirm anything."""
+        """Whether all services and the client are up to date."""
         return self.announced and not (self.moved or self.waiting_for or self.lost)
 
     @property
@@ -62,7 +62,7 @@ class SessionRecord:
         return self.waiting_for & {*self.workers.values()}
 
     @property
-    def _audio(self) -> str:
+    def _audio_endpoint(self) -> str:
         """Endpoint for the client's audio."""
         live = self.endpoints["audio"]
         return live if self.opening.paced else self.endpoints.get(UNPACED_AUDIO, live)
@@ -99,7 +99,7 @@ class SessionRecord:
             token=self.token,
             events=events,
             facts=self.facts,
-            audio=self._audio,
+            audio=self._audio_endpoint,
             phones=self.endpoints["phones"],
             faps=self.endpoints["faps"],
         )
@@ -110,7 +110,7 @@ class SessionRecord:
             session=self.name,
             epoch=self.epoch,
             next_sequence=self.resume_sequence,
-            audio=self._audio,
+            audio=self._audio_endpoint,
             phones=self.endpoints["phones"],
             faps=self.endpoints["faps"],
         )

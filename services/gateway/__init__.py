@@ -1,1 +1,1 @@
-"""Gateway: the head in a browser, with sound and microphone."""
+"""The gateway service: shows the head in a browser, with sound and microphone."""

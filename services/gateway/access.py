@@ -19,10 +19,10 @@ _READABLE = {"Access-Control-Expose-Headers": "Location"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccessPolicy:
-    """Conditions that a request must meet."""
+    """The conditions that an HTTP request must meet."""
 
     is_gateway_host: Callable[[str], bool] = is_loopback
-    """Returns whether a host name or address belongs to the gateway."""
+    """Returns whether a host name or address is the gateway's."""
     token: str = ""
     """Secret that private paths require. If empty, they require no token."""
     trusted_origins: Collection[str] = ()
@@ -59,7 +59,7 @@ class AccessPolicy:
 
     def _check_host(self, request: web.Request) -> None:
         # DNS rebinding: a foreign page whose name resolves to this machine sends its own name as
-        # the host. A foreign page that only connects here is caught by its origin.
+        # the host. The origin check rejects a foreign page that only connects here.
         try:
             host = urlsplit(f"//{request.headers.get('Host', '')}").hostname or ""
         except ValueError:

@@ -14,17 +14,17 @@ from kouxing.shared.encoding_check import EncodingCheck
 
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
-CHUNK_S = 0.04  # duration of the pieces in which queued audio is passed on
-KEEP_ALIVE_S = 20.0  # after this time without audio, a piece of silence keeps the session open
+CHUNK_S = 0.04  # duration of the pieces in which queued audio is forwarded
+KEEP_ALIVE_S = 20.0  # interval of the silent pieces that keep a session without audio open
 _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR}
 
 
 class AudioInput:
-    """Passes a client's audio on to its session.
+    """Forwards a client's audio to its session.
 
-    If ``is_ahead``, audio may arrive faster than real time, as synthesized speech does. It is then
-    queued here and passed on in real time, and an interruption drops the queue. Without it, only
-    messages of more than a second are queued, and those that follow before the queue is empty.
+    If ``is_ahead``, audio may arrive faster than real time, like synthesized speech. It is queued
+    here and forwarded in real time, and an interruption drops the queue. Otherwise, only messages
+    of more than a second are queued, with the messages that follow before the queue is empty.
     """
 
     def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, is_ahead: bool) -> None:
@@ -35,13 +35,13 @@ class AudioInput:
         is_pcm16 = pcm_format.encoding == "s16le"
         self._encoding = EncodingCheck(pcm_format.num_channels) if is_pcm16 else None
         self._incomplete = b""  # part of a sample, or of a file's header
-        self._drained: asyncio.Task[None] | None = None  # done when all audio is passed on
+        self._drain_task: asyncio.Task[None] | None = None  # done when all audio is forwarded
         self._rate_limit = RealTimeLimit()
         self._queue = RealTimeQueue(session, pcm_format, keep_alive=is_ahead)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Pass on queued audio while the context is open."""
+        """Forward queued audio while the context is open."""
         task = asyncio.create_task(self._queue.run())
         try:
             yield
@@ -49,7 +49,7 @@ class AudioInput:
             task.cancel()
 
     async def push(self, pcm: bytes) -> None:
-        """Take the audio of a binary message of any length; return when more may be read.
+        """Forward the audio of a binary message of any length; return when more may be read.
 
         Raises ``UserError`` if the data does not have the announced format.
         """
@@ -76,7 +76,7 @@ class AudioInput:
             await self._rate_limit.wait(duration_s)
 
     async def flush(self) -> None:
-        """Interrupt: drop queued audio and audio whose face is not shown yet."""
+        """Interrupt: drop queued audio, and audio whose face is not shown yet."""
         self._incomplete = b""
         self._queue.clear()
         await self._session.flush()
@@ -84,14 +84,14 @@ class AudioInput:
     async def end(self) -> None:
         """Mark the end of the audio: ``messages`` ends when the queue is empty."""
         await self._pass_on(self._incomplete)
-        self._drained = asyncio.create_task(self._queue.wait_until_empty())
+        self._drain_task = asyncio.create_task(self._queue.wait_until_empty())
 
     async def messages(self, client: web.WebSocketResponse) -> AsyncIterator[WSMessage]:
-        """Yield a client's messages until it leaves or, after ``end``, all audio is passed on."""
+        """Yield a client's messages until it disconnects; after ``end``, until all is forwarded."""
         while True:
             receiving = asyncio.create_task(client.receive())
             await asyncio.wait(
-                {receiving, self._drained} if self._drained else {receiving},
+                {receiving, self._drain_task} if self._drain_task else {receiving},
                 return_when=asyncio.FIRST_COMPLETED,
             )
             if not receiving.done():
@@ -106,7 +106,7 @@ class AudioInput:
 
 
 class RealTimeQueue:
-    """Audio that arrived early. It is passed on in real time."""
+    """Queues audio that arrives early, and forwards it in real time."""
 
     def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, keep_alive: bool) -> None:
         self._session = session
@@ -118,7 +118,7 @@ class RealTimeQueue:
 
     @property
     def is_empty(self) -> bool:
-        """Whether all audio is passed on."""
+        """Whether all audio is forwarded."""
         return not self._queued
 
     async def put(self, pcm: bytes) -> None:
@@ -133,12 +133,12 @@ class RealTimeQueue:
         self._queued.clear()
 
     async def wait_until_empty(self) -> None:
-        """Return once all audio is passed on."""
+        """Return once all audio is forwarded."""
         while self._queued:
             await asyncio.sleep(CHUNK_S)
 
     async def run(self) -> None:
-        """Pass on queued audio until cancelled."""
+        """Forward queued audio until cancelled."""
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:

@@ -1,4 +1,4 @@
-"""The sessions that the gateway opens for audio from microphones, WebRTC and the sample.
+"""Opens sessions for audio from microphones, WebRTC and the sample sentence.
 
 Audio arrives in real time and cannot wait. If the recognizer is too slow, audio is dropped. Media
 time continues.
@@ -11,11 +11,11 @@ from collections.abc import AsyncIterator, Callable
 from kouxing_client import AsyncClient, AsyncSession, KouxingError, Refused
 from kouxing_client.keys import Key
 
-from kouxing.services.gateway import wire
+from kouxing.services.gateway import browser_messages
 from kouxing.shared.errors import UserError
 
-LAST_FRAME_TIMEOUT_S = 1.5  # from the end of the audio
-LAST_PHONES_S = 0.2  # the last phones take another way than the last frame
+LAST_FRAME_TIMEOUT_S = 1.5  # after the end of the audio
+LAST_PHONES_S = 0.2  # wait for the last phones, which arrive separately from the last frame
 CONTROL_TIMEOUT_S = 3.0
 
 Warn = Callable[[str, str, str], None]  # reason, text, session
@@ -41,7 +41,7 @@ class AudioSession:
             self._warn("slow_recognizer", "dropped audio: the recognizer is too slow", self.name)
 
     def skip(self, num_frames: int) -> None:
-        """Leave out audio: media time advances."""
+        """Skip audio: media time advances."""
         self._session.skip(num_frames)
 
     async def flush(self) -> None:
@@ -52,7 +52,7 @@ class AudioSession:
         """Change the lip model."""
         await self._session.set_face(lip_model=lip_model)
 
-    def errors(self) -> list[Refused]:
+    def take_errors(self) -> list[Refused]:
         """Return the recognizer's errors since the last call.
 
         Raises ``KouxingError`` if the session is over.
@@ -79,8 +79,8 @@ class AudioSession:
             self._warn("close", str(error), self.name)
 
 
-class AudioSessions:
-    """Opens sessions as a client of control, without encryption if ``key`` is None."""
+class AudioClient:
+    """Opens sessions as a client of control; without encryption if ``key`` is None."""
 
     def __init__(self, control: str, key: Key | None, warn: Warn) -> None:
         self._control = control
@@ -138,5 +138,5 @@ class AudioSessions:
 def error_text(error: UserError | KouxingError) -> str:
     """Return the message about an error for a browser."""
     if isinstance(error, Refused):
-        return wire.error_text(error.text, error.code, error.retry_after_s)
-    return wire.error_text(str(error))
+        return browser_messages.error_text(error.text, error.code, error.retry_after_s)
+    return browser_messages.error_text(str(error))

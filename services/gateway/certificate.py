@@ -1,4 +1,4 @@
-"""The certificate for https: the configured one, or a self-signed one created on first use."""
+"""The certificate for https: the configured file, or a self-signed one created on first use."""
 
 import datetime
 import ipaddress
@@ -19,8 +19,8 @@ _MAX_BYTES = 1 << 20
 _VALID_DAYS = 397  # browsers reject certificates that are valid for longer
 
 
-def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
-    """Return the TLS context of a PEM file with a certificate and its private key.
+def load_tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
+    """Load the TLS context from a PEM file with a certificate and its private key.
 
     If the file does not exist, it is created with a self-signed certificate for the hosts. Raises
     ``UserError`` if the file cannot be read or written, or does not contain a certificate and its
@@ -28,7 +28,7 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     """
     try:
         if not certificate.exists():
-            write_private(certificate, _self_signed(hosts))
+            write_private(certificate, _create_self_signed(hosts))
         open_file(certificate, _MAX_BYTES).close()  # OpenSSL would block on a FIFO
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         context.load_cert_chain(certificate)
@@ -40,7 +40,7 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     return context
 
 
-def _self_signed(hosts: Iterable[str]) -> bytes:
+def _create_self_signed(hosts: Iterable[str]) -> bytes:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "kouxing")])
     now = datetime.datetime.now(datetime.UTC)

@@ -10,7 +10,7 @@ from kouxing.shared.config import BoundHost, BoundPort, HostNames, Texts, ValueH
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 
-ADDRESS_SHARE = 0.75  # fraction of each quota for one address, which may be a proxy
+ADDRESS_SHARE = 0.75  # maximum fraction of each quota for one address, which may be a proxy
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
 
 

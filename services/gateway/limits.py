@@ -13,9 +13,9 @@ COMMAND_S = 0.05  # a command costs as much as this duration of audio
 
 
 class ConnectionQuota:
-    """A limited number of connections of one kind, a plural noun such as ``viewers``.
+    """Limits the connections of one kind, a plural noun such as ``viewers``.
 
-    One address gets at most ``address_share`` of ``capacity``.
+    One address may hold at most ``address_share`` of ``capacity``.
     """
 
     def __init__(self, capacity: int, kind: str, address_share: float) -> None:
@@ -62,7 +62,7 @@ class RealTimeLimit:
     """Limits one browser's data to real time, after an initial burst."""
 
     def __init__(self) -> None:
-        self._used_until_s = 0.0  # when all data so far would end if it had arrived in real time
+        self._used_until_s = 0.0  # when all data so far would end in real time
 
     async def wait(self, duration_s: float) -> None:
         """Charge for data of a given duration; return when more may be read."""

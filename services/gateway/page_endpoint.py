@@ -1,4 +1,4 @@
-"""The page's endpoint: its URL, its certificate and its access policy."""
+"""Determines the page's URL, certificate and access policy from the configuration."""
 
 import secrets
 import socket
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from urllib.parse import quote
 
 from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.certificate import tls_context
+from kouxing.services.gateway.certificate import load_tls_context
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, local_address
 
@@ -34,7 +34,7 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     names = {host, local_name, f"{local_name}.local", *config.names}
     tls = None
     if config.certificate:
-        tls = tls_context(config.certificate, [*sorted(names), "localhost", "127.0.0.1"])
+        tls = load_tls_context(config.certificate, [*sorted(names), "localhost", "127.0.0.1"])
     address = f"{f'[{host}]' if ':' in host else host}:{port}"
     fragment = f"#token={quote(token)}" if token else ""
     access = AccessPolicy(

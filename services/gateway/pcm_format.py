@@ -1,4 +1,4 @@
-"""The PCM format that a client announces, and checks that its data has this format."""
+"""The PCM format that a client announces, with checks of its data."""
 
 import base64
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from kouxing.shared.user_file import parse_json
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
-RATES_HZ = (8000, 48000)
+RATES_HZ = (8000, 48000)  # minimum and maximum
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file
 
@@ -58,7 +58,7 @@ class PcmFormat:
             raise UserError(f"expected {self}; this is JSON: send it as a text message")
 
     def check_samples(self, pcm: bytes, *, is_first: bool) -> None:
-        """Check whole samples. The data may start with the header of a file.
+        """Check whole samples. The first data must not be the header of a file.
 
         Raises ``UserError`` if they do not have this format; the text says what was expected.
         """

@@ -1,4 +1,4 @@
-"""HTTP API of the senders: other programs that show the face.
+"""HTTP API that starts and stops senders to programs that show the face.
 
 A page can start senders only to programs on the gateway's machine and to addresses in the
 configuration. It cannot make the gateway send to arbitrary hosts.
@@ -11,9 +11,9 @@ from dataclasses import asdict
 import numpy as np
 from aiohttp import web
 
-from kouxing.services.gateway import wire
+from kouxing.services.gateway import browser_messages
 from kouxing.services.senders.protocols import parse_target
-from kouxing.services.senders.senders import Senders
+from kouxing.services.senders.sender_pool import SenderPool
 from kouxing.services.senders.target import Target, parse_delay_s
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
@@ -21,7 +21,7 @@ from kouxing.shared.logs import LOG
 
 
 class SendersApi:
-    """Sends the face that the gateway shows to other programs, and reports their state.
+    """Sends the gateway's face to other programs, and reports their state.
 
     ``on_started`` is called when a page starts a sender.
     """
@@ -31,7 +31,7 @@ class SendersApi:
     ) -> None:
         self._configured = {url: parse_target(url) for url in urls}
         self._on_started = on_started
-        self._senders = Senders(idle_motion_seed, _log_problem)
+        self._senders = SenderPool(idle_motion_seed, _log_problem)
         for target in self._configured.values():
             self._senders.start(target)
 
@@ -60,7 +60,7 @@ class SendersApi:
     async def serve_post(self, request: web.Request) -> web.StreamResponse:
         """Start or stop a sender, or delay all; answer with their state or with an error."""
         try:
-            command = wire.parse_object(await request.read())
+            command = browser_messages.parse_object(await request.read())
             start, stop, delay_ms = (command.get(key) for key in ("start", "stop", "delay_ms"))
             if isinstance(start, str):
                 self._senders.start(self._allowed_target(start))

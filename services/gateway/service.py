@@ -1,4 +1,4 @@
-"""The gateway service: it shows sessions in browsers and streams microphones into sessions.
+"""The gateway service: shows sessions in browsers, and streams microphones into sessions.
 
 Receives start-session, close-session, flush-session, set-face and status-report from control,
 fap-frame and end-of-faps from synthesizers, sound, phone and speech from recognizers, and the
@@ -16,20 +16,20 @@ from dataclasses import dataclass
 
 from aiohttp import web
 
-from kouxing.services.gateway import http, wire
-from kouxing.services.gateway.audio_sessions import AudioSessions
+from kouxing.services.gateway import browser_messages, web_application
+from kouxing.services.gateway.audio_sessions import AudioClient
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.kind import KIND
-from kouxing.services.gateway.learn_mouth import MouthLearner
-from kouxing.services.gateway.microphone import Microphones
+from kouxing.services.gateway.microphone_handler import MicrophoneHandler
+from kouxing.services.gateway.mouth_learner import MouthLearner
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
-from kouxing.services.gateway.sample import SampleSentence
+from kouxing.services.gateway.sample_sentence import SampleSentence
 from kouxing.services.gateway.senders_api import SendersApi
-from kouxing.services.gateway.sound_upload import SoundUpload
+from kouxing.services.gateway.sound_upload import SoundUploadHandler
+from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.viewer_queue import MessageKind
-from kouxing.services.gateway.viewers import Viewers
 from kouxing.services.gateway.web_server import WebServer, bind_port
-from kouxing.services.gateway.whip import WhipClients
+from kouxing.services.gateway.whip_handler import WhipHandler
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
@@ -50,9 +50,9 @@ from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Acoustic, Phone, Speech
 
 STATUS_INTERVAL_S = 1.0  # interval between status requests
-STATUS_TIMEOUT_S = 3.0  # interval between status requests without an answer, or without viewers
-MISSING_S = 3.0  # delay of reporting a missing service; a restarted control waits for services
-CONTROL_MISSING_S = 8.0  # delay of reporting that control is missing; a restart takes less
+STATUS_TIMEOUT_S = 3.0  # the same without an answer, or without viewers
+MISSING_S = 3.0  # delay before a missing service is shown, because control may have restarted
+CONTROL_MISSING_S = 8.0  # delay before a missing control is shown; a restart is faster
 
 
 @dataclass(slots=True)
@@ -72,20 +72,20 @@ class GatewayService(SessionService):
     kind = KIND
 
     def __init__(self, config: GatewayConfig) -> None:
-        listening = bind_port(config.host, config.port)
+        listener = bind_port(config.host, config.port)
         self._runner = asyncio.Runner()
         self._loop = self._runner.get_loop()
         self._is_waiting = False
         super().__init__(config)
-        host, port = listening.getsockname()[:2]
+        host, port = listener.getsockname()[:2]
         endpoint = make_page_endpoint(config, port)
         self.endpoints = {"page": endpoint.url}
         self._sessions: dict[str, _FollowedSession] = {}
-        self._web_sockets = http.WebSockets()
+        self._web_sockets = web_application.OpenWebSockets()
         share = config.address_share
-        self._audio_sessions = AudioSessions(self.control_endpoint, self.key, self.warn)
-        self._sample = SampleSentence(self._audio_sessions)
-        self._viewers = Viewers(
+        self._audio_client = AudioClient(self.control_endpoint, self.key, self.warn)
+        self._sample = SampleSentence(self._audio_client)
+        self._viewers = ViewerHandler(
             self._web_sockets,
             share,
             self.metrics,
@@ -93,40 +93,40 @@ class GatewayService(SessionService):
             self._set_face,
             self.waker.wake,
         )
-        self._microphones = Microphones(self._web_sockets, share, self._audio_sessions)
-        self._whip_clients = WhipClients(
+        self._microphones = MicrophoneHandler(self._web_sockets, share, self._audio_client)
+        self._whip_handler = WhipHandler(
             share,
-            self._audio_sessions,
+            self._audio_client,
             self._viewers,
             [] if ipaddress.ip_address(host).is_unspecified else [host],
         )
         self._mouth_learner = MouthLearner()
-        self._sound_upload = SoundUpload()
+        self._sound_upload = SoundUploadHandler()
         self._senders = SendersApi(config.senders, config.idle_motion_seed, self.waker.wake)
         self._routes = (
             web.get("/viewer", self._viewers.serve),
             web.get("/microphone", self._microphones.serve),
-            web.post("/whip", self._whip_clients.serve_post),
-            web.delete("/whip/{name}", self._whip_clients.serve_delete),
+            web.post("/whip", self._whip_handler.serve_post),
+            web.delete("/whip/{name}", self._whip_handler.serve_delete),
             web.post("/learn-mouth", self._mouth_learner.serve),
             web.post("/sound", self._sound_upload.serve),
             web.get("/senders", self._senders.serve_get),
             web.post("/senders", self._senders.serve_post),
         )
-        self._application = http.make_application(
+        self._application = web_application.make_application(
             head_file=config.head,
             access=endpoint.access,
             frame_ancestors=" ".join(config.trusted_origins),
             routes=self._routes,
         )
-        self._server = WebServer(listening, endpoint.tls, share)
+        self._server = WebServer(listener, endpoint.tls, share)
         self._tasks: set[asyncio.Task[None]] = set()
         self._closing: asyncio.Task[None] | None = None
         self._resting_face = RestingFace(config.idle_motion_seed)
         self._rest_due_s = 0.0
-        self._report_s = -math.inf
-        self._incomplete_since_s = math.inf  # time of the first report that lacks a service
-        self._request_s = 0.0
+        self._last_report_s = -math.inf
+        self._missing_since_s = math.inf  # time of the first report that lacks a service
+        self._last_request_s = 0.0
 
     # --- the loop --------------------------------------------------------------------------------
 
@@ -137,7 +137,7 @@ class GatewayService(SessionService):
         self._loop.add_reader(self.waker.descriptor, self._on_input)
 
     def wait(self, timeout_s: float) -> list[Socket]:
-        """Run HTTP until messages arrive or the time has passed."""
+        """Run the HTTP loop until messages arrive or the time has passed."""
         # The descriptors are edge-triggered: they do not signal messages beyond a full batch.
         timer = self._loop.call_later(0.0 if super().wait(0) else timeout_s, self._loop.stop)
         self._is_waiting = True
@@ -159,26 +159,26 @@ class GatewayService(SessionService):
         super().unregister(socket)
 
     def on_drain(self) -> bool:
-        """Close every browser's connection; the last frames of their microphones still arrive."""
+        """Close all browser connections. The last frames of their microphones still arrive."""
         if self._closing is None:
             self._closing = self._create_task(self._web_sockets.close_all())
-            self._create_task(self._whip_clients.close_all())
+            self._create_task(self._whip_handler.close_all())
             self._mouth_learner.close()
             self._sound_upload.close()
             self._sample.stop()
         is_uploading = self._mouth_learner.is_running or self._sound_upload.is_running
-        is_connected = self._web_sockets or self._whip_clients or self._sample.session
+        is_connected = self._web_sockets or self._whip_handler or self._sample.session
         return self._closing.done() and not is_uploading and not is_connected
 
     def on_shutdown(self) -> None:
         """Stop HTTP and the senders."""
         self._senders.close()
         self._loop.run_until_complete(self._server.stop())
-        self._loop.run_until_complete(self._audio_sessions.close())
+        self._loop.run_until_complete(self._audio_client.close())
         self._runner.close()
 
     def send_to_control(self, message: Message) -> None:
-        """Send a message to control, then read its messages: sending may reset the descriptor."""
+        """Send to control, then read its messages, because sending may reset the descriptor."""
         super().send_to_control(message)
         self._on_input()
 
@@ -201,7 +201,7 @@ class GatewayService(SessionService):
             session = self._sessions[start.session] = self._make_session(start)
         session.follower.session_start = start
         self._viewers.add_session(start.session, start.epoch, start.face.lip_model or "")
-        is_needed = start.session in self._needed_sessions() or self._audio_sessions.num_opening
+        is_needed = start.session in self._needed_sessions() or self._audio_client.num_opening
         if session.follower.is_following or is_needed:
             session.follower.follow()
         return not session.follower.is_following
@@ -210,7 +210,7 @@ class GatewayService(SessionService):
         """Return the sessions that are shown or sent to other programs."""
         needed = {*self._viewers.shown_sessions}
         if self._senders.is_sending:
-            needed.add(self._viewers.newest)
+            needed.add(self._viewers.newest_session)
         return needed
 
     def stop_session(self, session: str) -> None:
@@ -219,9 +219,9 @@ class GatewayService(SessionService):
         if stopped is not None:
             stopped.follower.close()
         self._viewers.remove_session(session)
-        self._audio_sessions.on_closed(session)
+        self._audio_client.on_closed(session)
         self._create_task(self._microphones.close_session(session))
-        self._create_task(self._whip_clients.close_session(session))
+        self._create_task(self._whip_handler.close_session(session))
 
     def control_handlers(self) -> dict[type[Message], Handler]:
         """Return the handlers of control's messages."""
@@ -243,7 +243,7 @@ class GatewayService(SessionService):
             self._viewers.set_lip_model(message.session, message.face.lip_model)
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Name the subscribed sessions, so that control can report which have ended."""
+        """Return the subscribed sessions, so that control can report ended ones."""
         return dict.fromkeys(self._sessions, SessionInput())
 
     def on_tick(self, now_s: float) -> float:
@@ -254,29 +254,29 @@ class GatewayService(SessionService):
             for follower in followers:
                 if follower.session in needed and not follower.is_following:
                     follower.follow()
-        rest_due_s = max(self._rest_due_s, self._viewers.rest_from_s)
+        rest_due_s = max(self._rest_due_s, self._viewers.rest_due_s)
         if now_s >= rest_due_s:
             self._rest_due_s = rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
-            self._viewers.show_rest(self._resting_face, now_s)
-        is_answered = self._report_s >= self._request_s
+            self._viewers.show_resting_face(self._resting_face, now_s)
+        is_answered = self._last_report_s >= self._last_request_s
         interval_s = STATUS_INTERVAL_S if self._viewers.has_viewers else STATUS_TIMEOUT_S
-        due_s = self._request_s + (interval_s if is_answered else STATUS_TIMEOUT_S)
+        due_s = self._last_request_s + (interval_s if is_answered else STATUS_TIMEOUT_S)
         if now_s >= due_s:
-            self._request_s, due_s = now_s, now_s + STATUS_TIMEOUT_S
+            self._last_request_s, due_s = now_s, now_s + STATUS_TIMEOUT_S
             self.send_to_control(StatusRequest(request=secrets.token_hex(8)))
-        if now_s - self._report_s > CONTROL_MISSING_S:
+        if now_s - self._last_report_s > CONTROL_MISSING_S:
             self._viewers.set_missing(("control",))
         return min(due_s, rest_due_s)
 
     def _on_status(self, report: StatusReport, _sender: Peer) -> None:
         """Announce missing services to the viewers."""
-        self._report_s = time.monotonic()
+        self._last_report_s = time.monotonic()
         running = {state.service for state in report.services if state.state == "ready"}
         required = ("recognizer", "synthesizer")
         missing = tuple(service for service in required if service not in running)
-        since_s = min(self._incomplete_since_s, self._report_s) if missing else math.inf
-        self._incomplete_since_s = since_s
-        if not missing or self._report_s > since_s + MISSING_S:
+        since_s = min(self._missing_since_s, self._last_report_s) if missing else math.inf
+        self._missing_since_s = since_s
+        if not missing or self._last_report_s > since_s + MISSING_S:
             self._viewers.set_missing(missing)
 
     def _set_face(self, session: str, face: FaceSettings) -> None:
@@ -319,16 +319,18 @@ class GatewayService(SessionService):
     def _on_frame(self, frame: FapFrame) -> None:
         now_s = time.monotonic()
         self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values, now_s)
-        if self._senders.is_sending and frame.session == self._viewers.newest:
+        if self._senders.is_sending and frame.session == self._viewers.newest_session:
             self._senders.send_frame(frame.media_time, frame.values)
 
     def _on_sound(self, sound: Sound) -> None:
-        message = wire.binary(wire.SOUND_TYPE, sound.epoch, sound.media_time, sound.pcm)
+        message = browser_messages.binary(
+            browser_messages.SOUND_TYPE, sound.epoch, sound.media_time, sound.pcm
+        )
         self._viewers.forward(sound.session, MessageKind.SOUND, message)
 
     def _on_phone(self, phone: Phone) -> None:
         syllables = self._sessions[phone.session].syllables
-        message = wire.text(
+        message = browser_messages.text(
             "phone",
             index=phone.index,
             symbol=phone.symbol,
@@ -340,7 +342,7 @@ class GatewayService(SessionService):
         )
         self._viewers.forward(phone.session, MessageKind.TEXT, message)
         for syllable in syllables.update(phone_of(phone)):
-            message = wire.text(
+            message = browser_messages.text(
                 "syllable",
                 index=syllable.index,
                 symbol=syllable.text,
@@ -351,13 +353,15 @@ class GatewayService(SessionService):
             self._viewers.forward(phone.session, MessageKind.TEXT, message)
 
     def _on_speech(self, speech: Speech) -> None:
-        message = wire.text("speech", active=speech.active, media_time=speech.media_time)
+        message = browser_messages.text(
+            "speech", active=speech.active, media_time=speech.media_time
+        )
         self._viewers.forward(speech.session, MessageKind.TEXT, message)
 
     def _on_acoustic(self, acoustic: Acoustic) -> None:
         self._viewers.set_acoustic(acoustic.session, acoustic.model)
 
     def _on_end(self, end: EndOfFaps) -> None:
-        self._audio_sessions.on_last_frame(end.session)
-        message = wire.text("end", media_time=end.media_time)
+        self._audio_client.on_last_frame(end.session)
+        message = browser_messages.text("end", media_time=end.media_time)
         self._viewers.forward(end.session, MessageKind.TEXT, message)

@@ -1,4 +1,4 @@
-"""Messages with a frame's blendshape weights, in the set and format that a viewer asked for."""
+"""Encodes a frame's blendshape weights, in the shape set and format that a viewer requested."""
 
 import json
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from kouxing.services.gateway import wire
+from kouxing.services.gateway import browser_messages
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS
@@ -16,7 +16,7 @@ from kouxing.shared.face.shapes import SHAPE_SETS
 FORMATS = ("binary", "json", "msgpack")
 MAX_AVATAR_SHAPES = 1024
 _MeshShapes = list[Annotated[str, msgspec.Meta(max_length=128)]]  # names of the shapes of one mesh
-_BINARY_TYPES = {"weights": wire.SHAPES_TYPE, "rest": wire.REST_SHAPES_TYPE}
+_BINARY_TYPES = {"weights": browser_messages.SHAPES_TYPE, "rest": browser_messages.REST_SHAPES_TYPE}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +28,11 @@ class ShapeEncoder:
     targets: tuple[tuple[int, int], ...] = ()  # an avatar's meshes and the shapes within them
     indices: tuple[int, ...] = ()  # of their weights in the set
 
-    def announcement(self) -> str:
+    def header_message(self) -> str:
         """Return the message with the names or the targets, in the order of the weights."""
         if self.targets:
-            return wire.text("avatar", set=self.shape_set, targets=self.targets)
-        return wire.text("shapes", set=self.shape_set, names=SHAPE_SETS[self.shape_set].names)
+            return browser_messages.text("avatar", set=self.shape_set, targets=self.targets)
+        return browser_messages.text("shapes", set=self.shape_set, names=SHAPE_SETS[self.shape_set].names)
 
     def encode(self, kind: str, epoch: int, media_time: int, faps: bytes) -> str | bytes:
         """Return the message for a frame: 68 little-endian float32, FAP units.
@@ -45,7 +45,7 @@ class ShapeEncoder:
             weights = weights[[*self.indices]]
         if self.message_format == "binary":
             payload = weights.astype("<f4").tobytes()
-            return wire.binary(_BINARY_TYPES[kind], epoch, media_time, payload)
+            return browser_messages.binary(_BINARY_TYPES[kind], epoch, media_time, payload)
         rounded = [round(float(weight), 4) for weight in weights]
         fields = {
             "type": kind,

@@ -1,4 +1,4 @@
-"""The process that decodes an uploaded sound file: PATH to a 16-bit WAV on standard output."""
+"""Process that decodes an uploaded sound file to a 16-bit WAV file on standard output."""
 
 import resource
 import sys
@@ -16,7 +16,7 @@ MAX_MEMORY_BYTES = 4 << 30
 
 
 def decode(path: Path) -> None:
-    """Write the sound, mono, and print the warnings of a file to standard error.
+    """Write a file's sound in mono, and its warnings to standard error.
 
     Raises ``UserError`` if the file cannot be read or is too long.
     """

@@ -1,4 +1,4 @@
-"""Sound files for the page's *File* button, decoded as the commands decode them.
+"""Decodes sound files for the page's *File* button, like the commands.
 
 The browser sends a file and receives 16-bit WAV, mono.
 """
@@ -13,8 +13,8 @@ from urllib.parse import quote
 from aiohttp import web
 
 from kouxing.services.gateway import sound_decoder
-from kouxing.services.gateway.http import discard_body
-from kouxing.services.gateway.uploads import UPLOAD_LIMIT_S, Uploads, upload_error
+from kouxing.services.gateway.upload_handler import UPLOAD_LIMIT_S, UploadHandler, upload_error
+from kouxing.services.gateway.web_application import discard_body
 from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.logs import LOG
 
@@ -26,8 +26,8 @@ _MAX_NAME = 80
 _PIECE_BYTES = 1 << 16
 
 
-class SoundUpload(Uploads):
-    """Answers a file with its sound."""
+class SoundUploadHandler(UploadHandler):
+    """Decodes an uploaded file and answers with its sound."""
 
     busy_text = "another file is being read; try again in a few seconds"
 
@@ -48,7 +48,8 @@ class SoundUpload(Uploads):
             return upload_error(
                 413, f"the file is larger than {MAX_BYTES >> 20} MiB; use a smaller one"
             )
-        # Python imports modules from the working folder, so that must not be the file's.
+        # Python imports modules from the working folder, which must therefore not be the file's
+        # folder.
         command = (sys.executable, "-m", sound_decoder.__name__, str(source))
         with target.open("wb") as output:
             status, _, messages = await self.run(request, command, DECODING_LIMIT_S, output=output)

@@ -1,16 +1,16 @@
-"""The bounded queue of messages for one viewer. It favors new frames over complete delivery."""
+"""Bounded queue of one viewer's messages, which prefers new frames to complete delivery."""
 
 import asyncio
 from collections import deque
 from enum import Enum
 
 MAX_QUEUED = 100  # messages; about a second of a talking session
-NUM_FRAMES_KEPT = 5
+NUM_FRAMES_KEPT = 5  # when old messages are dropped
 NUM_TEXTS_KEPT = 50
 
 
 class MessageKind(Enum):
-    """Kind of a queued message; it decides how many old messages are kept."""
+    """Kind of a queued message; determines how many old messages are kept."""
 
     TEXT = "text"
     FRAME = "frame"

@@ -1,4 +1,4 @@
-"""The gateway's HTTP server: it limits connections, closes idle ones, and answers errors."""
+"""The gateway's HTTP server: limits connections, closes idle ones, and answers errors."""
 
 import asyncio
 import errno
@@ -21,12 +21,12 @@ from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
 
 MAX_CONNECTIONS = 256
-IDLE_TIMEOUT_S = 10.0  # limit until the first or the next request arrives
-BODY_TIMEOUT_S = 70.0  # for the body on unlimited paths; an upload is answered before that
+IDLE_TIMEOUT_S = 10.0  # limit for the wait for the next request
+BODY_TIMEOUT_S = 70.0  # limit for the body on unlimited paths; uploads are answered earlier
 MAX_HEAD_BYTES = 64 * 1024  # limit for the first line and the headers of a request
 ANSWER_TIMEOUT_S = 120.0  # limit for sending a file; a head is 5 MB
 BACKLOG = 128
-KEEPALIVE_S = 20  # after this time without data, the system checks that the client exists
+KEEPALIVE_S = 20  # after this time without data, the system probes the client
 _KEEPALIVE_PROBES, _PROBE_S = 3, 5
 LOG_PERIOD_S = 60.0  # interval between log lines about errors at the same place
 _CHECK_S = 1.0
@@ -71,7 +71,7 @@ def bind_port(host: str, port: int) -> socket.socket:
 
 
 def _enable_keepalive(connection: socket.socket) -> None:
-    """Let the system close the connection of a client that has vanished, in 35 s."""
+    """Let the system close the connection of a vanished client after 35 s."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     options = (
         ("TCP_KEEPIDLE", KEEPALIVE_S),
@@ -84,7 +84,7 @@ def _enable_keepalive(connection: socket.socket) -> None:
 
 
 class _ErrorResponse(web.Response):
-    """An answer to a request that reached no application; it sends no application signals."""
+    """An answer to a request that did not reach the application; sends no application signals."""
 
     async def _prepare_headers(self) -> None:
         await super()._prepare_headers()
@@ -92,7 +92,7 @@ class _ErrorResponse(web.Response):
 
 
 class _Connection(web.RequestHandler):
-    """One connection. It answers errors that no handler has caught, without a traceback."""
+    """One connection. Answers errors that no handler has caught, without a traceback."""
 
     def __init__(self, server: web.Server, address: str, log_limit: RateLimit) -> None:
         super().__init__(server, loop=asyncio.get_running_loop(), **_OPTIONS)
@@ -120,7 +120,7 @@ class _Connection(web.RequestHandler):
     async def finish_response(
         self, request: web.BaseRequest, resp: web.StreamResponse, start_time: float | None
     ) -> tuple[web.StreamResponse, bool]:
-        """Send an answer. Read the next request only after the client has received it."""
+        """Send an answer. Read the next request only after the client has received the answer."""
         if self.transport is not None:
             self.transport.pause_reading()
         try:
@@ -190,18 +190,18 @@ async def _set_headers(_request: web.Request | None, response: web.StreamRespons
 class WebServer:
     """Accepts connections and serves them with an aiohttp application.
 
-    ``listening`` is from ``bind_port``. One address gets at most ``address_share`` of the
-    connections. If the server is full, a new connection replaces the one that has waited for the
-    longest time. Connections with a complete request for an unlimited path are never replaced.
+    ``listener`` is from ``bind_port``. One address gets at most ``address_share`` of the
+    connections. If the server is full, a new connection replaces the connection that has been idle
+    longest. Connections with a complete request for an unlimited path are never replaced.
     """
 
     def __init__(
         self,
-        listening: socket.socket,
+        listener: socket.socket,
         tls: ssl.SSLContext | None,
         address_share: float = ADDRESS_SHARE,
     ) -> None:
-        self._listening = listening
+        self._listener = listener
         self._tls = tls
         self._max_per_address = math.ceil(address_share * MAX_CONNECTIONS)
         self._connections: dict[_Connection, asyncio.Task[None]] = {}
@@ -235,13 +235,13 @@ class WebServer:
         await self._runner.setup()
         self._server = cast(web.Server, self._runner.server)
         self._monitor = asyncio.create_task(self._close_late_connections())
-        self._listening.setblocking(False)
+        self._listener.setblocking(False)
         self._start_accepting()
 
     async def stop(self) -> None:
         """Accept no more connections and close the open ones."""
-        asyncio.get_running_loop().remove_reader(self._listening)
-        self._listening.close()
+        asyncio.get_running_loop().remove_reader(self._listener)
+        self._listener.close()
         await self._runner.cleanup()
         tasks = [self._monitor, *self._connections.values()]
         for task in tasks:
@@ -249,18 +249,18 @@ class WebServer:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def _start_accepting(self) -> None:
-        if self._listening.fileno() >= 0:
-            asyncio.get_running_loop().add_reader(self._listening, self._accept)
+        if self._listener.fileno() >= 0:
+            asyncio.get_running_loop().add_reader(self._listener, self._accept)
 
     def _accept(self) -> None:
         loop = asyncio.get_running_loop()
         try:
-            accepted, (address, *_) = self._listening.accept()
+            accepted, (address, *_) = self._listener.accept()
         except (BlockingIOError, ConnectionAbortedError):
             return
         except OSError as error:
             LOG.error("cannot accept a connection: %s", error.strerror)
-            loop.remove_reader(self._listening)
+            loop.remove_reader(self._listener)
             loop.call_later(_RETRY_S, self._start_accepting)
             return
         if not self._make_room(address):
@@ -274,16 +274,16 @@ class WebServer:
 
     def _make_room(self, address: str) -> bool:
         """Close a connection if the server is full; return False if none may be closed."""
-        rivals = [other for other in self._connections if other.address == address]
-        if len(rivals) < self._max_per_address:
+        candidates = [other for other in self._connections if other.address == address]
+        if len(candidates) < self._max_per_address:
             if len(self._connections) < MAX_CONNECTIONS:
                 return True
-            rivals = [*self._connections]
-        rivals = [other for other in rivals if other.deadline_s < math.inf]
-        if rivals:
-            closed = min(rivals, key=lambda other: other.changed_s)
+            candidates = [*self._connections]
+        candidates = [other for other in candidates if other.deadline_s < math.inf]
+        if candidates:
+            closed = min(candidates, key=lambda other: other.changed_s)
             self._connections.pop(closed).cancel()
-        return bool(rivals)
+        return bool(candidates)
 
     async def _close_late_connections(self) -> None:
         num_before = 0

@@ -1,4 +1,4 @@
-"""One WebRTC connection: audio track in, data channels out. Needs aiortc (extra ``webrtc``)."""
+"""One WebRTC connection with an audio track and data channels. Needs aiortc (extra ``webrtc``)."""
 
 import asyncio
 import contextlib
@@ -20,8 +20,8 @@ from av import AudioFrame
 from kouxing.shared.errors import UserError
 
 CONNECT_LIMIT_S = 20.0  # limit from the answer to the first sound
-MAX_CONCEALED = 14_400  # lost samples that are replaced, so that speech continues
-MAX_GAP = 600 * 48_000  # samples; after a longer gap, timestamps start again
+MAX_CONCEALED_SAMPLES = 14_400  # lost samples that are concealed, so that speech continues
+MAX_GAP = 600 * 48_000  # samples; after a longer gap, timestamps restart
 _TIMESTAMP_RANGE = 2**32  # RTP timestamps wrap around at this value
 _OPUS = re.compile(r"^a=rtpmap:\d+ opus/48000/2\s*$", re.IGNORECASE | re.MULTILINE)
 
@@ -63,11 +63,11 @@ class WebRtcPeer:
             raise UserError("expected an offer with an audio track in Opus (opus/48000/2)")
         return self._connection.localDescription.sdp
 
-    async def sound(self) -> AsyncIterator[tuple[int, bytes, int]]:
+    async def receive_audio(self) -> AsyncIterator[tuple[int, bytes, int]]:
         """Yield received audio until the connection ends.
 
-        Up to ``MAX_CONCEALED`` lost samples are replaced: the audio before the gap is repeated and
-        fades out.
+        Up to ``MAX_CONCEALED_SAMPLES`` lost samples are concealed: the audio before the gap is
+        repeated and fades out.
 
         Yields
         ------
@@ -87,7 +87,7 @@ class WebRtcPeer:
             if lost > _TIMESTAMP_RANGE // 2:  # the packet is late
                 continue
             expected = frame.pts + frame.samples
-            if 0 < lost <= MAX_CONCEALED:
+            if 0 < lost <= MAX_CONCEALED_SAMPLES:
                 yield 0, self._fade_out(pcm, lost), lost
                 lost = 0
             pcm = bytes(frame.planes[0])[: frame.samples * self.num_channels * 2]

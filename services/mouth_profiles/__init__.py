@@ -1,1 +1,1 @@
-"""Mouth profiles: learn how one speaker's lips differ from the lip model's average speaker."""
+"""Mouth profiles: learns how one speaker's lips differ from the predicted average lips."""

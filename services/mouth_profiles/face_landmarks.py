@@ -1,4 +1,4 @@
-"""Computes the mouth's FAPs from the landmarks of a face, without the motion of the head.
+"""Computes the mouth's FAPs from face landmarks, without head motion.
 
 The landmarks come from MediaPipe's face mesh (Kartynnik et al. 2019, "Real-time facial surface
 geometry from monocular video on mobile GPUs"), in pixels: x to the right, y down, z away from the
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 # Points of MediaPipe's canonical face model (Apache-2.0) that its own alignment uses, without jaw
 # and cheeks: cm, right-handed, y up, z out of the face.
-_STEADY = {
+_STABLE_POINTS = {
     4: (0.000000, -0.463170, 7.586580),
     6: (0.000000, 2.473255, 5.788627),
     10: (0.000000, 8.261778, 4.481535),
@@ -63,7 +63,7 @@ _STEADY = {
 _UNDER_NOSE, _UPPER_LIP, _LOWER_LIP, _RIGHT_CORNER, _LEFT_CORNER = 2, 13, 14, 61, 291
 _X, _Y = range(2)
 # By FAP: landmark at its feature point, axis, and sign of the FAP's direction on that axis.
-_FAPS = {
+_FAP_LANDMARKS = {
     3: (152, _Y, -1), 4: (13, _Y, -1), 5: (14, _Y, 1), 6: (308, _X, 1), 7: (78, _X, -1),
     8: (311, _Y, -1), 9: (81, _Y, -1), 10: (402, _Y, 1), 11: (178, _Y, 1), 12: (308, _Y, 1),
     13: (78, _Y, 1), 51: (0, _Y, -1),
@@ -71,17 +71,19 @@ _FAPS = {
     57: (405, _Y, 1), 58: (181, _Y, 1), 59: (291, _Y, 1), 60: (61, _Y, 1),
 }  # fmt: skip
 
-LANDMARKS = tuple(sorted({*_STEADY, _UNDER_NOSE, *(point for point, _, _ in _FAPS.values())}))
+LANDMARKS = tuple(
+    sorted({*_STABLE_POINTS, _UNDER_NOSE, *(point for point, _, _ in _FAP_LANDMARKS.values())})
+)
 """Indices of the needed landmarks among MediaPipe's 468, ascending."""
 
-_QUIET_DB = 30.0  # level of silent frames below loud frames
+_QUIET_DB = 30.0  # silent frames are this much below loud frames
 _LOUD_PERCENTILE = 95.0
 _CLOSED_FRACTION = 0.35  # fraction of the frames whose lips count as closed
-_CLOSED_FRACTION_SPEAKING = 0.08  # the same fraction, without silent frames
+_CLOSED_FRACTION_SPEAKING = 0.08  # the same in recordings without silence
 _MIN_NEUTRAL = 5  # frames
 
 
-def expand_mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array:
+def compute_mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array:
     """Compute the FAPs of a mouth relative to its own neutral face, FAP units, (n, 28).
 
     ``landmarks`` are ``LANDMARKS`` of each frame, pixels, (n, 43, 3). ``level_db`` are the audio
@@ -89,29 +91,31 @@ def expand_mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array
     upright face.
     """
     points = _align_head(landmarks.astype(np.float64))
-    height = points[:, _at(_UPPER_LIP), _Y] - points[:, _at(_LOWER_LIP), _Y]
+    height = points[:, _landmark_index(_UPPER_LIP), _Y] - points[:, _landmark_index(_LOWER_LIP), _Y]
     neutral = np.median(points[_is_neutral(height, level_db)], axis=0)
-    mouth_y = neutral[[_at(_UPPER_LIP), _at(_LOWER_LIP)], _Y].mean()
-    nose_to_mouth = neutral[_at(_UNDER_NOSE), _Y] - mouth_y
-    width = neutral[_at(_LEFT_CORNER), _X] - neutral[_at(_RIGHT_CORNER), _X]
+    mouth_y = neutral[[_landmark_index(_UPPER_LIP), _landmark_index(_LOWER_LIP)], _Y].mean()
+    nose_to_mouth = neutral[_landmark_index(_UNDER_NOSE), _Y] - mouth_y
+    width = neutral[_landmark_index(_LEFT_CORNER), _X] - neutral[_landmark_index(_RIGHT_CORNER), _X]
     if not (nose_to_mouth > 0 and width > 0):
         raise UserError("the landmarks do not form an upright face; film the face from the front")
     faps = np.full((len(points), len(MOUTH_FAPS)), np.nan)
-    for fap, (point, axis, sign) in _FAPS.items():
-        displacement = points[:, _at(point), axis] - neutral[_at(point), axis]
+    for fap, (point, axis, sign) in _FAP_LANDMARKS.items():
+        displacement = (
+            points[:, _landmark_index(point), axis] - neutral[_landmark_index(point), axis]
+        )
         unit = width if axis == _X else nose_to_mouth
         faps[:, MOUTH_FAPS.index(fap)] = sign * displacement * 1024 / unit
     return faps
 
 
-def _at(point: int) -> int:
+def _landmark_index(point: int) -> int:
     return LANDMARKS.index(point)
 
 
 def _align_head(landmarks: Array) -> Array:
     points = landmarks * (1, -1, -1)  # y up, z out of the face
-    steady = points[:, [_at(point) for point in _STEADY]]
-    canonical = np.array(list(_STEADY.values()))
+    steady = points[:, [_landmark_index(point) for point in _STABLE_POINTS]]
+    canonical = np.array(list(_STABLE_POINTS.values()))
     center, goal = steady.mean(axis=1, keepdims=True), canonical.mean(axis=0)
     steady = steady - center
     size = (steady**2).sum(axis=(1, 2))

@@ -1,4 +1,4 @@
-"""Landmark files: tracked points of a speaking face with the audio, but without images.
+"""Parses landmark files: tracked points of a speaking face and the audio, without images.
 
     4 bytes   length of the header, little endian
     header    JSON: {"times": n, "points": 43, "sample_rate_hz": 48000}
@@ -14,9 +14,9 @@ every size.
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, expand_mouth_faps
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
-from kouxing.services.mouth_profiles.lip_tracks import level_track, lip_tracks
+from kouxing.services.mouth_profiles.lip_tracks import measure_levels, select_lip_faps
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
@@ -32,14 +32,14 @@ _MAX_PIXEL = 1e5
 
 
 def parse_landmark_file(content: bytes) -> FilmedSpeech:
-    """Parse a landmark file; UserError if it is not one, or does not show a face."""
+    """Parse a landmark file; ``UserError`` if it is invalid or does not show a face."""
     try:
         time_s, landmarks, samples = _parse(content)
     except ValueError as error:
         raise UserError(str(error)) from error
-    levels = np.array(level_track(samples))
-    faps = expand_mouth_faps(landmarks, np.interp(time_s, levels[:, 0], levels[:, 1]))
-    return FilmedSpeech(samples=samples, frame_s=time_s, lip_track=lip_tracks(faps))
+    levels = np.array(measure_levels(samples))
+    faps = compute_mouth_faps(landmarks, np.interp(time_s, levels[:, 0], levels[:, 1]))
+    return FilmedSpeech(samples=samples, frame_s=time_s, lip_track=select_lip_faps(faps))
 
 
 def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:

@@ -17,8 +17,8 @@ v        mean variance of the hidden values                           1
     r = (P' P + k v I)^-1 P' (t - s y - b)        P and the errors about their means
 
 Cross-validation chooses k, so little speech gives a strong ridge. An infinite k leaves only the
-affine map. Some cameras deliver their images late. Each recording of sufficient length is therefore
-shifted to where the tracked lips follow the prediction best.
+affine map. Some cameras deliver their images late. Each recording of sufficient length is
+therefore shifted to the best correlation of tracked and predicted lips.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.mouth_profiles.lip_inputs import POSITION_S, record_lip_inputs
 from kouxing.services.mouth_profiles.lip_tracks import (
     MEASURES,
     correlate_curves,
     interpolate_track,
     lip_measures,
 )
-from kouxing.services.mouth_profiles.positions import POSITION_S, record_positions
 from kouxing.services.recognizer.lip_frames import choose_delay
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
@@ -53,9 +53,9 @@ _NUM_FAPS = len(LIP_FAPS)
 _BLOCK = 250  # adjacent positions that stay in one fold
 _MAX_FOLDS = 5
 _SCALE_SHRINKAGE = 250.0  # weight of a scale of 1, positions
-_HELD_OUT = 0.25  # fraction, at the end
+_HELD_OUT = 0.25  # fraction at the end of the speech
 _LAGS_S = np.arange(-20, 21) / 100  # possible lags of a camera
-_MIN_LAG_CORRELATION = 0.3  # below this a camera's lag is not estimated
+_MIN_LAG_CORRELATION = 0.3  # below this correlation, the lag of a camera is not estimated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,15 +98,15 @@ class ProfileGain:
 
     speech_s: float
     delay_s: float
-    before: Array  # (3,) correlation of each of ``MEASURES``; NaN for one that does not move
+    before: Array  # (3,) correlation for each of ``MEASURES``; NaN without movement
     after: Array  # (3,)
     time_s: Array  # (n,)
     curves: Array  # (3, 3, n): measure; tracked, before, after
 
 
 def observe(lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
-    """Run the lip model over a recording; the result is empty if there is no speech."""
-    positions = record_positions(filmed.samples)
+    """Run the lip predictor over a recording. The result is empty if there is no speech."""
+    positions = record_lip_inputs(filmed.samples)
     stream = lip_predictor.create_stream(lip_predictor.delays_s)
     predicted = np.zeros(
         (len(positions.known_s), len(lip_predictor.delays_s), _NUM_FAPS), np.float32
@@ -165,7 +165,10 @@ def fit_profile(observations: Observations) -> MouthProfile:
 
 
 def measure_gain(lip_predictor: LipPredictor, observations: Observations) -> ProfileGain:
-    """Fit a profile to all but the last quarter, and measure it there; UserError as there."""
+    """Fit a profile to the first three quarters, and measure it on the last quarter.
+
+    Raises like ``fit_profile``.
+    """
     first_held_out = round((1 - _HELD_OUT) * len(observations))
     profile = fit_profile(observations[:first_held_out])
     held_out = observations[first_held_out:]
@@ -243,31 +246,31 @@ def _error(profile: MouthProfile, observations: Observations) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearnedProfile:
-    """A mouth profile and what it improves."""
+    """A mouth profile and its measured gain."""
 
     content: bytes
-    speech_s: float  # speech that it was learned from
+    speech_s: float  # duration of the speech for learning
     gain: ProfileGain  # gain of a profile that was learned from the first three quarters
 
     def figures(self) -> dict[str, object]:
         """Return the figures that ``kouxing adapt --json`` writes, see ``docs/my_mouth.md``."""
         gain = self.gain
         curves = {
-            measure: dict(zip(("tracked", "before", "after"), map(_plain, curve), strict=True))
+            measure: dict(zip(("tracked", "before", "after"), map(_to_json, curve), strict=True))
             for measure, curve in zip(MEASURES, gain.curves, strict=True)
         }
         return {
             "speech_s": self.speech_s,
             "held_out_s": gain.speech_s,
             "delay_ms": 1e3 * gain.delay_s,
-            "before": dict(zip(MEASURES, _plain(gain.before), strict=True)),
-            "after": dict(zip(MEASURES, _plain(gain.after), strict=True)),
-            "curves": {"time_s": _plain(gain.time_s), **curves},
+            "before": dict(zip(MEASURES, _to_json(gain.before), strict=True)),
+            "after": dict(zip(MEASURES, _to_json(gain.after), strict=True)),
+            "curves": {"time_s": _to_json(gain.time_s), **curves},
         }
 
 
 def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
-    """Learn a mouth profile; UserError if there is too little speech with lips in view."""
+    """Learn a mouth profile; ``UserError`` if too little speech shows the lips."""
     lip_predictor = load_lip_predictor()
     observations = Observations.join([observe(lip_predictor, filmed) for filmed in recordings])
     return LearnedProfile(
@@ -277,6 +280,6 @@ def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     )
 
 
-def _plain(values: NDArray[np.float64]) -> list[float | None]:
+def _to_json(values: NDArray[np.float64]) -> list[float | None]:
     """Convert numbers to JSON values; NaN becomes None."""
     return [round(float(value), 4) if np.isfinite(value) else None for value in values]

@@ -1,4 +1,4 @@
-"""Tracked lips in the form that the lip model uses."""
+"""Converts and compares tracked lips, in the form that the lip predictor uses."""
 
 from collections.abc import Sequence
 
@@ -16,14 +16,14 @@ MEASURES = ("opening", "width", "jaw")
 LEVEL_STEP_S = 0.02
 
 _MAX_GAP_S = 0.1  # longer gaps between tracked frames are not interpolated
-_MAX_SLOW_GAP_S = 0.3  # the same at few images per second
+_MAX_SLOW_GAP_S = 0.3  # the same for cameras with few images per second
 _JITTER = 1.3  # multiple of the interval between images
 _SIDES = [[MOUTH_FAPS.index(fap), MOUTH_FAPS.index(OTHER_SIDE.get(fap, fap))] for fap in LIP_FAPS]
 _JAW, _UPPER_LIP, _LOWER_LIP, _CORNER = (LIP_FAPS.index(fap) for fap in (3, 4, 5, 6))
 
 
-def lip_tracks(faps: Array) -> Array:
-    """Select the lips' FAPs from the mouth's, (n, 28) to (n, 15); left and right are averaged."""
+def select_lip_faps(faps: Array) -> Array:
+    """Select lip FAPs from mouth FAPs, (n, 28) to (n, 15). Left and right are averaged."""
     return np.stack([faps[:, pair].mean(axis=1) for pair in _SIDES], axis=1)
 
 
@@ -69,7 +69,7 @@ def correlate_curves(pairs: Sequence[tuple[Array, Array]]) -> Array:
     return np.array(figures)
 
 
-def level_track(samples: NDArray[np.float32]) -> list[tuple[float, float]]:
+def measure_levels(samples: NDArray[np.float32]) -> list[tuple[float, float]]:
     """Measure the level as the live system does: pairs of time (s) and level (dB full scale)."""
     step = round(LEVEL_STEP_S * MEDIA_RATE_HZ)
     ends = range(step, len(samples) + 1, step)

@@ -1,8 +1,8 @@
-"""Forwards the packets of a camera tracker with the mouth from the sound.
+"""Forwards the packets of a camera tracker, with the mouth of the session.
 
 A tracker such as VSeeFace, or Live Link Face on an iPhone, sends its packets to a port of this
-machine instead of the program with the avatar. Each packet is forwarded on arrival. Its mouth is
-replaced with the mouth of the session's newest frame. Everything else stays. While the tracker
+machine instead of the program with the avatar. Each packet is forwarded on arrival. The mouth of
+the session's newest frame replaces its mouth; all other values stay unchanged. While the tracker
 sends, the session's own frames are not sent. Malformed packets are dropped.
 """
 
@@ -11,12 +11,12 @@ import contextlib
 import math
 from collections.abc import Callable
 
-_LIVE_S = 1.0  # after this time without a packet, the tracker counts as stopped
+_LIVE_S = 1.0  # after this time without a packet, the tracker is considered stopped
 _MAX_RATE_HZ = 600  # packets above this rate are dropped unread
 
 
 class CameraInput(asyncio.DatagramProtocol):
-    """Passes a tracker's packets to ``forward``.
+    """Receives a tracker's packets and passes them to ``forward``.
 
     ``forward`` returns whether the packet contained a mouth, and raises ``ValueError`` if the
     packet is malformed.

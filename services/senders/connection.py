@@ -1,4 +1,4 @@
-"""Connections to targets: the common interface, and datagrams."""
+"""Connections to targets: the interface, and the implementation for datagrams."""
 
 import asyncio
 import errno
@@ -13,14 +13,14 @@ from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
 
 RETRY_S = 1.0
-_REFUSED_S = 1.0  # without a refusal for this time, a program is listening
+_REFUSED_S = 1.0  # without an error for this time, a program is listening
 
 Options = Mapping[str, tuple[str, ...]]
 COMMON_OPTIONS: Options = {"delay": ("0",), "only": ("face", "mouth")}
 
 
-class Connection(ABC):
-    """A connection to a target; it reconnects by itself.
+class TargetConnection(ABC):
+    """A connection to a target, which reconnects automatically.
 
     Each protocol is one subclass, listed in ``protocols.PROTOCOLS``.
     """
@@ -34,21 +34,21 @@ class Connection(ABC):
 
     @abstractmethod
     async def run(self) -> None:
-        """Keep the connection open until cancelled, or until only the user can help."""
+        """Keep the connection open until cancelled, or until the user must act."""
 
     @abstractmethod
     def send(self, frame: FaceFrame) -> bool:
         """Send a frame immediately; return whether it was sent."""
 
 
-class DatagramConnection(Connection):
-    """UDP. Receipt is not confirmed, but a local port without a listener is reported."""
+class DatagramConnection(TargetConnection):
+    """A UDP connection. Receipt is not confirmed, but a closed local port is reported."""
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)
         self._socket: socket.socket | None = None
         self._refused_s = -_REFUSED_S
-        self._newest: FaceFrame | None = None
+        self._newest_frame: FaceFrame | None = None
         self._camera: tuple[asyncio.DatagramTransport, CameraInput] | None = None
 
     @abstractmethod
@@ -88,21 +88,21 @@ class DatagramConnection(Connection):
             self.problem = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
 
     def _forward(self, packet: bytes) -> bool:
-        if self._newest is None:
+        if self._newest_frame is None:
             return False
-        packets, has_mouth = self.with_mouth(packet, self._newest)
+        packets, has_mouth = self.with_mouth(packet, self._newest_frame)
         self._send(packets)
         return has_mouth
 
     def send(self, frame: FaceFrame) -> bool:
         """Send the datagrams of a frame, unless a tracker's packets contain its mouth."""
-        self._newest = frame
+        self._newest_frame = frame
         if self._camera is not None and self._camera[1].is_live:
             return True
         return self._send(self.encode(frame))
 
     def _send(self, datagrams: Iterable[bytes]) -> bool:
-        """Send datagrams; drop those that the system does not accept."""
+        """Send datagrams; drop datagrams that the system does not accept."""
         if self._socket is None:
             return False
         now_s = time.monotonic()

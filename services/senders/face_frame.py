@@ -1,4 +1,4 @@
-"""One frame of a face in the terms of other programs."""
+"""Converts a frame of the face to the parameters of other programs."""
 
 from functools import cached_property
 
@@ -18,7 +18,7 @@ _OPEN_LIPS = 880.0  # FAP units between the lips in a wide "a"
 _NO_MOUTH = ("brow", "eye", "blink", "look", "cheekSquint", "nose")  # prefixes of shape names
 
 
-def mouth_names(shapes: str) -> list[str]:
+def mouth_shape_names(shapes: str) -> list[str]:
     """Return the names of the mouth's shapes in one of ``SHAPE_SETS``."""
     return [name for name in SHAPE_SETS[shapes].names if not name.startswith(_NO_MOUTH)]
 
@@ -27,7 +27,7 @@ Angles = tuple[float, float, float]
 
 
 class FaceFrame:
-    """A frame, FAPs (68,), for all targets; each conversion is computed once.
+    """A frame, FAPs (68,). All targets share its conversions, which are computed once.
 
     ``time_s`` is media time. At rest it continues from the last frame, or from 0.
     """
@@ -45,7 +45,7 @@ class FaceFrame:
             self._weights[shapes] = dict(zip(shape_set.names, values, strict=True))
         weights = self._weights[shapes]
         if is_mouth_only:
-            return {name: weights[name] for name in mouth_names(shapes)}
+            return {name: weights[name] for name in mouth_shape_names(shapes)}
         return weights
 
     @property

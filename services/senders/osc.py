@@ -1,4 +1,4 @@
-"""Open Sound Control 1.0: the face as one message per value.
+"""Encodes the face for Open Sound Control 1.0, with one message per value.
 
 ======================  =====  ====================================================================
 address                 types  value
@@ -40,14 +40,14 @@ class OscConnection(DatagramConnection):
         """Yield the datagrams of a frame."""
         weights = frame.weights(self.target.shapes, is_mouth_only=self.target.is_mouth_only)
         prefix = self.target.options["prefix"] or "/kouxing/"
-        messages = [message(f"{prefix}time", frame.time_s)]
+        messages = [encode_message(f"{prefix}time", frame.time_s)]
         if not self.target.is_mouth_only:
-            messages.append(message(f"{prefix}head", *map(math.degrees, frame.head)))
-        messages += [message(prefix + name, value) for name, value in weights.items()]
-        return bundles(messages)
+            messages.append(encode_message(f"{prefix}head", *map(math.degrees, frame.head)))
+        messages += [encode_message(prefix + name, value) for name, value in weights.items()]
+        return bundle_messages(messages)
 
 
-def message(address: str, *arguments: str | int | float) -> bytes:
+def encode_message(address: str, *arguments: str | int | float) -> bytes:
     """Return a message; text arguments come before numbers (int32 or float32)."""
     numbers = [argument for argument in arguments if not isinstance(argument, str)]
     texts = arguments[: len(arguments) - len(numbers)]
@@ -57,13 +57,13 @@ def message(address: str, *arguments: str | int | float) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _message_start(address: str, texts: tuple[str, ...], kinds: str) -> bytes:
-    """Return a message without its numbers; this part is the same in each frame."""
+    """Return a message without its numbers. This part is the same in each frame."""
     numbers = [0 if kind == "i" else 0.0 for kind in kinds]
     whole = build_msg(address, [*texts, *numbers]).dgram
     return whole[: len(whole) - 4 * len(numbers)]
 
 
-def split(packet: bytes, depth: int = 0) -> Iterator[bytes]:
+def split_packet(packet: bytes, depth: int = 0) -> Iterator[bytes]:
     """Yield the messages of a packet, including those in nested bundles, as bytes.
 
     Raises ``ValueError`` if the packet is malformed.
@@ -80,16 +80,16 @@ def split(packet: bytes, depth: int = 0) -> Iterator[bytes]:
         end = start + 4 + int.from_bytes(packet[start : start + 4], "big")
         if not start + 4 < end <= len(packet):
             raise ValueError("an element is longer than its bundle")
-        yield from split(packet[start + 4 : end], depth + 1)
+        yield from split_packet(packet[start + 4 : end], depth + 1)
         start = end
 
 
-def address_of(content: bytes) -> str:
+def parse_address(content: bytes) -> str:
     """Return the address of a message; ``ValueError`` if it is malformed."""
     return _text_at(content, 0)[0]
 
 
-def first_text(content: bytes) -> str:
+def parse_first_text(content: bytes) -> str:
     """Return the first argument of a message; ``ValueError`` if it is not a string."""
     _, start = _text_at(content, 0)
     kinds, start = _text_at(content, start)
@@ -99,12 +99,12 @@ def first_text(content: bytes) -> str:
 
 
 def _text_at(content: bytes, start: int) -> tuple[str, int]:
-    """Return a string, which is padded to a multiple of 4 bytes, and the offset after it."""
+    """Return a string and the offset after it. Strings are padded to a multiple of 4 bytes."""
     end = content.index(b"\0", start)
     return content[start:end].decode(), end // 4 * 4 + 4
 
 
-def bundles(messages: Iterable[bytes]) -> Iterator[bytes]:
+def bundle_messages(messages: Iterable[bytes]) -> Iterator[bytes]:
     """Yield bundles with all messages in order, each as large as a datagram allows."""
     bundle = _HEADER
     for content in messages:

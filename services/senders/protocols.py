@@ -1,8 +1,8 @@
-"""The table of sender protocols, and the parser of target addresses."""
+"""Lists the sender protocols, and parses target addresses."""
 
 from urllib.parse import parse_qsl, urlsplit
 
-from kouxing.services.senders.connection import Connection
+from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import OscConnection
 from kouxing.services.senders.target import Target, parse_camera, parse_delay_s
@@ -12,17 +12,17 @@ from kouxing.shared.errors import UserError
 
 LOOPBACK = "127.0.0.1"
 MAX_TEXT = 64  # characters of an option without fixed values
-PROTOCOLS: dict[str, type[Connection]] = {
+PROTOCOLS: dict[str, type[TargetConnection]] = {
     "vmc": VmcConnection,
     "livelink": LiveLinkConnection,
     "osc": OscConnection,
     "vts": VTubeStudioConnection,
 }
 _FORMS = [f"{name}://HOST:{connection.default_port}" for name, connection in PROTOCOLS.items()]
-FORMS = f"{', '.join(_FORMS[:-1])} or {_FORMS[-1]}"
+ADDRESS_FORMS = f"{', '.join(_FORMS[:-1])} or {_FORMS[-1]}"
 
 
-def connect(target: Target) -> Connection:
+def make_connection(target: Target) -> TargetConnection:
     """Return a connection to a target; ``run`` opens it."""
     return PROTOCOLS[target.protocol](target)
 
@@ -36,11 +36,11 @@ def parse_target(url: str) -> Target:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
-        raise UserError(f"{url!r} is not a valid address; write {FORMS}") from None
+        raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}") from None
     protocol = PROTOCOLS.get(parts.scheme)
     is_bare = parts.path in ("", "/") and not parts.fragment and parts.username is None
     if protocol is None or not is_bare or not url.isprintable() or " " in url:
-        raise UserError(f"{url!r} is not a valid address; write {FORMS}")
+        raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}")
     options = _parse_options(url, parts.query, protocol)
     try:
         delay_s = parse_delay_s(options["delay"])
@@ -58,7 +58,7 @@ def parse_target(url: str) -> Target:
     )
 
 
-def _parse_options(url: str, query: str, protocol: type[Connection]) -> dict[str, str]:
+def _parse_options(url: str, query: str, protocol: type[TargetConnection]) -> dict[str, str]:
     options = {name: next(iter(values), "") for name, values in protocol.options.items()}
     for name, value in parse_qsl(query, keep_blank_values=True):
         if name not in options:

@@ -1,4 +1,4 @@
-"""Addresses of programs that receive the face: ``PROTOCOL://HOST:PORT?OPTION=VALUE``."""
+"""Targets, programs that receive the face: ``PROTOCOL://HOST:PORT?OPTION=VALUE``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ MAX_DELAY_MS = 10_000.0
 class Target:
     """A program that receives the face."""
 
-    url: str  # as given; identifies the target
+    url: str  # as entered; identifies the target
     protocol: str  # one of ``protocols.PROTOCOLS``
     host: str
     port: int
@@ -43,7 +43,7 @@ class Target:
 
     @property
     def is_local(self) -> bool:
-        """Whether the target, and the tracker if any, are certainly on this machine."""
+        """Whether the target, and the tracker if any, are on this machine."""
         return is_loopback(self.host) and (self.camera is None or is_loopback(self.camera[0]))
 
     @property

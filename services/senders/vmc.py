@@ -19,18 +19,24 @@ from itertools import islice
 from typing import ClassVar
 
 from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
-from kouxing.services.senders.face_frame import Angles, FaceFrame, mouth_names
-from kouxing.services.senders.osc import address_of, bundles, first_text, message, split
+from kouxing.services.senders.face_frame import Angles, FaceFrame, mouth_shape_names
+from kouxing.services.senders.osc import (
+    bundle_messages,
+    encode_message,
+    parse_address,
+    parse_first_text,
+    split_packet,
+)
 
-_VRM_0 = {  # where it is not only the capital of VRM 1
+_VRM_0 = {  # names that differ from VRM 1 by more than a capital letter
     "aa": "A", "ih": "I", "ou": "U", "ee": "E", "oh": "O",
     "blinkLeft": "Blink_L", "blinkRight": "Blink_R",
 }  # fmt: skip
-_MAX_MESSAGES = 200  # in a received packet
+_MAX_MESSAGES = 200  # limit for a received packet
 _MOUTH = {
     name.lower()
     for shapes in ("vrm", "arkit")
-    for mouth in mouth_names(shapes)
+    for mouth in mouth_shape_names(shapes)
     for name in (mouth, _VRM_0.get(mouth, mouth))
 }
 
@@ -48,29 +54,29 @@ class VmcConnection(DatagramConnection):
 
     def encode(self, frame: FaceFrame) -> Iterator[bytes]:
         """Yield the datagrams of a frame; the last message applies the shapes."""
-        messages = [message("/VMC/Ext/OK", 1), message("/VMC/Ext/T", frame.time_s)]
+        messages = [encode_message("/VMC/Ext/OK", 1), encode_message("/VMC/Ext/T", frame.time_s)]
         if self.target.options["head"] == "on":
             rotation = _quaternion(frame.head)
-            messages.append(message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0, *rotation))
+            messages.append(encode_message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0, *rotation))
         messages += self._shape_messages(frame, is_mouth_only=self.target.is_mouth_only)
-        messages.append(message("/VMC/Ext/Blend/Apply"))
-        return bundles(messages)
+        messages.append(encode_message("/VMC/Ext/Blend/Apply"))
+        return bundle_messages(messages)
 
     def with_mouth(self, packet: bytes, frame: FaceFrame) -> tuple[Iterator[bytes], bool]:
         """Insert the frame's mouth where the packet applies shapes; raises ``ValueError``."""
-        received = list(islice(split(packet), _MAX_MESSAGES + 1))
+        received = list(islice(split_packet(packet), _MAX_MESSAGES + 1))
         if len(received) > _MAX_MESSAGES:
             raise ValueError("the packet has too many messages")
         messages: list[bytes] = []
         has_mouth = False
         for part in received:
-            address = address_of(part)
+            address = parse_address(part)
             if address == "/VMC/Ext/Blend/Apply":
                 messages += self._shape_messages(frame, is_mouth_only=True)
                 has_mouth = True
-            if address != "/VMC/Ext/Blend/Val" or first_text(part).lower() not in _MOUTH:
+            if address != "/VMC/Ext/Blend/Val" or parse_first_text(part).lower() not in _MOUTH:
                 messages.append(part)
-        return bundles(messages), has_mouth
+        return bundle_messages(messages), has_mouth
 
     def _shape_messages(self, frame: FaceFrame, *, is_mouth_only: bool) -> list[bytes]:
         weights = frame.weights(self.target.shapes, is_mouth_only=is_mouth_only)
@@ -78,7 +84,7 @@ class VmcConnection(DatagramConnection):
             _VRM_0.get(name) or name[0].upper() + name[1:]: value for name, value in weights.items()
         }
         return [
-            message("/VMC/Ext/Blend/Val", name, value)
+            encode_message("/VMC/Ext/Blend/Val", name, value)
             for name, value in {**alternatives, **weights}.items()
         ]
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import aiohttp
 
-from kouxing.services.senders.connection import RETRY_S, Connection
+from kouxing.services.senders.connection import RETRY_S, TargetConnection
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
@@ -96,7 +96,7 @@ class VTubeStudioProtocol:
         return self.first_message()
 
     def _on_authenticated(self, data: Any) -> str:
-        if not data["authenticated"]:  # the user revoked it
+        if not data["authenticated"]:  # the user revoked the token
             self._token = ""
             return self.first_message()
         self.problem = ""
@@ -192,7 +192,7 @@ def _request(kind: str, **data: object) -> str:
     )
 
 
-class VTubeStudioConnection(Connection):
+class VTubeStudioConnection(TargetConnection):
     """Sends the newest frame whenever the WebSocket is ready."""
 
     default_port = 8001
@@ -204,7 +204,7 @@ class VTubeStudioConnection(Connection):
         self._is_ready = False
 
     async def run(self) -> None:
-        """Connect repeatedly until the user denies it."""
+        """Connect repeatedly, until the user denies access."""
         async with aiohttp.ClientSession() as http:
             while True:
                 try:
@@ -224,7 +224,7 @@ class VTubeStudioConnection(Connection):
                 await asyncio.sleep(RETRY_S)
 
     def send(self, frame: FaceFrame) -> bool:
-        """Queue a frame; it replaces a queued one."""
+        """Queue a frame; it replaces a queued frame."""
         if not self._is_ready:
             return False
         if self._newest.full():

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from kouxing.evaluation.system.commands import app
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from tests.system import VOWELS_FILE
 
 

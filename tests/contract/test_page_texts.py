@@ -12,11 +12,11 @@ PAGE_TEXTS = PAGE / "gateway-texts.js"
 SOURCES = (
     *("shared/audio_file.py", "shared/media_file.py", "shared/sound_formats.py"),
     *("shared/channels.py", "shared/wav_parts.py", "services/gateway/sound_upload.py"),
-    *("services/gateway/uploads.py", "services/gateway/learn_mouth.py"),
+    *("services/gateway/upload_handler.py", "services/gateway/mouth_learner.py"),
     *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),
     *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),
     *("services/senders/connection.py", "services/senders/protocols.py"),
-    *("services/senders/senders.py", "services/senders/target.py"),
+    *("services/senders/sender_pool.py", "services/senders/target.py"),
     *("services/senders/vtube_studio.py", "clients/python/kouxing_client/base.py"),
     *("clients/python/kouxing_client/core.py", "clients/python/kouxing_client/session_core.py"),
 )

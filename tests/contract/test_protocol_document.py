@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from kouxing.services.control.placement import CLIENT_NEEDS
-from kouxing.services.control.requests import Request
+from kouxing.services.control.request_handler import Request
 from kouxing.services.synthesizer.service import LOW_LEVEL_FAPS
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS

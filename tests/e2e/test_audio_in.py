@@ -14,7 +14,7 @@ from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription
 from aiortc.contrib.media import MediaPlayer
 from aiortc.rtcdtlstransport import RTCDtlsTransport
 
-from kouxing.services.gateway.wire import FAP_TYPE, SHAPES_TYPE
+from kouxing.services.gateway.browser_messages import FAP_TYPE, SHAPES_TYPE
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.inventory import load_inventory
 from tests.e2e.streaming import stream

@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 from kouxing_client import Client, KouxingError
 
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key

@@ -13,7 +13,7 @@ from kouxing_client.aio import AsyncClient
 from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.live_faces import live_events, live_frames
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -98,7 +98,7 @@ def test_services_send_the_frames_of_the_chain(
     samples = at_rate(samples_of_file(DEMO / f"{name}.wav")[:48000], rate_hz)
     samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
     sent = stream(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
-    chain = LiveChain(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
+    chain = LivePipeline(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
     assert sent.times == [to_samples(time_s) for time_s, _ in frames]
@@ -141,7 +141,7 @@ def lip_frames_of(sent: Stream) -> list[speech.LipPositions]:
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     samples = samples_of_file(VOWELS_FILE)
-    chain = LiveChain(
+    chain = LivePipeline(
         load_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0, feeling=0.0)
     )
     frames = chain.accept_waveform(samples) + chain.input_finished()

@@ -17,7 +17,7 @@ import pytest
 import soundfile
 from kouxing_client import Client, FapFrame, Refused
 
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.conftest import CommandRunner

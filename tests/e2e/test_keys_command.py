@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.keys import key_folder, read_grants
 from tests.e2e.conftest import CommandRunner
 from tests.e2e.streaming import stream

@@ -10,7 +10,7 @@ from kouxing_client import Client
 from rich.console import Console
 
 from kouxing.services.cli.supervisor import Supervisor
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.errors import UserError
 from tests.browser import Browser
 from tests.documents import code_blocks

@@ -18,7 +18,7 @@ from kouxing.services.driver.config import DriverConfig, Framing
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import ASSETS, Head
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
@@ -121,7 +121,7 @@ def test_renders_a_sound_as_curves_and_converts_them(tmp_path: Path) -> None:
 
 def test_live_frames_are_those_of_the_live_chain(tmp_path: Path) -> None:
     render(SENTENCE, tmp_path / "live.fap", live=True)
-    chain = LiveChain(load_model(), load_lip_model())
+    chain = LivePipeline(load_model(), load_lip_model())
     samples = read_audio(SENTENCE)[0][:, 0]
     frames = chain.accept_waveform(samples) + chain.input_finished()
     written = read_fap(tmp_path / "live.fap").faps[:, 2:]

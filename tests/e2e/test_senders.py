@@ -17,7 +17,7 @@ from kouxing.services.senders import connection, vtube_studio
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import parse_target
-from kouxing.services.senders.senders import MAX_SENDERS, Senders
+from kouxing.services.senders.sender_pool import MAX_SENDERS, SenderPool
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import STALL_S
@@ -66,7 +66,7 @@ def problem_of(senders: Senders, url: str) -> str:
     return next(state.problem for state in senders.states() if state.target == url)
 
 
-def test_an_osc_server_receives_the_face(senders: Senders) -> None:
+def test_an_osc_server_receives_the_face(senders: SenderPool) -> None:
     opened: list[float] = []
 
     def receive(_address: str, name: str, value: float) -> None:
@@ -90,7 +90,7 @@ def test_an_osc_server_receives_the_face(senders: Senders) -> None:
 
 
 def test_reports_a_missing_receiver_and_finds_it_later(
-    senders: Senders, receiver: socket.socket, reports: list[tuple[str, str]]
+    senders: SenderPool, receiver: socket.socket, reports: list[tuple[str, str]]
 ) -> None:
     port = free_port()
     missing = f"osc://127.0.0.1:{port}"
@@ -111,7 +111,7 @@ def test_reports_a_missing_receiver_and_finds_it_later(
 
 
 def test_an_unknown_host_does_not_delay_other_targets(
-    senders: Senders, receiver: socket.socket
+    senders: SenderPool, receiver: socket.socket
 ) -> None:
     lost = "vmc://nowhere.invalid"
     senders.start(parse_target(lost))
@@ -120,7 +120,7 @@ def test_an_unknown_host_does_not_delay_other_targets(
     wait_until(lambda: "cannot reach nowhere.invalid" in problem_of(senders, lost))
 
 
-def test_starts_and_stops_senders(senders: Senders, receiver: socket.socket) -> None:
+def test_starts_and_stops_senders(senders: SenderPool, receiver: socket.socket) -> None:
     url = f"livelink://localhost:{receiver.getsockname()[1]}"
     senders.start(parse_target(url))
     senders.start(parse_target(url))  # ignored
@@ -137,7 +137,7 @@ def test_starts_and_stops_senders(senders: Senders, receiver: socket.socket) -> 
         senders.start(parse_target(url))
 
 
-def test_media_time_continues_at_rest(senders: Senders, receiver: socket.socket) -> None:
+def test_media_time_continues_at_rest(senders: SenderPool, receiver: socket.socket) -> None:
     def next_time_s() -> float:
         while (first := next(iter(OscBundle(receiver.recv(2000))))).address != "/kouxing/time":
             pass
@@ -173,7 +173,7 @@ def test_the_permission_of_vtube_studio_is_requested_once(senders: Senders) -> N
 
 
 def test_a_sender_can_be_stopped_while_its_connection_ends(
-    senders: Senders, monkeypatch: pytest.MonkeyPatch
+    senders: SenderPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     is_writing, is_ending = threading.Event(), threading.Event()
 
@@ -211,7 +211,7 @@ def test_vtube_studio_is_not_asked_again_after_a_denial(
         assert stub.requests == ["AuthenticationTokenRequest"]
 
 
-def test_two_senders_share_one_permission(senders: Senders) -> None:
+def test_two_senders_share_one_permission(senders: SenderPool) -> None:
     with VTubeStudioStub() as stub:
         whole = f"vts://127.0.0.1:{stub.port}"
         senders.start(parse_target(whole))
@@ -227,7 +227,7 @@ def test_two_senders_share_one_permission(senders: Senders) -> None:
 
 
 def test_a_tracker_passes_through_with_the_mouth_of_the_session(
-    senders: Senders, receiver: socket.socket
+    senders: SenderPool, receiver: socket.socket
 ) -> None:
     port, camera = receiver.getsockname()[1], free_port()
     target = parse_target(f"livelink://127.0.0.1:{port}?camera={camera}")

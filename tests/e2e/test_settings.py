@@ -13,10 +13,10 @@ from kouxing_client import Client, KouxingError, Refused
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.live import ReceivedResults, speak
-from kouxing.services.control.load import MIN_SESSIONS, RETRY_AFTER_S
-from kouxing.services.kinds import KINDS
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.control.worker_load import MIN_SESSIONS, RETRY_AFTER_S
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.config import variable
@@ -44,7 +44,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 
 
 def frames_of_the_chain(lips: str) -> NDArray[np.float32]:
-    chain = LiveChain(load_model(), load_lip_model(name=lips), synthesizer=FACE)
+    chain = LivePipeline(load_model(), load_lip_model(name=lips), synthesizer=FACE)
     frames = chain.accept_waveform(SAMPLES) + chain.input_finished()
     return np.array([faps for _, faps in frames])
 

@@ -5,7 +5,7 @@ import secrets
 
 import pytest
 
-from kouxing.services.control import status as control_status
+from kouxing.services.control import status_reporter as control_status
 from kouxing.shared.bus import Bus
 from kouxing.shared.endpoints import key_of
 from kouxing.shared.keys import load_key

@@ -2,7 +2,7 @@
 
 import pytest
 
-from kouxing.services.control import lifecycle, takeover
+from kouxing.services.control import restart_recovery, session_lifecycle
 from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
@@ -30,8 +30,8 @@ ELSEWHERE = {**PLACED, "audio": "tcp://127.0.0.1:2"}
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Extend the time limits of control for slow machines."""
-    monkeypatch.setattr(takeover, "TAKEOVER_S", 60.0)
-    monkeypatch.setattr(lifecycle, "START_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(restart_recovery, "RECOVERY_S", 60.0)
+    monkeypatch.setattr(session_lifecycle, "START_TIMEOUT_S", 60.0)
 
 
 def report(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:

@@ -13,8 +13,13 @@ import pytest
 from kouxing_client.base import MAX_UNACKNOWLEDGED
 from pythonosc.osc_bundle import OscBundle
 
-from kouxing.services.gateway.microphone import MAX_MESSAGE_BYTES
-from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
+from kouxing.services.gateway.browser_messages import (
+    FAP_TYPE,
+    REST_SHAPES_TYPE,
+    REST_TYPE,
+    SHAPES_TYPE,
+)
+from kouxing.services.gateway.microphone_handler import MAX_MESSAGE_BYTES
 from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.wire.audio import AudioChunk

@@ -16,12 +16,12 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from aiohttp.typedefs import Handler
 
-from kouxing.services.gateway import microphone, viewers, web_server, whip
-from kouxing.services.gateway.http import WebSockets
-from kouxing.services.gateway.microphone import Microphones
-from kouxing.services.gateway.viewers import Viewers
+from kouxing.services.gateway import microphone_handler, viewer_handler, web_server, whip_handler
+from kouxing.services.gateway.microphone_handler import MicrophoneHandler
+from kouxing.services.gateway.viewer_handler import ViewerHandler
+from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.services.gateway.web_server import WebServer
-from kouxing.services.gateway.whip import MISSING, WhipClients
+from kouxing.services.gateway.whip_handler import NO_WEBRTC, WhipHandler
 from kouxing.shared.metrics import Metrics
 from tests.process.web_clients import async_test
 from tests.system import LIMIT_S
@@ -261,8 +261,10 @@ async def test_ends_answers_that_are_never_read(monkeypatch: pytest.MonkeyPatch)
 
 
 CLIENTS: dict[str, Callable[[float], Handler]] = {
-    "viewers": lambda share: Viewers(WebSockets(), share, Metrics(), *(UNUSED,) * 3).serve,
-    "microphones": lambda share: Microphones(WebSockets(), share, UNUSED).serve,
+    "viewers": lambda share: (
+        ViewerHandler(OpenWebSockets(), share, Metrics(), *(UNUSED,) * 3).serve
+    ),
+    "microphones": lambda share: MicrophoneHandler(OpenWebSockets(), share, UNUSED).serve,
 }
 
 
@@ -273,8 +275,8 @@ CLIENTS: dict[str, Callable[[float], Handler]] = {
 async def test_one_address_gets_only_its_share_unless_it_is_a_proxys(
     monkeypatch: pytest.MonkeyPatch, kind: str, share: float, num_per_address: int
 ) -> None:
-    monkeypatch.setattr(viewers, "MAX_VIEWERS", 4)
-    monkeypatch.setattr(microphone, "MAX_MICROPHONES", 4)
+    monkeypatch.setattr(viewer_handler, "MAX_VIEWERS", 4)
+    monkeypatch.setattr(microphone_handler, "MAX_MICROPHONES", 4)
     application = web.Application()
     application.add_routes([web.get("/", CLIENTS[kind](share))])
     async with TestServer(application) as server, AsyncExitStack() as stack:
@@ -299,7 +301,7 @@ async def test_one_address_gets_only_its_share_unless_it_is_a_proxys(
 
 
 @asynccontextmanager
-async def whip_offer(clients: WhipClients) -> AsyncIterator[Callable[[], Any]]:
+async def whip_offer(clients: WhipHandler) -> AsyncIterator[Callable[[], Any]]:
     """Serve WebRTC clients; yield a function that posts an offer."""
     application = web.Application()
     application.add_routes([web.post("/", clients.serve_post)])
@@ -316,8 +318,8 @@ async def whip_offer(clients: WhipClients) -> AsyncIterator[Callable[[], Any]]:
 async def test_one_address_gets_only_its_share_of_webrtc_clients(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(whip, "MAX_CLIENTS", 4)
-    clients = WhipClients(0.75, UNUSED, UNUSED, [])
+    monkeypatch.setattr(whip_handler, "MAX_CLIENTS", 4)
+    clients = WhipHandler(0.75, UNUSED, UNUSED, [])
     may_end = asyncio.Event()
 
     async def make_peer(_client: object) -> None:
@@ -339,9 +341,9 @@ async def test_one_address_gets_only_its_share_of_webrtc_clients(
 async def test_whip_without_aiortc_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "aiortc", None)
     monkeypatch.delitem(sys.modules, "kouxing.services.gateway.webrtc", raising=False)
-    clients = WhipClients(1.0, UNUSED, UNUSED, ["127.0.0.1"])
+    clients = WhipHandler(1.0, UNUSED, UNUSED, ["127.0.0.1"])
     async with whip_offer(clients) as offer:
-        assert await offer() == (501, MISSING)
+        assert await offer() == (501, NO_WEBRTC)
     assert len(clients) == 0
 
 

@@ -8,7 +8,7 @@ from unittest import mock
 import pytest
 
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.kinds import (
+from kouxing.services.service_kinds import (
     KINDS,
     available_port_environment,
     extra_worker_environments,

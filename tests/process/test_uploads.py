@@ -18,10 +18,10 @@ from aiohttp import web
 
 from kouxing.services.gateway import sound_upload
 from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.http import make_application
-from kouxing.services.gateway.learn_mouth import MAX_BYTES, MouthLearner
-from kouxing.services.gateway.sound_upload import REMARKS_HEADER, SoundUpload
-from kouxing.services.gateway.uploads import Uploads
+from kouxing.services.gateway.mouth_learner import MAX_BYTES, MouthLearner
+from kouxing.services.gateway.sound_upload import REMARKS_HEADER, SoundUploadHandler
+from kouxing.services.gateway.upload_handler import UploadHandler
+from kouxing.services.gateway.web_application import make_application
 from tests.process.web_clients import async_test
 
 REVERSE = """
@@ -48,7 +48,7 @@ SINE = 0.5 * np.sin(np.arange(32_000) * 0.1)
 
 
 @asynccontextmanager
-async def serve(uploads: Uploads) -> AsyncIterator[Post]:
+async def serve(uploads: UploadHandler) -> AsyncIterator[Post]:
     route = web.post("/upload", uploads.serve)
     runner = web.AppRunner(make_application(head_file="", routes=[route], access=AccessPolicy()))
     await runner.setup()
@@ -167,7 +167,7 @@ async def test_answers_a_file_with_its_sound() -> None:
 
 @async_test
 async def test_a_file_cannot_name_itself_like_a_module_or_a_path() -> None:
-    async with serve(SoundUpload()) as post:
+    async with serve(SoundUploadHandler()) as post:
         for name in ("wave.py", "../../x", "-", "口型.wav"):
             status, _, warnings = await post(media_bytes("WAV", SINE)[:40_000], name)
             assert status == 200
@@ -177,7 +177,7 @@ async def test_a_file_cannot_name_itself_like_a_module_or_a_path() -> None:
 
 @async_test
 async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serve(SoundUpload()) as post:
+    async with serve(SoundUploadHandler()) as post:
         status, data, _ = await post(b'{"error": "no key"}', "a.mp3")
         assert status == 422
         assert b"a.mp3: cannot read audio: this is text, not sound" in data

@@ -11,7 +11,7 @@ from typing import Any
 
 import aiohttp
 
-from kouxing.services.gateway.wire import REST_TYPE
+from kouxing.services.gateway.browser_messages import REST_TYPE
 from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.face import FapFrame

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kouxing.services.senders.camera import CameraInput
 from kouxing.services.senders.connection import DatagramConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
-from kouxing.services.senders.osc import bundles, message
+from kouxing.services.senders.osc import bundle_messages, encode_message
 from kouxing.services.senders.protocols import connect, parse_target
 from kouxing.shared.errors import UserError
 from tests.fake_time import run
@@ -30,16 +30,16 @@ LIVE_LINK = LiveLinkConnection(parse_target("livelink://?camera=11112"))
 def test_vmc_keeps_everything_but_the_mouth() -> None:
     bone = ("Head", 0.0, 1.5, 0.0, 0.0, 0.1, 0.0, 0.99)
     sent = [
-        message("/VMC/Ext/T", 3.5),
-        message("/VMC/Ext/Bone/Pos", *bone),
-        message("/VMC/Ext/Blend/Val", "A", 0.9),
-        message("/VMC/Ext/Blend/Val", "JawOpen", 0.9),
-        message("/VMC/Ext/Blend/Val", "Blink_L", 0.25),
-        message("/VMC/Ext/Blend/Val", "browInnerUp", 0.5),
-        message("/VMC/Ext/Blend/Apply"),
-        message("/VMC/Ext/OK", 1),
+        encode_message("/VMC/Ext/T", 3.5),
+        encode_message("/VMC/Ext/Bone/Pos", *bone),
+        encode_message("/VMC/Ext/Blend/Val", "A", 0.9),
+        encode_message("/VMC/Ext/Blend/Val", "JawOpen", 0.9),
+        encode_message("/VMC/Ext/Blend/Val", "Blink_L", 0.25),
+        encode_message("/VMC/Ext/Blend/Val", "browInnerUp", 0.5),
+        encode_message("/VMC/Ext/Blend/Apply"),
+        encode_message("/VMC/Ext/OK", 1),
     ]
-    for packets in (list(bundles(sent)), sent):  # in bundles, or one by one
+    for packets in (list(bundle_messages(sent)), sent):  # in bundles, or one by one
         answers = [VMC.with_mouth(packet, SPOKEN) for packet in packets]
         messages = [parsed for passed, _ in answers for parsed in read_osc(list(passed)) if passed]
         assert any(has_mouth for _, has_mouth in answers)
@@ -54,7 +54,9 @@ def test_vmc_keeps_everything_but_the_mouth() -> None:
 
 
 def test_a_tracker_without_shapes_does_not_replace_the_session() -> None:
-    (packet,) = bundles([message("/VMC/Ext/Bone/Pos", "Hips", 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)])
+    (packet,) = bundle_messages(
+        [encode_message("/VMC/Ext/Bone/Pos", "Hips", 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)]
+    )
     packets, has_mouth = VMC.with_mouth(packet, SPOKEN)
     assert list(packets) == [packet]
     assert not has_mouth
@@ -76,7 +78,11 @@ def test_live_link_keeps_everything_but_the_mouth() -> None:
 
 
 PACKETS = (
-    next(bundles([message("/VMC/Ext/Blend/Val", "A", 0.5), message("/VMC/Ext/Blend/Apply")])),
+    next(
+        bundle_messages(
+            [encode_message("/VMC/Ext/Blend/Val", "A", 0.5), encode_message("/VMC/Ext/Blend/Apply")]
+        )
+    ),
     LIVE_LINK.encode_at(SPOKEN, 0.0),
 )
 

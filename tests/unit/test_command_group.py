@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from kouxing.services.cli import main as command_line
-from kouxing.services.kinds import KINDS
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.errors import UserError
 
 wave_app = typer.Typer(add_completion=False)
@@ -76,7 +76,10 @@ def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> 
             "import kouxing.services.cli.main",
             "kouxing.training kouxing.evaluation numpy zmq kouxing.services.recognizer.service",
         ),
-        ("from kouxing.services.kinds import read_settings; read_settings()", "numpy zmq aiohttp"),
+        (
+            "from kouxing.services.service_kinds import read_settings; read_settings()",
+            "numpy zmq aiohttp",
+        ),
         ("import kouxing.services.gateway.service", "scipy onnxruntime prometheus_client"),
         (
             "import kouxing.services.recognizer.service as service; service.load_numba()",

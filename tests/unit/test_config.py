@@ -11,9 +11,9 @@ from kouxing.services.cli.configuration import config, markdown_page
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import HEAD_NAMES, DriverConfig
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.kinds import CONFIG_TYPES, read_settings
 from kouxing.services.lip_models import lip_model_names
 from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.service_kinds import CONFIG_TYPES, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.config import KnownNames, ServiceConfig, Settings
 from kouxing.shared.errors import UserError

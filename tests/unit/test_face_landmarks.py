@@ -10,7 +10,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from kouxing.corpora.face_mesh import FaceMesh
-from kouxing.services.mouth_profiles.face_landmarks import _STEADY, LANDMARKS, expand_mouth_faps
+from kouxing.services.mouth_profiles.face_landmarks import (
+    _STABLE_POINTS,
+    LANDMARKS,
+    compute_mouth_faps,
+)
 from kouxing.services.mouth_profiles.landmark_file import parse_landmark_file
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.errors import UserError
@@ -25,7 +29,7 @@ MOUTH = {
     39: (-1.2, -3.5, 5.6), 269: (1.2, -3.5, 5.6), 181: (-1.2, -4.9, 5.2), 405: (1.2, -4.9, 5.2),
     152: (0, -9, 4.2),
 }  # fmt: skip
-FACE = np.array([(_STEADY | MOUTH)[point] for point in LANDMARKS], float)
+FACE = np.array([(_STABLE_POINTS | MOUTH)[point] for point in LANDMARKS], float)
 
 
 def film(moves: dict[int, tuple[float, float, float]], seed: int = 0) -> NDArray[np.float32]:
@@ -64,7 +68,7 @@ def levels(speaking_db: float = -20.0) -> NDArray[np.float64]:
 def test_the_motion_of_a_point_is_its_fap_in_any_head_pose(
     point: int, move: tuple[float, float, float], number: int, expected: float
 ) -> None:
-    faps = expand_mouth_faps(film({point: move}), levels())
+    faps = compute_mouth_faps(film({point: move}), levels())
     assert fap(faps, number) == pytest.approx(expected, abs=1.0)
     others = [
         other for other in MOUTH_FAPS if other not in (number, *range(12, 18), *range(44, 48))
@@ -77,16 +81,16 @@ def test_the_motion_of_a_point_is_its_fap_in_any_head_pose(
 def test_the_neutral_face_is_silent_and_closed_or_the_most_closed() -> None:
     # with -levels() the mouth is open in silence: those frames are not among the closed ones
     for level_db in (levels(), QUIET, -levels()):
-        assert fap(expand_mouth_faps(film({14: (0, -1, 0)}), level_db), 5) == pytest.approx(
+        assert fap(compute_mouth_faps(film({14: (0, -1, 0)}), level_db), 5) == pytest.approx(
             -512, abs=1
         )
 
 
 def test_rejects_landmarks_that_form_no_face() -> None:
     with pytest.raises(UserError, match="coincide"):
-        expand_mouth_faps(np.zeros((NUM_FRAMES, len(LANDMARKS), 3)), QUIET)
+        compute_mouth_faps(np.zeros((NUM_FRAMES, len(LANDMARKS), 3)), QUIET)
     with pytest.raises(UserError, match="upright face"):
-        expand_mouth_faps(film({13: (0, 5, 0), 14: (0, 5, 0)})[NUM_FRAMES // 2 :], QUIET[::2])
+        compute_mouth_faps(film({13: (0, 5, 0), 14: (0, 5, 0)})[NUM_FRAMES // 2 :], QUIET[::2])
 
 
 TIMES = np.arange(NUM_FRAMES) / 25

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -96,7 +96,7 @@ def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
     )
     live_openings = []
     for chunk in (32_000, 333):
-        chain = LiveChain(load_model(), LIPS, synthesizer=settings)
+        chain = LivePipeline(load_model(), LIPS, synthesizer=settings)
         frames = []
         for begin in range(0, len(samples), chunk):
             frames += chain.accept_waveform(samples[begin : begin + chunk])

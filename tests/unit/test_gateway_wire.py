@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kouxing.services.gateway import wire
-from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.pcm_format import PcmFormat
-from kouxing.services.gateway.sample import SampleSentence
+from kouxing.services.gateway.sample_sentence import SampleSentence
 from kouxing.services.gateway.shape_messages import parse_avatar
 from kouxing.services.gateway.viewer_queue import (
     MAX_QUEUED,
@@ -18,7 +17,7 @@ from kouxing.services.gateway.viewer_queue import (
     MessageKind,
     ViewerQueue,
 )
-from kouxing.services.gateway.viewers import PAUSE_S, Viewer, Viewers
+from kouxing.services.gateway.web_application import WebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
@@ -30,12 +29,16 @@ LONG_PROFILE = "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)
 
 
 def test_hello_describes_the_audio() -> None:
-    hello = wire.parse_hello('{"sample_rate_hz": 44100, "num_channels": 2, "encoding": "f32le"}')
+    hello = browser_messages.parse_microphone_options(
+        '{"sample_rate_hz": 44100, "num_channels": 2, "encoding": "f32le"}'
+    )
     assert hello.pcm_format == PcmFormat(sample_rate_hz=44100, num_channels=2, encoding="f32le")
     assert hello.pcm_format.frame_bytes == 8
     assert hello.mouth_profile == b""
     assert hello.language == ""
-    hello = wire.parse_hello('{"sample_rate_hz": 8000, "mouth_profile": "YWJj", "language": "de"}')
+    hello = browser_messages.parse_microphone_options(
+        '{"sample_rate_hz": 8000, "mouth_profile": "YWJj", "language": "de"}'
+    )
     assert hello.language == "de"
     assert hello.mouth_profile == b"abc"
 
@@ -56,40 +59,49 @@ def test_hello_describes_the_audio() -> None:
 )
 def test_rejects_a_bad_hello_and_names_the_field(fields: object, field: str) -> None:
     with pytest.raises(UserError, match=field):
-        wire.parse_hello(json.dumps(fields))
+        browser_messages.parse_microphone_options(json.dumps(fields))
 
 
 def test_parses_microphone_commands() -> None:
-    assert wire.parse_command('{"flush": true}').flush
-    assert wire.parse_command('{"skip": 960}').num_skipped == 960
+    assert browser_messages.parse_command('{"flush": true}').flush
+    assert browser_messages.parse_command('{"skip": 960}').num_skipped == 960
     pcm_format = PcmFormat(sample_rate_hz=16000)
-    wire.parse_command('{"sample_rate_hz": 16000, "encoding": "s16le"}', pcm_format)
+    browser_messages.parse_command('{"sample_rate_hz": 16000, "encoding": "s16le"}', pcm_format)
     with pytest.raises(UserError, match="sample_rate_hz cannot change during a session"):
-        wire.parse_command('{"sample_rate_hz": 48000}', pcm_format)
-    assert wire.parse_command('{"lips": "ferguson"}').lip_model == "ferguson"
+        browser_messages.parse_command('{"sample_rate_hz": 48000}', pcm_format)
+    assert browser_messages.parse_command('{"lips": "ferguson"}').lip_model == "ferguson"
 
 
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
         *(({"lips": lips}, "lips must be the name") for lips in ("no name", 1)),
-        *(({"skip": n}, "skip must be an integer") for n in (-1, 1.5, True, wire.MAX_SKIPPED + 1)),
+        *(
+            ({"skip": n}, "skip must be an integer")
+            for n in (-1, 1.5, True, browser_messages.MAX_SKIPPED + 1)
+        ),
     ],
 )
 def test_rejects_bad_microphone_commands(fields: object, error: str) -> None:
     with pytest.raises(UserError, match=error):
-        wire.parse_command(json.dumps(fields))
+        browser_messages.parse_command(json.dumps(fields))
 
 
 def test_parses_face_settings() -> None:
-    assert wire.parse_face_settings({"follow": "one"}) is None
-    settings = wire.parse_face_settings({"express": {"joy": 1}, "hold_s": 7, "expressiveness": 2})
+    assert browser_messages.parse_face_settings({"follow": "one"}) is None
+    settings = browser_messages.parse_face_settings(
+        {"express": {"joy": 1}, "hold_s": 7, "expressiveness": 2}
+    )
     assert settings == FaceSettings(expressions={"joy": 1}, hold_s=7, expressiveness=2)
     manner: dict[str, Any] = {"feeling": 0, "still": True, "eye_contact": False, "listen_to": "bob"}
-    assert wire.parse_face_settings(manner) == FaceSettings(**manner)
-    assert wire.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
-    assert wire.parse_face_settings({"lips": "learned"}) == FaceSettings(lip_model="learned")
-    assert wire.parse_face_settings({"acoustic": "light"}) == FaceSettings(acoustic="light")
+    assert browser_messages.parse_face_settings(manner) == FaceSettings(**manner)
+    assert browser_messages.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
+    assert browser_messages.parse_face_settings({"lips": "learned"}) == FaceSettings(
+        lip_model="learned"
+    )
+    assert browser_messages.parse_face_settings({"acoustic": "light"}) == FaceSettings(
+        acoustic="light"
+    )
 
 
 @pytest.mark.parametrize(
@@ -108,13 +120,13 @@ def test_parses_face_settings() -> None:
 )
 def test_rejects_bad_face_settings(fields: dict[str, object], error: str) -> None:
     with pytest.raises(UserError, match=error):
-        wire.parse_face_settings(fields)
+        browser_messages.parse_face_settings(fields)
 
 
 @pytest.mark.parametrize("message", ["", "{", "[" * 100_000, "null", '"text"'])
 def test_rejects_messages_that_are_not_objects(message: str) -> None:
     with pytest.raises(UserError, match="JSON object"):
-        wire.parse_object(message)
+        browser_messages.parse_object(message)
 
 
 UNUSED: Any = lambda *_: None  # noqa: E731 - calls that these tests do not need
@@ -168,21 +180,21 @@ def binary_types(viewer: Viewer) -> list[int]:
 
 
 def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
-    viewers = Viewers(WebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED)
+    viewers = ViewerHandler(WebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED)
     face = RestingFace(seed=0)
     frame = np.zeros(68, "<f4").tobytes()
     viewers.add_session("talk", 1, "learned")
     with viewers.connected("", None) as viewer:
         viewers.show_frame("talk", 1, 0, frame, now_s=0.0)
         assert viewers.rest_from_s < 0
-        viewers.show_rest(face, now_s=0.01)
-        assert binary_types(viewer) == [wire.FAP_TYPE, wire.REST_TYPE]
+        viewers.show_resting_face(face, now_s=0.01)
+        assert binary_types(viewer) == [browser_messages.FAP_TYPE, browser_messages.REST_TYPE]
         viewers.show_frame("talk", 1, 1, frame, now_s=0.02)
-        viewers.show_rest(face, now_s=0.1)
-        assert binary_types(viewer) == [wire.FAP_TYPE]
+        viewers.show_resting_face(face, now_s=0.1)
+        assert binary_types(viewer) == [browser_messages.FAP_TYPE]
         assert viewers.rest_from_s == 0.02 + PAUSE_S
-        viewers.show_rest(face, now_s=0.5)
-        assert binary_types(viewer) == [wire.REST_TYPE]
+        viewers.show_resting_face(face, now_s=0.5)
+        assert binary_types(viewer) == [browser_messages.REST_TYPE]
 
 
 def test_drops_sound_and_old_frames_but_not_text() -> None:

@@ -7,7 +7,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from kouxing.services.kinds import CONFIG_TYPES, KINDS
+from kouxing.services.service_kinds import CONFIG_TYPES, KINDS
 from kouxing.shared.config import BindAddress, Settings, bound_keys
 from tests.system import ROOT
 

@@ -10,7 +10,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline_recognition import recognize_recording
-from kouxing.services.recording_chain import analyze_recording, animate_recording
+from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -30,7 +30,7 @@ def test_dynamic_visemes_are_the_full_model() -> None:
     assert isinstance(lips, DynamicVisemes)
     frames = np.array([faps for _, faps in animate_recording(analyzed, lips, STILL)])
     num_frames = int(analyzed.duration_s * 50) + 1
-    full = synthesize(lips, analyzed.phones, num_frames, 50.0, level_track(samples))
+    full = synthesize(lips, analyzed.phones, num_frames, 50.0, measure_levels(samples))
     assert np.ptp(full[:, 2]) > 100
     np.testing.assert_allclose(frames[:num_frames], full, atol=1e-3)
     assert len(frames) == num_frames + 15, "and the way to rest"

@@ -9,7 +9,7 @@ import pytest
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import connect, parse_target
-from kouxing.services.senders.senders import PAUSE_S, WINDOW_S, PlayoutClock
+from kouxing.services.senders.sender_pool import PAUSE_S, WINDOW_S, PlayoutClock
 from kouxing.services.senders.vtube_studio import (
     AccessDenied,
     VTubeStudioProtocol,

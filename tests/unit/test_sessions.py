@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from kouxing.services.control.placement import Placement
-from kouxing.services.control.refusal import Refusal
-from kouxing.services.control.registry import Registry
+from kouxing.services.control.rejection import RequestRejected
+from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
-from kouxing.services.control.sessions import Sessions
+from kouxing.services.control.session_table import Sessions
 from kouxing.shared.keys import Peer
 from kouxing.shared.records import replace
 from kouxing.shared.wire.control import Heartbeat, SessionInput
@@ -51,7 +51,7 @@ class System:
     """The state of a control with one recognizer and one synthesizer."""
 
     def __init__(self, max_sessions: int = 8, max_load: float = 1000.0) -> None:
-        self.registry = Registry(lost_after_s=3.0)
+        self.registry = ServiceRegistry(lost_after_s=3.0)
         self.placement = Placement(self.registry, max_load)
         self.sessions = Sessions(self.registry, self.placement, max_sessions)
         for service in PROVIDES:
@@ -82,7 +82,7 @@ def system() -> System:
 
 @contextmanager
 def refused(code: str, text: str | None = None) -> Iterator[None]:
-    with pytest.raises(Refusal, match=text) as caught:
+    with pytest.raises(RequestRejected, match=text) as caught:
         yield
     assert caught.value.code == code
 
@@ -151,7 +151,7 @@ def test_the_error_names_a_missing_service(system: System, service: str) -> None
 def test_places_a_needed_worker_of_an_unknown_kind(system: System) -> None:
     system.lose("synthesizer-1")
     system.add(replace(worker("synthesizer", "synthesizer-1"), needs=["gaze"]))
-    with pytest.raises(Refusal, match="provides 'gaze'"):
+    with pytest.raises(RequestRejected, match="provides 'gaze'"):
         system.open()
     eyes = {"service": "eyes", "instance": "eyes-1", "endpoints": {"gaze": "tcp://eyes:1"}}
     system.add(replace(worker("synthesizer", "eyes-1"), **eyes, needs=[]))
@@ -180,13 +180,13 @@ def test_refuses_a_worker_with_bad_endpoints(
 
 def test_refuses_names_that_are_taken_and_wrong_tokens(system: System) -> None:
     record = system.open("demo")
-    assert system.sessions.find_owned("demo", record.token) is record
+    assert system.sessions.find_authorized("demo", record.token) is record
     with refused("session-exists"):
         system.open("demo")
     with refused("bad-token"):
-        system.sessions.find_owned("demo", "guess")
+        system.sessions.find_authorized("demo", "guess")
     with refused("unknown-session"):
-        system.sessions.find_owned("other", record.token)
+        system.sessions.find_authorized("other", record.token)
 
 
 def test_limits_the_sessions_in_total_and_per_key() -> None:
@@ -277,30 +277,30 @@ def test_does_not_start_a_recognizer_that_is_lost(system: System) -> None:
 
 def test_services_become_silent_in_the_order_of_their_heartbeats(system: System) -> None:
     system.add(worker("recognizer", "recognizer-1"), now_s=2.0)
-    assert system.registry.overdue(2.9) == []
-    assert system.registry.overdue(3.5) == ["synthesizer-1"]
+    assert system.registry.overdue_services(2.9) == []
+    assert system.registry.overdue_services(3.5) == ["synthesizer-1"]
     system.registry.exclude_pause(1.0)
-    assert system.registry.overdue(3.5) == [], "control did not run"
-    assert system.registry.overdue(6.5) == ["synthesizer-1", "recognizer-1"]
+    assert system.registry.overdue_services(3.5) == [], "control did not run"
+    assert system.registry.overdue_services(6.5) == ["synthesizer-1", "recognizer-1"]
 
 
 def test_waits_longer_for_heartbeats_after_a_service_was_late(system: System) -> None:
     system.registry.adapt_timeout(after_s=60.0, now_s=0.0)
-    assert len(system.registry.overdue(3.5)) == 2
+    assert len(system.registry.overdue_services(3.5)) == 2
     system.registry.adapt_timeout(after_s=1.0, now_s=3.5)
-    assert system.registry.overdue(4.9) == []
-    assert len(system.registry.overdue(5.1)) == 2
+    assert system.registry.overdue_services(4.9) == []
+    assert len(system.registry.overdue_services(5.1)) == 2
     system.registry.adapt_timeout(after_s=1.0, now_s=6.0)
     system.add(worker("recognizer", "recognizer-1"), now_s=66.0)
-    assert system.registry.overdue(66.1) == ["synthesizer-1"]
-    assert len(system.registry.overdue(69.1)) == 2, "the usual limit applies again"
+    assert system.registry.overdue_services(66.1) == ["synthesizer-1"]
+    assert len(system.registry.overdue_services(69.1)) == 2, "the usual limit applies again"
 
 
 def test_ignores_what_arrives_from_a_connection_that_has_ended(system: System) -> None:
     heartbeat, peer = worker("recognizer", "recognizer-1"), Peer(b"recognizer-1", connection=7)
     system.registry.add(heartbeat, peer, 0.0)
     system.registry.add(heartbeat, dataclasses.replace(peer, connection=0), 0.0)
-    assert system.registry.instance_on(7) == "recognizer-1"
+    assert system.registry.instance_by_connection(7) == "recognizer-1"
     system.lose("recognizer-1")
     assert system.registry.is_stale("recognizer-1", dataclasses.replace(peer, connection=0))
     assert not system.registry.is_stale("recognizer-1", dataclasses.replace(peer, connection=8))
@@ -309,9 +309,11 @@ def test_ignores_what_arrives_from_a_connection_that_has_ended(system: System) -
 def test_distinguishes_a_restarted_worker_from_the_crashed_one(system: System) -> None:
     old, peer = worker("recognizer", "recognizer-1"), Peer(b"recognizer-1")
     new = replace(old, instance="recognizer-9")
-    assert system.registry.replaced_by(new, CLIENT) is None, "its endpoints have another key"
-    assert system.registry.replaced_by(new, peer) == "recognizer-1"
-    assert system.registry.replaced_by(old, peer) is None
+    assert system.registry.find_replaced_worker(new, CLIENT) is None, (
+        "its endpoints have another key"
+    )
+    assert system.registry.find_replaced_worker(new, peer) == "recognizer-1"
+    assert system.registry.find_replaced_worker(old, peer) is None
     assert not system.registry.is_other_process(old, peer)
     assert system.registry.is_other_process(old, Peer(b"restarted"))
     assert system.registry.is_other_process(replace(old, endpoints={"audio": "tcp://new:1"}), peer)
@@ -323,8 +325,8 @@ def test_distinguishes_a_restarted_worker_from_the_crashed_one(system: System) -
 
 def test_a_heartbeat_without_sessions_may_be_older(system: System) -> None:
     system.add(replace(worker("synthesizer", "synthesizer-1"), sessions={}))
-    assert system.registry.overdue_s() == pytest.approx(3.0)
+    assert system.registry.next_overdue_s() == pytest.approx(3.0)
     system.add(worker("recognizer", "recognizer-1"), 1.0)
-    assert system.registry.overdue_s() == pytest.approx(3.75)
-    assert system.registry.overdue(3.7) == []
-    assert system.registry.overdue(3.8) == ["synthesizer-1"]
+    assert system.registry.next_overdue_s() == pytest.approx(3.75)
+    assert system.registry.overdue_services(3.7) == []
+    assert system.registry.overdue_services(3.8) == ["synthesizer-1"]

@@ -136,7 +136,7 @@ def test_the_error_names_words_that_cannot_be_read() -> None:
     assert [word.text for word in transcript.syllables] == ["Hello", "world"]
     assert set(transcript.dropped) == {"你好", "☃", "привет"}
     with pytest.raises(UserError, match="cannot read '你好' as language en"):
-        load_inventory("english").pronounce("Hello 你好")
+        load_inventory("english").pronounce("MicrophoneOptions 你好")
 
 
 def test_a_phone_of_another_language_becomes_the_nearest() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.live_chain import LiveChain
+from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text, drop_pauses
@@ -101,7 +101,7 @@ def test_a_text_of_the_language_is_aligned(toy: PhoneInventory, path: Path) -> N
 def test_the_language_opens_the_mouth(toy: PhoneInventory, path: Path) -> None:
     visemes = "dynamic-visemes"
     config = SynthesizerConfig(lips=visemes)
-    chain = LiveChain(load_model(path), load_lip_model("toy", visemes), synthesizer=config)
+    chain = LivePipeline(load_model(path), load_lip_model("toy", visemes), synthesizer=config)
     frames = chain.accept_waveform(SAMPLES) + chain.input_finished()
     phones = [event for event in chain.events if isinstance(event, Phone)]
     assert {phone.symbol for phone in phones} <= set(toy.phones)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import as_floats
-from kouxing.services.mouth_profiles.positions import POSITION_S
+from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
 from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel

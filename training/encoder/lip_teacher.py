@@ -37,7 +37,7 @@ from scipy.special import expit
 from kouxing.corpora.feature_cache import as_integers
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.parallel import process_in_order
-from kouxing.services.mouth_profiles.positions import POSITION_S
+from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
 from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.output_file import open_output

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import cache_folder, load_or_compute
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.services.mouth_profiles.positions import record_positions
+from kouxing.services.mouth_profiles.lip_inputs import record_lip_inputs
 from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.training.networks.augmentation import augment_samples, scale_level
 
@@ -68,7 +68,7 @@ def _positions(of_encoder: hashlib._Hash, samples: Floats) -> dict[str, NDArray[
     key.update(samples.tobytes())
 
     def compute() -> dict[str, NDArray[Any]]:
-        recorded = record_positions(samples)
+        recorded = record_lip_inputs(samples)
         return {
             "starts": np.array(recorded.starts, dtype=np.int64),
             "known_s": np.array(recorded.known_s, dtype=np.float64),

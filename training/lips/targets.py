@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_tracks
+from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, select_lip_faps
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 
@@ -65,7 +65,7 @@ def targets_at(
     or 1), (n, delays, 17); NaN if unknown.
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
-    faps = [interpolate_track(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]
+    faps = [interpolate_track(clip.time_s, track, time_s) for track in select_lip_faps(clip.faps).T]
     height = interpolate_track(clip.time_s, opening_of(clip), time_s)
     closure = np.where(np.isnan(height), np.nan, height < closed_at)
     lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)

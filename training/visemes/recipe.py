@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, read_clips
-from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
+from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
@@ -50,7 +50,7 @@ def measure_levels(
     start = initial_parameters().level_db
     total, count = _LEVEL_RIDGE * start, np.full(len(VISEMES), _LEVEL_RIDGE)
     for clip, phones in zip(clips, labels, strict=True):
-        time_s, level = np.array(level_track(clip.samples)).T
+        time_s, level = np.array(measure_levels(clip.samples)).T
         timeline = build_timeline(phones, inventory)
         spoken_db = level[level > np.percentile(level, 95.0) - _SPOKEN_DB]
         for viseme, start_s, end_s in zip(

@@ -1,4 +1,4 @@
-"""Record what the recognizer passes to the lip model for whole recordings.
+"""Records the inputs of the lip predictor for whole recordings.
 
 Voice activity detection runs as in the live recognizer.
 """
@@ -20,10 +20,10 @@ POSITION_S = FRAMES_PER_POSITION * HOP_S
 
 
 class LipInputs:
-    """The lip model's inputs over one recording."""
+    """Records the lip predictor's inputs over one recording; implements ``LipFrameStream``."""
 
     def __init__(self) -> None:
-        self.starts: list[int] = []  # first position of each stretch of speech
+        self.starts: list[int] = []  # first position of each segment of speech
         self.known_s: list[float] = []  # media time up to which the audio is known
         self.features: list[NDArray[np.float16]] = []  # features of each position, (features,)
 
@@ -36,14 +36,14 @@ class LipInputs:
         return []
 
     def reset(self) -> None:
-        """Mark the start of a stretch of speech."""
+        """Mark the start of a segment of speech."""
         self.starts.append(len(self.known_s))
 
 
-def record_positions(samples: Floats) -> LipInputs:
+def record_lip_inputs(samples: Floats) -> LipInputs:
     """Run the audio encoder over a recording, 16 kHz mono, (n,)."""
     positions = LipInputs()
     segmenter = SpeechSegmenter(WhisperMel(), positions)
     for _ in segmenter.accept_waveform(to_16_khz(samples, SAMPLE_RATE_HZ)):
-        pass  # the positions are what counts
+        pass  # only the positions are needed
     return positions

@@ -1,38 +1,38 @@
-"""Microphones: each WebSocket streams audio into a separate session."""
+"""Serves microphones: each WebSocket streams audio into a separate session."""
 
 import contextlib
 
 from aiohttp import WSCloseCode, WSMsgType, web
+from kouxing.services.gateway.audio_client import AudioClient, AudioSession, error_text
 from kouxing_client import KouxingError
 
-from kouxing.services.gateway import wire
+from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.audio_input import AudioInput
-from kouxing.services.gateway.audio_sessions import AudioSession, AudioSessions, error_text
-from kouxing.services.gateway.http import WebSockets
 from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.services.gateway.pcm_format import PcmFormat
+from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
 MAX_MICROPHONES = 16
-HELLO_TIMEOUT_S = 10.0
+OPTIONS_TIMEOUT_S = 10.0
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024  # 43 s of 48 kHz mono
 
 
-class Microphones:
+class MicrophoneHandler:
     """Serves ``/microphone``."""
 
     def __init__(
-        self, web_sockets: WebSockets, address_share: float, audio_sessions: AudioSessions
+        self, web_sockets: OpenWebSockets, address_share: float, audio_client: AudioClient
     ) -> None:
         self._web_sockets = web_sockets
         self._quota = ConnectionQuota(MAX_MICROPHONES, "microphones", address_share)
-        self._audio_sessions = audio_sessions
+        self._audio_client = audio_client
         self._session_names: dict[web.WebSocketResponse, str] = {}
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one microphone until it is turned off."""
-        # No pings: while the queue is full, nothing is read, and no answer to a ping either.
+        # No pings: while the queue is full, nothing is read, so pongs would not be seen.
         async with self._web_sockets.open(
             request, self._quota, max_message_bytes=MAX_MESSAGE_BYTES, ping_s=None
         ) as browser:
@@ -54,34 +54,34 @@ class Microphones:
         for browser in [b for b, name in self._session_names.items() if name == session]:
             reason = "the session was closed"
             with contextlib.suppress(ConnectionError):
-                await browser.send_str(wire.text("closed", text=reason))
+                await browser.send_str(browser_messages.text("closed", text=reason))
             await browser.close(message=reason.encode())
 
     async def _stream(self, browser: web.WebSocketResponse) -> None:
         """Open a session for a microphone and stream its audio."""
         try:
-            first = await browser.receive(HELLO_TIMEOUT_S)
+            first = await browser.receive(OPTIONS_TIMEOUT_S)
         except TimeoutError:
             raise UserError(
-                f"no description of the audio arrived within {HELLO_TIMEOUT_S:g} s; send it first"
+                f"no description of the audio arrived within {OPTIONS_TIMEOUT_S:g} s; send it first"
             ) from None
         if first.type is not WSMsgType.TEXT:
             raise UserError("the first message must be a JSON object that describes the audio")
-        hello = wire.parse_hello(first.data)
-        async with self._audio_sessions.open(
-            encoding=hello.pcm_format.encoding,
-            sample_rate_hz=hello.pcm_format.sample_rate_hz,
-            num_channels=hello.pcm_format.num_channels,
-            mouth_profile=hello.mouth_profile or None,
-            language=hello.language or None,
+        options = browser_messages.parse_microphone_options(first.data)
+        async with self._audio_client.open(
+            encoding=options.pcm_format.encoding,
+            sample_rate_hz=options.pcm_format.sample_rate_hz,
+            num_channels=options.pcm_format.num_channels,
+            mouth_profile=options.mouth_profile or None,
+            language=options.language or None,
         ) as session:
             self._session_names[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})
-            await browser.send_str(wire.text("opened", session=session.name))
-            audio_input = AudioInput(session, hello.pcm_format, is_ahead=hello.is_ahead)
+            await browser.send_str(browser_messages.text("opened", session=session.name))
+            audio_input = AudioInput(session, options.pcm_format, is_ahead=options.is_ahead)
             try:
                 async with audio_input.running():
-                    await self._forward_audio(browser, session, audio_input, hello.pcm_format)
+                    await self._forward_audio(browser, session, audio_input, options.pcm_format)
             finally:
                 self._session_names[browser] = ""
 
@@ -96,7 +96,7 @@ class Microphones:
             if message.type is WSMsgType.BINARY:
                 await audio_input.push(message.data)
             elif message.type is WSMsgType.TEXT:
-                command = wire.parse_command(message.data, pcm_format)
+                command = browser_messages.parse_command(message.data, pcm_format)
                 session.skip(command.num_skipped)
                 if command.flush:
                     await audio_input.flush()
@@ -104,5 +104,5 @@ class Microphones:
                     await session.set_lip_model(command.lip_model)
                 if command.eof:
                     await audio_input.end()
-            for error in session.errors():
+            for error in session.take_errors():
                 await browser.send_str(error_text(error))

@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.senders.connection import Connection
+from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.face_frame import FaceFrame
-from kouxing.services.senders.protocols import connect
+from kouxing.services.senders.protocols import make_connection
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
@@ -23,7 +23,7 @@ from kouxing.shared.face.idle_motion import FADE_S, RESTING_RATE_HZ, STALL_S, Re
 MAX_SENDERS = 16
 RATE_WINDOW_S = 2.0
 WINDOW_S = 2.0  # period in which the smallest network delay counts
-PAUSE_S = 0.5  # a frame that is this much later than the others follows a pause
+PAUSE_S = 0.5  # a frame that is this much later than other frames follows a pause
 MAX_COUNTED = 1000  # frames in the window
 
 Faps = NDArray[np.float32]
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SenderState:
-    """The state of a sender, for display."""
+    """The state of a sender for display."""
 
     target: str  # address, as given
     delay_ms: float  # additional delay of each frame
@@ -43,22 +43,22 @@ class SenderState:
 
 @dataclass(slots=True, eq=False)
 class _Sender:
-    connection: Connection
+    connection: TargetConnection
     task: asyncio.Task[None]
     delay_s: float
     queue: deque[tuple[float, FaceFrame]] = field(default_factory=deque)  # with earliest times
     timer: asyncio.TimerHandle | None = None
     sent_s: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_COUNTED))
-    reported: str = ""
+    reported: str = ""  # last reported problem
 
 
 class PlayoutClock:
     """Removes network jitter from frame times.
 
-    The frame with the smallest network delay defines when every other frame could have arrived at
-    the earliest. A frame is due at that time plus the target's delay. Without a delay it is due on
-    arrival; a delay above the jitter removes the jitter. Clocks drift, so only recent frames count.
-    The delay is measured again when media time stops, goes back or is late.
+    The frame with the smallest network delay defines the earliest possible arrival of all other
+    frames. A frame is due at its earliest arrival plus the target's delay. Without a delay, it is
+    due on arrival; a delay above the jitter removes the jitter. Clocks drift, so only recent
+    frames count. The measurement restarts when media time stops, jumps back or is late.
     """
 
     def __init__(self) -> None:
@@ -83,11 +83,11 @@ class PlayoutClock:
         return time_s + min(self._shortest_s, self._previous_shortest_s)
 
 
-class Senders:
+class SenderPool:
     """Sends the frames of one session to targets. All methods are safe to call from any thread.
 
     While no frames arrive, targets receive a face at rest. ``report`` is called with a target's
-    address and problem when the problem changes; the problem is empty when it is over.
+    address and problem when the problem changes. An empty problem means that it is solved.
     """
 
     def __init__(self, idle_motion_seed: int, report: Callable[[str, str], None]) -> None:
@@ -115,7 +115,7 @@ class Senders:
         self._call(lambda: self._stop(url))
 
     def set_delay(self, delay_s: float) -> None:
-        """Set the delay of all targets, in place of the delays in their addresses."""
+        """Set the delay of all targets; replaces the delays in their addresses."""
         self._call(lambda: self._set_delay(delay_s))
 
     @property
@@ -166,7 +166,7 @@ class Senders:
             return
         if len(self._senders) >= MAX_SENDERS:
             raise UserError(f"already sending to {MAX_SENDERS} programs; stop one first")
-        connection = connect(target)
+        connection = make_connection(target)
         task = self._loop.create_task(connection.run())
         self._senders[target.url] = _Sender(connection, task, target.delay_s)
         if self._timer is None:

@@ -1,4 +1,4 @@
-"""The kinds of service, and the addresses that they bind."""
+"""The kinds of services, and the addresses that they bind."""
 
 import contextlib
 import errno
@@ -46,7 +46,7 @@ def free_port_environment(
 ) -> dict[str, str]:
     """Return an environment in which services bind free ports, on 127.0.0.1 or the given hosts."""
     environment = {}
-    with contextlib.ExitStack() as probes:  # all stay open, so that all ports differ
+    with contextlib.ExitStack() as probes:  # all stay open, so that the ports differ
         for name in names:
             host = (hosts or {}).get(name, "127.0.0.1")
             for key, bound in bound_keys(KINDS[name].config_type).items():

@@ -1,4 +1,4 @@
-"""Learn my mouth: turn a browser's recording of a speaker's lips into a mouth profile.
+"""Serves *Learn my mouth*: turns a browser's recording of a speaker's lips into a mouth profile.
 
 The browser sends a landmark file (``docs/my_mouth.md``).
 """
@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 from aiohttp import web
 
-from kouxing.services.gateway.http import discard_body
-from kouxing.services.gateway.uploads import UPLOAD_LIMIT_S, Uploads, upload_error
-from kouxing.services.mouth_profiles import worker
+from kouxing.services.gateway.upload_handler import UPLOAD_LIMIT_S, UploadHandler, upload_error
+from kouxing.services.gateway.web_application import discard_body
+from kouxing.services.mouth_profiles import learning_process
 from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.logs import LOG
 
@@ -19,12 +19,14 @@ MAX_BYTES = 8 << 20
 LEARNING_LIMIT_S = 180.0
 
 
-class MouthLearner(Uploads):
+class MouthLearner(UploadHandler):
     """Answers a recording with the learned mouth profile."""
 
     busy_text = "another mouth profile is being created; try again in a minute"
 
-    def __init__(self, command: Sequence[str] = (sys.executable, "-m", worker.__name__)) -> None:
+    def __init__(
+        self, command: Sequence[str] = (sys.executable, "-m", learning_process.__name__)
+    ) -> None:
         super().__init__()
         self._command = command
 

@@ -1,10 +1,10 @@
-"""Answers requests: checks roles, and repeats the answer to a repeated request."""
+"""Handles requests: checks roles, and repeats the answer to a repeated request."""
 
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from kouxing.services.control.refusal import Refusal
+from kouxing.services.control.rejection import RequestRejected
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
@@ -25,12 +25,12 @@ from kouxing.shared.wire.session import (
 
 MAX_ANSWERS = 1000  # kept for repeated requests
 MAX_DEFERRED = 1000
-TEMPORARY_ERRORS = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)  # errors that may be temporary
+TEMPORARY_ERRORS = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)  # may be temporary
 Request: TypeAlias = OpenSession | CloseSession | FlushSession | SetFace | StatusRequest
 
 
-class Requests:
-    """Answers requests on control's socket.
+class RequestHandler:
+    """Handles requests on control's socket.
 
     While ``defers`` is set, requests that fail with a temporary error wait for ``retry_deferred``.
     """
@@ -59,17 +59,17 @@ class Requests:
             try:
                 self.check_role(sender, *roles)
                 answer = handle(message, sender)
-            except Refusal as refusal:
-                if self._can_defer(refusal):
+            except RequestRejected as rejection:
+                if self._can_defer(rejection):
                     self._deferred.append((on_request, message, sender))
                     return
-                self._metrics.count(f"refused_{refusal.code}")
+                self._metrics.count(f"refused_{rejection.code}")
                 answer = Error(
                     session=message.session,
-                    code=refusal.code,
-                    text=refusal.text,
+                    code=rejection.code,
+                    text=rejection.text,
                     request=message.request,
-                    retry_after_s=refusal.retry_after_s,
+                    retry_after_s=rejection.retry_after_s,
                 )
             if answer is not None:
                 self.answer(sender, message.request, answer)
@@ -87,11 +87,11 @@ class Requests:
     def check_role(self, sender: Peer, *roles: str) -> None:
         """Reject a sender unless its key has one of ``roles``; accept anyone if ``insecure``.
 
-        Raises ``Refusal`` if the key lacks these roles.
+        Raises ``RequestRejected`` if the key lacks these roles.
         """
         if roles and not self.has_role(sender.key, *roles):
             text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
-            raise Refusal(ErrorCode.NOT_ALLOWED, text)
+            raise RequestRejected(ErrorCode.NOT_ALLOWED, text)
 
     def has_role(self, key: str, *roles: str) -> bool:
         """Return whether a key has one of ``roles``; True if ``insecure``."""
@@ -124,7 +124,9 @@ class Requests:
         for handle, message, sender in deferred:
             handle(message, sender)
 
-    def _can_defer(self, refusal: Refusal) -> bool:
+    def _can_defer(self, rejection: RequestRejected) -> bool:
         return (
-            self.defers and refusal.code in TEMPORARY_ERRORS and len(self._deferred) < MAX_DEFERRED
+            self.defers
+            and rejection.code in TEMPORARY_ERRORS
+            and len(self._deferred) < MAX_DEFERRED
         )

@@ -6,10 +6,10 @@ Each step is sent to the services and the client of the session, and is publishe
 import math
 import time
 
-from kouxing.services.control.registry import Registry
-from kouxing.services.control.requests import Requests
+from kouxing.services.control.request_handler import RequestHandler
+from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
-from kouxing.services.control.sessions import Sessions
+from kouxing.services.control.session_table import SessionTable
 from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.records import replace
@@ -20,10 +20,10 @@ from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionM
 
 START_TIMEOUT_S = 5.0
 MOVE_TIMEOUT_S = 20.0  # time without a worker after which a session is closed
-REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)  # a client's connection may have broken
+REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)  # because a client's connection may have broken
 
 
-class Lifecycle:
+class SessionLifecycle:
     """Manages the lifecycle of control's sessions.
 
     ``commands`` is the socket for services and clients. ``events`` is the publisher of events, and
@@ -32,9 +32,9 @@ class Lifecycle:
 
     def __init__(
         self,
-        registry: Registry,
-        sessions: Sessions,
-        requests: Requests,
+        registry: ServiceRegistry,
+        sessions: SessionTable,
+        requests: RequestHandler,
         commands: Socket,
         events: Socket,
         events_address: str,
@@ -48,7 +48,7 @@ class Lifecycle:
         self._events_address = events_address
         self._metrics = metrics
         self._num_events = 0
-        self._repeats: list[tuple[float, SessionMoved]] = []  # times, and messages to repeat
+        self._repeats: list[tuple[float, SessionMoved]] = []  # times and messages to repeat
 
     def on_tick(self, now_s: float) -> float:
         """Repeat move messages and check timeouts; return when the next repetition is due."""
@@ -64,7 +64,7 @@ class Lifecycle:
         return min((due_s for due_s, _ in self._repeats), default=math.inf)
 
     def send_start(self, record: SessionRecord, instances: set[str]) -> None:
-        """Ask services to start serving a session."""
+        """Send services the start of a session."""
         start = record.start_message(time.monotonic())
         for instance in instances:
             self._commands.send(start, to=self._registry[instance].peer)
@@ -77,8 +77,8 @@ class Lifecycle:
     def announce_if_started(self, record: SessionRecord) -> None:
         """Notify the client that its session is open or has moved, once all services are ready.
 
-        A new session waits for the observers, so that they miss nothing. A moved session does not
-        wait for them, because its client still has audio to resend.
+        A new session waits for the observers, so that they miss no message. A moved session does
+        not wait for them, because its client still has audio to resend.
         """
         if record.lost:
             return
@@ -95,8 +95,8 @@ class Lifecycle:
         if self._sessions.move(record, time.monotonic()):
             self.send_start(record, record.waiting_for - record.deferred)
 
-    def refuse(self, record: SessionRecord, error: Error) -> None:
-        """Reject a session that was not announced to its client, and end it."""
+    def reject(self, record: SessionRecord, error: Error) -> None:
+        """Reject a session that is not announced to its client yet, and end it."""
         request = record.opening.request
         self._requests.answer(record.client, request, replace(error, request=request))
         self.end(record, error.text)
@@ -169,4 +169,4 @@ class Lifecycle:
             self.end(record, text)
         else:
             error = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text)
-            self.refuse(record, error)
+            self.reject(record, error)

@@ -1,19 +1,19 @@
-"""Collects the sessions of an earlier control, in the first seconds after startup."""
+"""Collects the sessions of an earlier control process in the first seconds after startup."""
 
 from collections.abc import Collection
 
-from kouxing.services.control.registry import Registry
+from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.shared.wire.control import Heartbeat, StartSession
 
-TAKEOVER_S = 5.0
+RECOVERY_S = 5.0
 
 
 class RestartRecovery:
-    """The sessions that services report after control has restarted, until ``end_s``."""
+    """The sessions that services report after a restart of control, until ``end_s``."""
 
-    def __init__(self, registry: Registry, now_s: float) -> None:
+    def __init__(self, registry: ServiceRegistry, now_s: float) -> None:
         self.is_active = True
-        self.end_s = now_s + TAKEOVER_S
+        self.end_s = now_s + RECOVERY_S
         self._registry = registry
         self._reported: dict[str, StartSession] = {}  # sessions that are not restored yet
         self._observed: dict[str, Collection[str]] = {}  # sessions by observer
@@ -32,7 +32,7 @@ class RestartRecovery:
             self._observed[heartbeat.instance] = heartbeat.sessions.keys()
 
     def pop_complete(self) -> list[StartSession]:
-        """Return the sessions whose workers are all back; at the end, all sessions."""
+        """Remove and return the sessions whose workers are all back; at the end, all sessions."""
         complete = [
             start
             for start in self._reported.values()
@@ -43,7 +43,7 @@ class RestartRecovery:
             del self._reported[start.session]
         return complete
 
-    def observers_without_start(self, session: str) -> set[str]:
+    def observers_that_missed_start(self, session: str) -> set[str]:
         """Return the observers that do not take part in a session yet."""
         return {
             instance

@@ -2,21 +2,21 @@
 
 from collections.abc import Iterator
 
-from kouxing.services.control.registry import Registry, ServiceRecord
+from kouxing.services.control.service_registry import ServiceRecord, ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
-from kouxing.services.control.sessions import Sessions
+from kouxing.services.control.session_table import SessionTable
 from kouxing.shared.wire.codec import encoded_size
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ServiceState, SessionState, StatusReport, StatusRequest
 
-PAGE_BYTES = 512 * 1024  # the largest state after that still fits into a message
+PAGE_BYTES = 512 * 1024  # so that the largest state still fits into the message
 FIRST_SESSION = 2**32  # number of the first session; services have smaller numbers
 
 
-class Status:
+class StatusReporter:
     """Builds status reports."""
 
-    def __init__(self, registry: Registry, sessions: Sessions) -> None:
+    def __init__(self, registry: ServiceRegistry, sessions: SessionTable) -> None:
         self._registry = registry
         self._sessions = sessions
 
@@ -31,7 +31,7 @@ class Status:
         """Return one page, or the state of one session and its services.
 
         The address of the web page contains its token only if ``shows_token``: with the token,
-        anyone can open sessions. Raises ``Refusal`` if there is no such session.
+        anyone can open sessions. Raises ``RequestRejected`` if there is no such session.
         """
         services: list[ServiceState] = []
         sessions: list[SessionState] = []
@@ -70,7 +70,7 @@ class Status:
         first = message.after
         if first < FIRST_SESSION:
             yield from enumerate(self._registry.sorted()[first:], first)
-        for session in self._sessions.numbered_from(first - FIRST_SESSION):
+        for session in self._sessions.sessions_from(first - FIRST_SESSION):
             yield FIRST_SESSION + session.number, session
 
     def _service_state(

@@ -4,11 +4,11 @@
           -> lip frames with the longest delay
           -> face
 
-The live chain's ``FaceAnimator`` makes the face, with the same lip models and modifiers. It
-has the longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes
-blend all visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small to see.
-With learned lips, phones also decide where the lips do not close. In the live chain, phones arrive
-too late for this.
+The live pipeline's ``FaceAnimator`` makes the face, with the same lip models and modifiers. It has
+the longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes blend
+all visemes within 1.5 s (Wang & Cai 2003, eq. 6); more distant visemes have no visible weight.
+With learned lips, phones can also prevent closures. In the live pipeline, phones arrive too late
+for this.
 """
 
 import dataclasses
@@ -44,15 +44,15 @@ from kouxing.shared.phones.events import (
 )
 from kouxing.shared.records import replace
 
-# Tuned on the same held-out clips as the rule of the live chain. If the sound has one closure and
-# the phones have two, the vowel between them counts. No clip has such a place.
+# Tuned on the same held-out clips as the rule of the live pipeline, except ``vowel``: no clip has
+# one closure in the sound and two in the phones.
 _RECOGNIZED = ClosureRule(other=1.0, vowel=3.0)
-_KNOWN_TEXT = ClosureRule(phone=6.0, other=6.0)  # the phones decide
+_KNOWN_TEXT = ClosureRule(phone=6.0, other=6.0)  # phones outweigh the sound
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnalyzedRecording:
-    """Everything that moves a face, for a whole recording."""
+    """All inputs of a face, for a whole recording."""
 
     duration_s: float
     events: Sequence[SoundEvent]  # phones, lip frames, voice activity and levels; not sorted
@@ -81,11 +81,10 @@ def analyze_recording(
     phones
         The phones of the recording, recognized or of a known text.
     lip_predictor
-        The network that predicts learned lips, if any.
+        Predicts the lip frames; None: no lip frames.
     is_text_known
         Whether the phones come from a known text.
-    with_progress
-        Shows the progress.
+    with_progress Wraps the loop to show progress.
     """
     lip_stream = None
     if lip_predictor is not None:
@@ -127,9 +126,9 @@ def animate_recording(
     config: SynthesizerConfig,
     with_progress: WithProgress = iter,
 ) -> list[Frame]:
-    """Return all frames of a recording, until the face is at rest. ``delay_ms`` is ignored.
+    """Return all frames of a recording, until the face is at rest.
 
-    ``with_progress`` shows the progress.
+    ``delay_ms`` is ignored. ``with_progress`` wraps the loop to show progress.
     """
     if isinstance(lip_model, LearnedLips):
         lip_model = dataclasses.replace(

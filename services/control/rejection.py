@@ -1,10 +1,10 @@
-"""A request that control refuses."""
+"""The exception for a request that control rejects."""
 
 from kouxing.shared.wire.session import ErrorCode
 
 
-class Refusal(Exception):
-    """Control refuses a request; the sender gets an ``error`` with these fields."""
+class RequestRejected(Exception):
+    """Control rejects a request; the sender receives an ``error`` with these fields."""
 
     def __init__(self, code: ErrorCode, text: str, retry_after_s: float | None = None) -> None:
         super().__init__(text)

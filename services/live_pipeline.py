@@ -1,8 +1,8 @@
-"""The whole chain in one process, without sockets: audio in, FAP frames out.
+"""The whole pipeline in one process, without sockets: turns audio into FAP frames.
 
 The services run the same two halves, ``SpeechStream`` and ``FaceAnimator``, and exchange messages
-between them. Offline rendering and evaluation use this chain. Its frames are identical, bit for
-bit.
+between them. Offline rendering and evaluation use this pipeline. Its frames equal those of the
+services bit for bit.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import SoundEvent, Waveform
 
 
-def sound_events(
+def recognize_events(
     model: AcousticModel,
     samples: NDArray[np.float32],
     lip_predictor: LipFrameModel | None,
@@ -42,7 +42,7 @@ def sound_events(
     return _decode(recognizer, stream)
 
 
-class LiveChain:
+class LivePipeline:
     """Computes the FAP frames of one session from its audio.
 
     Parameters
@@ -56,7 +56,7 @@ class LiveChain:
     synthesizer
         Settings of the synthesizer. ``lips`` is ignored.
     lip_predictor
-        The network that predicts learned lips. If None, the recognizer's default.
+        Predicts the lip frames. If None, the recognizer's default predictor.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class LiveChain:
 
     Examples
     --------
-    >>> chain = LiveChain(load_model(), load_lip_model())
+    >>> chain = LivePipeline(load_model(), load_lip_model())
     >>> frames = chain.accept_waveform(samples) + chain.input_finished()
     """
 
@@ -113,7 +113,7 @@ class LiveChain:
     ) -> list[Frame]:
         """Process a whole recording, shape (n,), a second at a time; return all frames.
 
-        The sample rate is 16 kHz. ``with_progress`` shows the progress.
+        The sample rate is 16 kHz. ``with_progress`` wraps the loop to show progress.
         """
         frames: list[Frame] = []
         for start in with_progress(range(0, len(samples), MEDIA_RATE_HZ)):

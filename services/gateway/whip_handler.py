@@ -16,14 +16,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from aiohttp import web
+from kouxing.services.gateway.audio_client import AudioClient, AudioSession, error_text
 from kouxing_client import KouxingError, Refused
 
-from kouxing.services.gateway import wire
-from kouxing.services.gateway.audio_sessions import AudioSession, AudioSessions, error_text
+from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
+from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.viewer_queue import MessageKind
-from kouxing.services.gateway.viewers import Viewers
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
@@ -34,24 +34,24 @@ if TYPE_CHECKING:
 
 MAX_CLIENTS = 16
 SDP = "application/sdp"
-MAX_COMMANDS = 100  # queued, for one client
+MAX_COMMANDS = 100  # limit of queued commands of one client
 MAX_BUFFERED_BYTES = 16 * 1024  # limit for a data channel; more messages stay in the viewer's queue
 BUFFER_CHECK_S = 0.02
-MISSING = (
+NO_WEBRTC = (
     "this gateway has no WebRTC; install it where the gateway runs: pip install 'kouxing[webrtc]'\n"
 )
 
 
 @dataclass(slots=True, eq=False)
 class _Client:
-    shape_encoder: ShapeEncoder | None  # for frames as blendshapes, in addition to FAPs
+    shape_encoder: ShapeEncoder | None  # encodes frames as blendshapes, in addition to FAPs
     peer: WebRtcPeer | None = None
     session: AudioSession | None = None
     is_ending: bool = False  # the gateway itself closes the session
     tasks: set[asyncio.Task[None]] = field(default_factory=set)  # tasks of the data channel
 
 
-class WhipClients:
+class WhipHandler:
     """Serves ``/whip``.
 
     Clients may connect at ``addresses`` of this machine; empty: all except loopback.
@@ -60,12 +60,12 @@ class WhipClients:
     def __init__(
         self,
         address_share: float,
-        audio_sessions: AudioSessions,
-        viewers: Viewers,
+        audio_client: AudioClient,
+        viewers: ViewerHandler,
         addresses: Sequence[str],
     ) -> None:
         self._quota = ConnectionQuota(MAX_CLIENTS, "WebRTC clients", address_share)
-        self._audio_sessions = audio_sessions
+        self._audio_client = audio_client
         self._viewers = viewers
         self._addresses = addresses
         self._clients: dict[str, _Client] = {}  # by the names of their resources
@@ -94,7 +94,7 @@ class WhipClients:
             try:
                 client.peer = peer = await self._make_peer(client)
                 answer = await peer.answer(offer)
-                opening = self._audio_sessions.open(
+                opening = self._audio_client.open(
                     encoding="s16le", sample_rate_hz=peer.rate_hz, num_channels=peer.num_channels
                 )
                 client.session = session = await stack.enter_async_context(opening)
@@ -136,7 +136,7 @@ class WhipClients:
         try:
             webrtc = await asyncio.to_thread(importlib.import_module, name)
         except ModuleNotFoundError:
-            raise web.HTTPNotImplemented(text=MISSING) from None
+            raise web.HTTPNotImplemented(text=NO_WEBRTC) from None
         if self._addresses:
             webrtc.use_addresses(self._addresses)
         peer: WebRtcPeer = webrtc.WebRtcPeer(lambda channel: self._on_channel(client, channel))
@@ -152,10 +152,10 @@ class WhipClients:
         """Stream a client's sound into its session until it disconnects, then close the stack."""
         async with stack:
             LOG.info("a WebRTC client is streaming", extra={"session": session.name})
-            async for num_lost, pcm, num_frames in peer.sound():
+            async for num_lost, pcm, num_frames in peer.receive_audio():
                 session.skip(num_lost)
                 session.send(pcm, num_frames)
-                for error in session.errors():
+                for error in session.take_errors():
                     self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
             client.is_ending = True
 
@@ -186,10 +186,10 @@ class WhipClients:
         self, session: AudioSession, shape_encoder: ShapeEncoder | None, channel: RTCDataChannel
     ) -> None:
         """Send the messages of a viewer of the session, except the sound."""
-        with self._viewers.connected(session.name, shape_encoder) as viewer:
+        with self._viewers.connect_viewer(session.name, shape_encoder) as viewer:
             while True:
                 message = await viewer.queue.get()
-                if isinstance(message, bytes) and message[0] == wire.SOUND_TYPE:
+                if isinstance(message, bytes) and message[0] == browser_messages.SOUND_TYPE:
                     continue
                 if channel.readyState != "open":
                     return
@@ -206,7 +206,7 @@ class WhipClients:
             try:
                 if isinstance(message, bytes):
                     raise UserError("expected a JSON object in a text message")
-                command = wire.parse_command(message)
+                command = browser_messages.parse_command(message)
                 if command.flush:
                     await session.flush()
                 if command.lip_model:

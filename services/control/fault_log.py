@@ -1,10 +1,10 @@
-"""Faults of services. Short faults are only logged; longer ones are reported."""
+"""Logs lost services. Short faults are only logged; longer faults are reported."""
 
 from dataclasses import dataclass
 
 from kouxing.shared.logs import LOG
 
-SHORT_S = 1.0  # the fault of a service that is back within this time is not reported
+SHORT_S = 1.0  # faults of services that return within this time are not reported
 MAX_FAULTS = 1000
 
 
@@ -16,7 +16,7 @@ class _Fault:
 
 
 class FaultLog:
-    """Services that are lost. A warning also reaches the supervisor's console."""
+    """The lost services. Warnings also reach the supervisor's console."""
 
     def __init__(self) -> None:
         self._faults: dict[str, _Fault] = {}  # by instance, oldest first
@@ -30,14 +30,14 @@ class FaultLog:
             del self._faults[next(iter(self._faults))]
 
     def report(self, now_s: float) -> None:
-        """Report faults that have become long."""
+        """Report faults that last longer than ``SHORT_S``."""
         for fault in self._faults.values():
             if not fault.is_reported and now_s - fault.begin_s > SHORT_S:
                 fault.is_reported = True
                 LOG.warning(fault.text)
 
     def end(self, instance: str, now_s: float) -> float:
-        """Record that a service has registered; return for how long it was lost.
+        """Record that a service has registered; return how long it was lost, seconds.
 
         The return is reported if the loss was reported.
         """

@@ -1,4 +1,4 @@
-"""The open sessions; no sockets, so that tests can check every rule."""
+"""Keeps the open sessions, without sockets, so that tests can check every rule."""
 
 import math
 import secrets
@@ -9,8 +9,8 @@ from itertools import count
 from operator import attrgetter
 
 from kouxing.services.control.placement import Placement
-from kouxing.services.control.refusal import Refusal
-from kouxing.services.control.registry import Registry
+from kouxing.services.control.rejection import RequestRejected
+from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import MAX_KEY_SHARE, Peer
@@ -21,19 +21,19 @@ from kouxing.shared.wire.face import CurrentFace, FaceSettings
 from kouxing.shared.wire.session import ErrorCode, OpenSession
 
 
-class Sessions:
-    """The open sessions by name. Indexes avoid iterating over all of them."""
+class SessionTable:
+    """The open sessions, by name. Indexes avoid iterating over all sessions."""
 
-    def __init__(self, registry: Registry, placement: Placement, max_sessions: int) -> None:
+    def __init__(self, registry: ServiceRegistry, placement: Placement, max_sessions: int) -> None:
         self._registry = registry
         self._placement = placement
         self._max_sessions = max_sessions
         self._records: dict[str, SessionRecord] = {}
         self._numbers = count()
         self._pending: dict[str, SessionRecord] = {}
-        self._of_worker: dict[str, dict[str, SessionRecord]] = {}
+        self._by_worker: dict[str, dict[str, SessionRecord]] = {}
         self._num_per_key: Counter[str] = Counter()
-        self._of_request: dict[tuple[Peer, str], SessionRecord] = {}
+        self._by_request: dict[tuple[Peer, str], SessionRecord] = {}
 
     def __iter__(self) -> Iterator[SessionRecord]:
         return iter(list(self._records.values()))
@@ -48,11 +48,11 @@ class Sessions:
         return self._records.get(name)
 
     def find(self, name: str) -> SessionRecord:
-        """Return a session; raise ``Refusal`` if there is no such session."""
+        """Return a session; raise ``RequestRejected`` if there is no such session."""
         record = self._records.get(name)
         if record is None:
             text = f"session {name!r} does not exist; open it first"
-            raise Refusal(ErrorCode.UNKNOWN_SESSION, text)
+            raise RequestRejected(ErrorCode.UNKNOWN_SESSION, text)
         return record
 
     def listeners_of(self, name: str) -> list[SessionRecord]:
@@ -61,14 +61,14 @@ class Sessions:
             record for record in self._records.values() if record.face.settings.listen_to == name
         ]
 
-    def find_owned(self, name: str, token: str) -> SessionRecord:
-        """Return a session whose token is given.
+    def find_authorized(self, name: str, token: str) -> SessionRecord:
+        """Return a session after checking its token.
 
-        Raises ``Refusal`` if there is no such session, or it has another token.
+        Raises ``RequestRejected`` if there is no such session, or it has another token.
         """
         record = self.find(name)
         if not secrets.compare_digest(record.token.encode(), token.encode()):
-            raise Refusal(
+            raise RequestRejected(
                 ErrorCode.BAD_TOKEN,
                 f"wrong token for session {name!r}; use the token of session-opened",
             )
@@ -76,14 +76,14 @@ class Sessions:
 
     def find_by_request(self, opening: OpenSession, client: Peer) -> SessionRecord | None:
         """Return the session that a client opened with this request, or None."""
-        record = self._of_request.get((client, opening.request))
+        record = self._by_request.get((client, opening.request))
         if record is None:
             return None
         same = replace(record.opening, session=opening.session, face=opening.face) == opening
         return record if same else None
 
-    def numbered_from(self, number: int) -> list[SessionRecord]:
-        """Return the sessions with this number or more; newer sessions have greater numbers."""
+    def sessions_from(self, number: int) -> list[SessionRecord]:
+        """Return the sessions with this number or more. Newer sessions have greater numbers."""
         records = list(self._records.values())
         return records[bisect_left(records, number, key=attrgetter("number")) :]
 
@@ -92,7 +92,7 @@ class Sessions:
         return [key for key, number in self._num_per_key.items() if number]
 
     def pending(self) -> list[SessionRecord]:
-        """Return the sessions that wait for a service, or whose client must be informed."""
+        """Return the sessions that wait for a service, or whose client must be notified."""
         for record in list(self._pending.values()):
             if record.is_settled:
                 del self._pending[record.name]
@@ -100,10 +100,10 @@ class Sessions:
 
     def num_speaking(self, instance: str) -> int:
         """Return the number of a worker's sessions with current speech."""
-        return sum(record.speaking for record in self._of_worker.get(instance, {}).values())
+        return sum(record.speaking for record in self._by_worker.get(instance, {}).values())
 
     def participants(self, record: SessionRecord) -> set[str]:
-        """Return the running services that take part: the session's workers and all observers."""
+        """Return a session's running services: its workers and all observers."""
         return ({*record.workers.values()} - record.lost) | self._registry.observers()
 
     def is_participant(self, record: SessionRecord, instance: str) -> bool:
@@ -117,20 +117,20 @@ class Sessions:
     def open(self, opening: OpenSession, client: Peer, now_s: float) -> SessionRecord:
         """Place a new session.
 
-        Raises ``Refusal`` if the name is taken, there are too many sessions, a service is missing
-        or busy, or no recognizer has the language.
+        Raises ``RequestRejected`` if the name is taken, there are too many sessions, a service is
+        missing or busy, or no recognizer has the language.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
         if name in self._records:
             text = f"session {name!r} is open; choose another name"
-            raise Refusal(ErrorCode.SESSION_EXISTS, text)
+            raise RequestRejected(ErrorCode.SESSION_EXISTS, text)
         if len(self._records) >= self._max_sessions:
             text = f"the limit of control.max_sessions is reached: {self._max_sessions}"
-            raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
+            raise RequestRejected(ErrorCode.TOO_MANY_SESSIONS, text)
         num_of_key = self._num_per_key[client.key]
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
             text = f"your key has {num_of_key} open sessions, the maximum; close one first"
-            raise Refusal(ErrorCode.TOO_MANY_SESSIONS, text)
+            raise RequestRejected(ErrorCode.TOO_MANY_SESSIONS, text)
         leaves_room = client.key and num_of_key and not opening.paced  # room for another client
         language = _language_of(opening)
         workers = self._placement.place({}, now_s, language, min_room=2 if leaves_room else 1)
@@ -157,7 +157,7 @@ class Sessions:
         return record
 
     def restore(self, start: StartSession, now_s: float) -> SessionRecord:
-        """Add a session that an earlier control placed; workers that do not run are lost."""
+        """Add a session that an earlier control placed. Workers that do not run count as lost."""
         running: set[str] = set()
         workers: dict[str, str] = {}
         for name, address in start.endpoints.items():
@@ -201,13 +201,13 @@ class Sessions:
         del self._records[record.name]
         self._pending.pop(record.name, None)
         self._num_per_key[record.client.key] -= 1
-        self._of_request.pop((record.client, record.opening.request), None)
+        self._by_request.pop((record.client, record.opening.request), None)
         self._set_workers(record, {}, now_s)
 
     # --- reports of services -------------------------------------------------------------------
 
     def record_input(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
-        """Record a service's progress in a session's input; return its idle time."""
+        """Record a service's progress in a session; return the time without input."""
         state = heartbeat.sessions[record.name]
         record.media_time = max(record.media_time, state.media_time)
         if state.skipped_s:
@@ -229,11 +229,11 @@ class Sessions:
         return deferred
 
     def mark_worker_lost(self, instance: str, now_s: float) -> list[SessionRecord]:
-        """Record that a service is lost; return the sessions that lack a worker now."""
+        """Record that a service is lost; return the sessions that now lack a worker."""
         for record in self._pending.values():
             record.waiting_for.discard(instance)
             record.deferred.discard(instance)
-        records = list(self._of_worker.get(instance, {}).values())
+        records = list(self._by_worker.get(instance, {}).values())
         for record in records:
             record.lost.add(instance)
             record.started_s = now_s
@@ -241,13 +241,13 @@ class Sessions:
         return records
 
     def reinstate_worker(self, instance: str) -> list[SessionRecord]:
-        """Reinstate a worker wrongly declared lost.
+        """Reinstate a worker that was declared lost by mistake.
 
         Returns the sessions whose start it may have missed.
         """
         records = [
             record
-            for record in self._of_worker.get(instance, {}).values()
+            for record in self._by_worker.get(instance, {}).values()
             if instance in record.lost
         ]
         for record in records:
@@ -266,7 +266,7 @@ class Sessions:
         remaining = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:
             workers = self._placement.place(remaining, now_s, record.facts.language)
-        except Refusal:
+        except RequestRejected:
             return False
         record.deferred = {workers["audio"]}
         if "audio" not in remaining:
@@ -287,29 +287,29 @@ class Sessions:
         self._records[record.name] = record
         self._pending[record.name] = record
         self._num_per_key[record.client.key] += 1
-        self._of_request[record.client, record.opening.request] = record
+        self._by_request[record.client, record.opening.request] = record
         self._set_workers(record, workers, now_s)
 
     def _set_workers(self, record: SessionRecord, workers: dict[str, str], now_s: float) -> None:
         before, after = {*record.workers.values()}, {*workers.values()}
         for instance in before - after:
-            of_worker = self._of_worker[instance]
-            del of_worker[record.name]
+            sessions_of_worker = self._by_worker[instance]
+            del sessions_of_worker[record.name]
             self._registry.load(instance).remove_session(now_s, paced=record.opening.paced)
-            if not of_worker:
-                del self._of_worker[instance]
+            if not sessions_of_worker:
+                del self._by_worker[instance]
                 self._registry.forget_load(instance)
         record.workers = workers
         for instance in after - before:
-            self._of_worker.setdefault(instance, {})[record.name] = record
+            self._by_worker.setdefault(instance, {})[record.name] = record
             self._registry.load(instance).add_session(now_s, paced=record.opening.paced)
 
 
 def _language_of(opening: OpenSession) -> str | None:
-    """Return the name of the language that a client chose; None if it did not choose one."""
+    """Return the name of the language that a client requested; None without a request."""
     if opening.language is None:
         return None
     try:
         return find_language(opening.language)
     except UserError as error:
-        raise Refusal(ErrorCode.BAD_LANGUAGE, str(error)) from None
+        raise RequestRejected(ErrorCode.BAD_LANGUAGE, str(error)) from None

@@ -1,4 +1,4 @@
-"""Messages on the gateway's WebSockets; ``proto/GATEWAY.md`` specifies them.
+"""Parses and encodes messages on the gateway's WebSockets; ``proto/GATEWAY.md`` specifies them.
 
 Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media time (samples at
 16 kHz), then the payload at an offset that is a multiple of four.
@@ -55,17 +55,17 @@ def error_text(reason: str, code: str = "refused", retry_after_s: float = 0.0) -
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hello:
-    """First message of a microphone."""
+class MicrophoneOptions:
+    """The first message of a microphone."""
 
     pcm_format: PcmFormat
     is_ahead: bool  # audio may arrive faster than real time
-    mouth_profile: bytes  # the speaker's; empty: the average speaker
-    language: str  # spoken language; empty: the recognizer's
+    mouth_profile: bytes  # profile of the speaker; empty: average speaker
+    language: str  # spoken language; empty: language of the recognizer
 
 
-def parse_hello(message: str) -> Hello:
-    """Return the first message of a microphone.
+def parse_microphone_options(message: str) -> MicrophoneOptions:
+    """Parse the first message of a microphone.
 
     Raises ``UserError`` if a field is missing or out of range; the text names the field.
     """
@@ -75,7 +75,7 @@ def parse_hello(message: str) -> Hello:
         num_channels=fields.get("num_channels", 1),  # type: ignore[arg-type]
         encoding=fields.get("encoding", "s16le"),  # type: ignore[arg-type]
     )
-    return Hello(
+    return MicrophoneOptions(
         pcm_format=pcm_format,
         is_ahead=bool(fields.get("ahead")),
         mouth_profile=_parse_mouth_profile(fields.get("mouth_profile", "")),
@@ -106,12 +106,12 @@ class MicrophoneCommand:
 
     flush: bool  # interrupt: drop audio whose face is not shown yet
     eof: bool  # no more audio follows
-    num_skipped: int  # samples of each channel that the client left out
-    lip_model: str  # to change to; empty: no change
+    num_skipped: int  # samples per channel that the client skipped
+    lip_model: str  # the new lip model; empty: no change
 
 
 def parse_command(message: str, pcm_format: PcmFormat | None = None) -> MicrophoneCommand:
-    """Return a later text message of a microphone.
+    """Parse a later text message of a microphone.
 
     Raises ``UserError`` if the message is not a JSON object, a field is out of range, or it
     describes audio of another format than ``pcm_format``.

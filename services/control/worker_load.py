@@ -1,22 +1,22 @@
-"""The load of each worker, and whether it has room for another session.
+"""Measures the load of each worker, and decides whether it has room for another session.
 
 A heartbeat states the fraction of the last two seconds in which a worker's loop was busy. Sessions
 that were placed or ended since then count with the cost of one session: the highest cost measured
-recently. Every session is expected to take that much, since a silent client may start to speak at
-any moment. A worker processes the audio of all sessions together, so each of many sessions costs
-less. While most sessions speak, the cost falls quickly to the load divided by their number. While
-they are silent, it does not fall below that.
+recently. Every session is expected to need this cost, because a silent client may start to speak
+at any moment. A worker processes the audio of all sessions together, so each of many sessions
+costs less. While most sessions speak, the cost falls quickly to the load divided by their number.
+While they are silent, it does not fall below this value.
 """
 
 from collections import deque
 
 EQUAL_LOAD = 0.05  # loads that differ by less are equal
-MIN_SESSIONS = 2  # always accepted: on a busy machine every session seems expensive
+MIN_SESSIONS = 2  # always accepted, because every session seems expensive on a busy machine
 MEASURED_S = 2.0  # period over which a worker measures its load
 DEFAULT_COST = 0.1  # cost of a session until it is measured; typical of a slow machine
 COST_HALF_LIFE_S = 60.0  # half-life of the highest measured cost
 SPEAKING_HALF_LIFE_S = 4.0  # half-life of the cost while speaking sessions cost less
-RETRY_AFTER_S = 5.0  # for a client that is refused
+RETRY_AFTER_S = 5.0  # wait of a rejected client
 
 
 class WorkerLoad:
@@ -46,7 +46,7 @@ class WorkerLoad:
         self._placed_s.append(now_s)
 
     def remove_session(self, now_s: float, *, paced: bool) -> None:
-        """Count one session fewer."""
+        """Stop counting a session."""
         self.num_sessions -= 1
         self._ended_s.append(now_s)
         if not paced:
@@ -63,22 +63,22 @@ class WorkerLoad:
         if not num_measured:
             self._idle = load if self._idle is None else min(load, self._idle)
         else:
-            of_sessions = max(0.0, load - (self._idle or 0.0))
-            mean = of_sessions / num_measured
+            sessions_load = max(0.0, load - (self._idle or 0.0))
+            mean = sessions_load / num_measured
             if 2 * num_speaking >= num_measured:
                 self._speaking_cost = mean
-            is_cheaper = self.cost * num_speaking > of_sessions
+            is_cheaper = self.cost * num_speaking > sessions_load
             half_life_s = SPEAKING_HALF_LIFE_S if is_cheaper else COST_HALF_LIFE_S
             decayed = (self._cost or 0.0) * 0.5 ** (passed_s / half_life_s)
             self._cost = max(mean, decayed, self._speaking_cost)
 
     def expected(self, now_s: float) -> float:
-        """Return the load when all sessions speak."""
-        of_sessions = self.num_sessions * self.cost
+        """Return the expected load when all sessions speak."""
+        sessions_load = self.num_sessions * self.cost
         if self._is_unpaced(now_s):
-            return of_sessions
+            return sessions_load
         num_new = _num_recent(self._placed_s, now_s) - _num_recent(self._ended_s, now_s)
-        return max(of_sessions, self._measured + num_new * self.cost)
+        return max(sessions_load, self._measured + num_new * self.cost)
 
     def has_room(self, num_new: int, now_s: float, max_load: float) -> bool:
         """Return whether more sessions stay within a limit; the first sessions always do."""
@@ -87,12 +87,12 @@ class WorkerLoad:
         return self.expected(now_s) + num_new * self.cost <= max_load
 
     def _is_unpaced(self, now_s: float) -> bool:
-        """Return whether the load is meaningless: unpaced audio uses all idle time."""
+        """Return whether the load is meaningless, because unpaced audio uses all idle time."""
         return self._num_unpaced > 0 or now_s < self._unpaced_until_s
 
 
 def _num_recent(times_s: deque[float], now_s: float) -> int:
-    """Drop the times that the measured load includes; return the number of the others."""
+    """Drop the times that the measured load already includes; return the number of later times."""
     while times_s and times_s[0] <= now_s - MEASURED_S:
         times_s.popleft()
     return len(times_s)

@@ -19,17 +19,17 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.page_heads import page_heads_folder
 from kouxing.shared.phones.inventory import language_titles
 
-PAGE = Path(__file__).parent / "page"
-LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
-PING_S = 20.0  # a browser that has vanished is detected within this time
-MAX_MESSAGE_BYTES = 128 * 1024  # limit for a WebSocket message, unless it has audio
-CHUNK_BYTES = 32 * 1024  # size of a piece of a file; a client that does not read occupies two
+PAGE_FOLDER = Path(__file__).parent / "page"
+LIGHT_SHADER = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
+PING_S = 20.0  # interval of pings that detect vanished browsers
+MAX_MESSAGE_BYTES = 128 * 1024  # limit for a WebSocket message without audio
+CHUNK_BYTES = 32 * 1024  # size of a piece of a file; a client that does not read holds two
 DISCARD_S = 5.0
-LINGER_S = 1.0  # data is still read, and discarded, after an invalid message
+LINGER_S = 1.0  # after an invalid message, data is read and discarded for this time
 MAX_REASON_BYTES = 123  # limit for the reason in a close frame, RFC 6455
-MAX_BODY_BYTES = 128 * 1024  # unless a handler reads the body in pieces
+MAX_BODY_BYTES = 128 * 1024  # handlers of uploads set other limits
 FACE_MESH_FRAME = "face-mesh.html"
-_CLOSE_REASONS: dict[int, str] = {  # reasons for the closes that aiohttp makes
+_CLOSE_REASONS: dict[int, str] = {  # when aiohttp closes the connection
     WSCloseCode.OK: "the connection has ended",
     WSCloseCode.PROTOCOL_ERROR: "the data is not a valid WebSocket message",
     WSCloseCode.INVALID_TEXT: "a text message is not valid UTF-8",
@@ -37,8 +37,8 @@ _CLOSE_REASONS: dict[int, str] = {  # reasons for the closes that aiohttp makes
 }
 _PAGE_SUFFIXES = {".html", ".js", ".css", ".svg", ".glb", ".webp"}
 _FACE_MESH_SUFFIXES = {".js", ".wasm", ".data", ".binarypb"}
-# The face mesh's WebAssembly glue compiles text into functions. It runs in a frame that permits
-# this but has no access to the camera or the microphone.
+# The face mesh's WebAssembly glue code compiles text into functions. It runs in a frame that
+# permits this but has no access to camera or microphone.
 _FACE_MESH_POLICIES = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self' 'unsafe-eval'; connect-src 'self'; "
@@ -47,14 +47,14 @@ _FACE_MESH_POLICIES = {
     "Permissions-Policy": "camera=(), microphone=()",
 }
 _IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
-_NO_MODULES = f"the page's JavaScript modules are missing; run 'npm ci' in {PAGE}"
+_NO_MODULES = f"the page's JavaScript modules are missing; run 'npm ci' in {PAGE_FOLDER}"
 
 
 class _WebSocket(web.WebSocketResponse):
     """A WebSocket that gives a reason whenever it closes."""
 
     def __init__(self, max_message_bytes: int, ping_s: float | None) -> None:
-        # aiohttp rejects messages of the limit itself
+        # aiohttp also rejects messages of exactly this size
         super().__init__(
             heartbeat=ping_s,
             max_msg_size=max_message_bytes + 1,
@@ -68,7 +68,9 @@ class _WebSocket(web.WebSocketResponse):
         self, *, code: int = WSCloseCode.OK, message: bytes = b"", drain: bool = True
     ) -> bool:
         reason = message or _CLOSE_REASONS.get(code, "").format(self._max_size).encode()
-        reason = reason[:MAX_REASON_BYTES].decode(errors="ignore").encode()  # whole letters
+        reason = (
+            reason[:MAX_REASON_BYTES].decode(errors="ignore").encode()
+        )  # without an incomplete character
         if code in _CLOSE_REASONS and code != WSCloseCode.OK and not self.closed:
             # The client may still send. It would lose the reason if the connection closed now.
             with contextlib.suppress(ConnectionError):
@@ -77,8 +79,8 @@ class _WebSocket(web.WebSocketResponse):
         return await super().close(code=code, message=reason, drain=drain)
 
 
-class WebSockets:
-    """The browsers' open WebSockets."""
+class OpenWebSockets:
+    """Tracks the browsers' open WebSockets."""
 
     def __init__(self) -> None:
         self._open: set[web.WebSocketResponse] = set()
@@ -96,7 +98,7 @@ class WebSockets:
         max_message_bytes: int = MAX_MESSAGE_BYTES,
         ping_s: float | None = PING_S,
     ) -> AsyncIterator[web.WebSocketResponse]:
-        """Answer a request with a WebSocket that is open while the context is.
+        """Answer a request with a WebSocket that stays open while the context is open.
 
         Raises ``web.HTTPServiceUnavailable`` if the quota is used up or the gateway is stopping.
         """
@@ -182,7 +184,7 @@ def _modules_folder() -> Path | None:
 
     An installed package has them in ``vendor``, a source tree in ``node_modules``.
     """
-    for folder in (PAGE / "vendor", PAGE / "node_modules"):
+    for folder in (PAGE_FOLDER / "vendor", PAGE_FOLDER / "node_modules"):
         if (folder / "three").is_dir() and (folder / "@mediapipe" / "face_mesh").is_dir():
             return folder
     return None
@@ -190,7 +192,7 @@ def _modules_folder() -> Path | None:
 
 async def _serve_offers(_request: web.Request) -> web.StreamResponse:
     """Answer with the names of heads, and the titles of lip models and of languages."""
-    heads = sorted(path.stem.removeprefix("head-") for path in PAGE.glob("head-*.webp"))
+    heads = sorted(path.stem.removeprefix("head-") for path in PAGE_FOLDER.glob("head-*.webp"))
     names = sorted(lip_models(), key=lambda name: name != DEFAULT_LIP_MODEL)
     lips = {name: dict(lip_models()[name].titles) for name in names}
     return web.json_response({"heads": heads, "lips": lips, "languages": language_titles()})
@@ -211,7 +213,9 @@ def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamRes
     if name.endswith(".glb"):
         path = Path(head_file) if head_file and name == "head.glb" else _page_head(name)
     else:
-        path = LIGHT if name == LIGHT.name else _find(PAGE, name, _PAGE_SUFFIXES)
+        path = (
+            LIGHT_SHADER if name == LIGHT_SHADER.name else _find(PAGE_FOLDER, name, _PAGE_SUFFIXES)
+        )
     response = web.FileResponse(path, CHUNK_BYTES)
     if name == "index.html":
         response.headers["Content-Security-Policy"] = _content_policy(path, frame_ancestors)
@@ -223,7 +227,7 @@ def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamRes
 def _page_head(name: str) -> Path:
     """Return the file of a head, from the page's folder or from the cache folder."""
     file = "head.glb" if name == "head-woman.glb" else name
-    for folder in (PAGE, page_heads_folder()):
+    for folder in (PAGE_FOLDER, page_heads_folder()):
         with contextlib.suppress(web.HTTPNotFound):
             return _find(folder, file, {".glb"})
     folder = page_heads_folder()

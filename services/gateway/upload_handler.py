@@ -1,4 +1,4 @@
-"""Uploads that a separate process handles, so that no file can harm or delay the gateway."""
+"""Handles uploads in a separate process, so that no file can harm or delay the gateway."""
 
 import asyncio
 import contextlib
@@ -10,18 +10,18 @@ from typing import BinaryIO, ClassVar
 
 from aiohttp import web
 
-from kouxing.services.gateway.http import discard_body
+from kouxing.services.gateway.web_application import discard_body
 from kouxing.shared.errors import UserError
 
 UPLOAD_LIMIT_S = 60.0
-PRESENCE_CHECK_S = 0.5  # interval at which a disconnected browser is noticed
+PRESENCE_CHECK_S = 0.5  # interval of checks whether the browser is still connected
 NICENESS = 19  # lowest priority, so that live streams do not suffer
 
 
-class Uploads(ABC):
+class UploadHandler(ABC):
     """Handles uploads of one kind, one at a time. Nothing is stored."""
 
-    busy_text: ClassVar[str]  # answer to uploads that arrive in the meantime
+    busy_text: ClassVar[str]  # answer to uploads that arrive during another one
 
     def __init__(self) -> None:
         self._is_busy = False
@@ -77,7 +77,7 @@ class Uploads(ABC):
             stderr=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C in the terminal must reach only the gateway
         )
-        with contextlib.suppress(ProcessLookupError):  # it has ended already
+        with contextlib.suppress(ProcessLookupError):  # the process has already ended
             os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
         exchange = asyncio.create_task(process.communicate(content))
         end_s = asyncio.get_running_loop().time() + limit_s

@@ -1,4 +1,4 @@
-"""Viewers: browsers that each show one session."""
+"""Serves viewers: browsers that each show one session."""
 
 import asyncio
 import contextlib
@@ -9,23 +9,23 @@ from dataclasses import dataclass, field
 
 from aiohttp import WSMsgType, web
 
-from kouxing.services.gateway import wire
-from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
-from kouxing.services.gateway.sample import SampleSentence
+from kouxing.services.gateway.sample_sentence import SampleSentence
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_avatar, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
+from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.names import NAME_RULE, is_name
-from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.speech import AcousticModelName
+from kouxing.shared.browser_messages.face import FaceSettings
+from kouxing.shared.browser_messages.speech import AcousticModelName
 
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
 SEND_BUFFER_BYTES = 32 * 1024  # in the kernel; about half a second for a slow viewer
-PAUSE_S = 0.2  # time without a frame after which a viewer gets the face at rest
+PAUSE_S = 0.2  # after this time without a frame, a viewer receives the face at rest
 
 
 @dataclass(slots=True)
@@ -39,25 +39,25 @@ class _ShownSession:
 class Viewer:
     """One browser that shows a session."""
 
-    chosen: str  # the requested session; empty: the newest
-    shape_encoder: ShapeEncoder | None  # for frames as blendshapes, in addition to FAPs
+    chosen_session: str  # the requested session; empty: the newest
+    shape_encoder: ShapeEncoder | None  # encodes frames as blendshapes, in addition to FAPs
     queue: ViewerQueue = field(default_factory=ViewerQueue)
-    shown: tuple[str, int] | None = None  # session and epoch last announced to the viewer
-    has_rest: bool = False  # whether it got the face at rest, with which its player starts
-    moved_s: float = -math.inf  # when the newest frame was sent
+    shown_session: tuple[str, int] | None = None  # session and epoch last announced to the viewer
+    has_resting_face: bool = False  # whether it has the face at rest, from which its player starts
+    last_frame_s: float = -math.inf  # when the newest frame was sent
 
 
-class Viewers:
-    """Sends every viewer the messages of the session that it requested, or of the newest.
+class ViewerHandler:
+    """Sends every viewer the messages of its requested session, or of the newest session.
 
-    The session of the sample sentence counts as the newest only if there is no other. ``set_face``
-    sends control the settings of a session's face, or of the face at rest (""). ``on_connected`` is
-    called for each new viewer.
+    The session of the sample sentence counts as the newest only if no other session is open.
+    ``set_face`` sends control the settings of a session's face, or of the face at rest ("").
+    ``on_connected`` is called for each new viewer.
     """
 
     def __init__(
         self,
-        web_sockets: WebSockets,
+        web_sockets: OpenWebSockets,
         address_share: float,
         metrics: Metrics,
         sample: SampleSentence,
@@ -71,13 +71,13 @@ class Viewers:
         self._set_face = set_face
         self._on_connected = on_connected
         self._viewers: set[Viewer] = set()
-        self._sessions: dict[str, _ShownSession] = {}  # in the order in which they were opened
+        self._sessions: dict[str, _ShownSession] = {}  # in order of opening
         self._missing: tuple[str, ...] = ("control",)
 
     # --- sessions ------------------------------------------------------------------------------
 
     def add_session(self, session: str, epoch: int, lip_model: str) -> None:
-        """Announce a session to its viewers; again when it continues in a new epoch."""
+        """Announce a session to its viewers, or its new epoch."""
         self._sessions[session] = _ShownSession(epoch, lip_model)
         self._notify_viewers()
 
@@ -85,14 +85,16 @@ class Viewers:
         """Announce that the lip model of a session has changed."""
         if session in self._sessions:
             self._sessions[session].lip_model = lip_model
-            self.forward(session, MessageKind.TEXT, wire.text("lips", lips=lip_model))
+            self.forward(session, MessageKind.TEXT, browser_messages.text("lips", lips=lip_model))
 
     def set_acoustic(self, session: str, model: str) -> None:
-        """Announce the acoustic model that finds a session's phones, if it has changed."""
-        shown = self._sessions.get(session)
-        if shown is not None and shown.acoustic != model:
-            shown.acoustic = model
-            self.forward(session, MessageKind.TEXT, wire.text("acoustic", acoustic=model))
+        """Announce the acoustic model of a session, if it has changed."""
+        shown_session = self._sessions.get(session)
+        if shown_session is not None and shown_session.acoustic != model:
+            shown_session.acoustic = model
+            self.forward(
+                session, MessageKind.TEXT, browser_messages.text("acoustic", acoustic=model)
+            )
 
     def remove_session(self, session: str) -> None:
         """Announce to a session's viewers that it has ended."""
@@ -115,30 +117,30 @@ class Viewers:
         self, session: str, epoch: int, media_time: int, faps: bytes, now_s: float
     ) -> None:
         """Send a frame to the viewers of a session."""
-        message = wire.binary(wire.FAP_TYPE, epoch, media_time, faps)
+        message = browser_messages.binary(browser_messages.FAP_TYPE, epoch, media_time, faps)
         viewers = self._viewers_of(session)
         for viewer in viewers:
-            viewer.moved_s = now_s
+            viewer.last_frame_s = now_s
             self._put(viewer, MessageKind.FRAME, message)
         self._put_shapes(viewers, MessageKind.SHAPES, "weights", epoch, media_time, faps)
 
-    def show_rest(self, face: RestingFace, now_s: float) -> None:
-        """Send the face at rest to new viewers, and to those without recent frames of a session."""
-        viewers = [viewer for viewer in self._viewers if now_s >= _rest_from_s(viewer)]
+    def show_resting_face(self, face: RestingFace, now_s: float) -> None:
+        """Send the face at rest to new viewers, and to viewers without recent frames."""
+        viewers = [viewer for viewer in self._viewers if now_s >= _rest_due_s(viewer)]
         faps = face.faps(now_s).astype("<f4").tobytes()
-        message = wire.binary(wire.REST_TYPE, 0, 0, faps)
+        message = browser_messages.binary(browser_messages.REST_TYPE, 0, 0, faps)
         for viewer in viewers:
-            viewer.has_rest = True
+            viewer.has_resting_face = True
             self._put(viewer, MessageKind.REST, message)
         self._put_shapes(viewers, MessageKind.REST_SHAPES, "rest", 0, 0, faps)
 
     @property
-    def rest_from_s(self) -> float:
-        """When the first viewer is due to get the face at rest; infinite without viewers."""
-        return min(map(_rest_from_s, self._viewers), default=math.inf)
+    def rest_due_s(self) -> float:
+        """When the face at rest is due for the first viewer; infinite without viewers."""
+        return min(map(_rest_due_s, self._viewers), default=math.inf)
 
     @property
-    def newest(self) -> str:
+    def newest_session(self) -> str:
         """The session shown to viewers that requested none; empty if there is no session."""
         sample = self._sample.session
         return next((name for name in reversed(self._sessions) if name != sample), sample)
@@ -146,7 +148,7 @@ class Viewers:
     @property
     def shown_sessions(self) -> Iterator[str]:
         """The sessions that viewers see."""
-        return (viewer.shown[0] for viewer in self._viewers if viewer.shown)
+        return (viewer.shown_session[0] for viewer in self._viewers if viewer.shown_session)
 
     @property
     def has_viewers(self) -> bool:
@@ -157,8 +159,8 @@ class Viewers:
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one viewer until it disconnects."""
-        chosen = request.query.get("session", "")
-        if chosen and not is_name(chosen):
+        chosen_session = request.query.get("session", "")
+        if chosen_session and not is_name(chosen_session):
             raise web.HTTPBadRequest(text=f"session must be a name; {NAME_RULE}\n")
         try:
             shape_encoder = parse_shape_query(request.query)
@@ -166,20 +168,20 @@ class Viewers:
             raise web.HTTPBadRequest(text=f"{error}\n") from None
         async with self._web_sockets.open(request, self._quota) as browser:
             _limit_send_buffers(request)
-            with self.connected(chosen, shape_encoder) as viewer:
+            with self.connect_viewer(chosen_session, shape_encoder) as viewer:
                 await self._serve_commands(viewer, browser)
         return browser
 
     @contextlib.contextmanager
-    def connected(self, session: str, shape_encoder: ShapeEncoder | None) -> Iterator[Viewer]:
-        """Add a viewer while the context is open. The caller sends the messages of its queue."""
+    def connect_viewer(self, session: str, shape_encoder: ShapeEncoder | None) -> Iterator[Viewer]:
+        """Add a viewer while the context is open. The caller sends the messages in its queue."""
         viewer = Viewer(session, shape_encoder)
         self._viewers.add(viewer)
         self._on_connected()
         try:
             self._put(viewer, MessageKind.TEXT, self._status())
             if shape_encoder is not None:
-                self._put(viewer, MessageKind.TEXT, shape_encoder.announcement())
+                self._put(viewer, MessageKind.TEXT, shape_encoder.header_message())
             self._notify_viewer(viewer)
             yield viewer
         finally:
@@ -199,26 +201,26 @@ class Viewers:
 
     def _handle_command(self, viewer: Viewer, message: str) -> None:
         try:
-            command = wire.parse_object(message)
+            command = browser_messages.parse_object(message)
             session = command.get("follow")
-            settings = wire.parse_face_settings(command)
+            settings = browser_messages.parse_face_settings(command)
             lip_model = settings.lip_model if settings is not None else None
             if command.get("play") == "sample":
                 self._sample.play(lip_model or "", self._on_sample_end)
-                viewer.chosen = self._sample.session
+                viewer.chosen_session = self._sample.session
             elif lip_model:
-                if not self._sample.session or viewer.chosen != self._sample.session:
+                if not self._sample.session or viewer.chosen_session != self._sample.session:
                     raise UserError("a viewer can choose lips only for the sample sentence")
                 self._sample.lip_model = lip_model
             elif settings is not None:
-                if viewer.shown is None and settings.expressions is None:
+                if viewer.shown_session is None and settings.expressions is None:
                     raise UserError("no session is shown; start a microphone or the sample first")
-                self._set_face(viewer.shown[0] if viewer.shown else "", settings)
+                self._set_face(viewer.shown_session[0] if viewer.shown_session else "", settings)
             elif isinstance(session, str) and (not session or is_name(session)):
-                viewer.chosen = session
+                viewer.chosen_session = session
             elif "avatar" in command:
                 viewer.shape_encoder = parse_avatar(command)
-                self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.announcement())
+                self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.header_message())
             else:
                 raise UserError(
                     "expected 'follow' with a session's name, 'avatar', 'play', 'lips', "
@@ -226,14 +228,14 @@ class Viewers:
                     "'listen_to' or 'listening'"
                 )
         except UserError as error:
-            self._put(viewer, MessageKind.TEXT, wire.error_text(str(error)))
+            self._put(viewer, MessageKind.TEXT, browser_messages.error_text(str(error)))
         self._notify_viewer(viewer)
 
     def _on_sample_end(self, session: str, error: str) -> None:
         """Show the newest session again to viewers of the sample sentence, with the error."""
         for viewer in self._viewers:
-            if viewer.chosen == session:
-                viewer.chosen = ""
+            if viewer.chosen_session == session:
+                viewer.chosen_session = ""
                 if error:
                     self._put(viewer, MessageKind.TEXT, error)
         self._notify_viewers()
@@ -244,24 +246,25 @@ class Viewers:
 
     def _notify_viewer(self, viewer: Viewer) -> None:
         """Announce the session that the viewer sees, if it has changed."""
-        name = viewer.chosen or self.newest
+        name = viewer.chosen_session or self.newest_session
         session = self._sessions.get(name)
-        shown = (name, session.epoch) if session else None
-        if shown != viewer.shown:
-            viewer.shown = shown
-            message = wire.text(
+        shown_session = (name, session.epoch) if session else None
+        if shown_session != viewer.shown_session:
+            viewer.shown_session = shown_session
+            message = browser_messages.text(
                 "session",
                 session=name if session else None,
-                chosen=viewer.chosen,
+                chosen=viewer.chosen_session,
                 epoch=session.epoch if session else 0,
                 lips=session.lip_model if session else "",
                 acoustic=session.acoustic if session else "",
-                sample=session is not None and name == viewer.chosen == self._sample.session,
+                sample=session is not None
+                and name == viewer.chosen_session == self._sample.session,
             )
             self._put(viewer, MessageKind.TEXT, message)
 
     def _viewers_of(self, session: str) -> list[Viewer]:
-        return [v for v in self._viewers if v.shown and v.shown[0] == session]
+        return [v for v in self._viewers if v.shown_session and v.shown_session[0] == session]
 
     def _put_shapes(
         self,
@@ -286,12 +289,12 @@ class Viewers:
             self._metrics.count("dropped_slow_viewer", num_dropped)
 
     def _status(self) -> str:
-        return wire.text("status", missing=self._missing)
+        return browser_messages.text("status", missing=self._missing)
 
 
-def _rest_from_s(viewer: Viewer) -> float:
-    """Return when a viewer is due to get the face at rest."""
-    return viewer.moved_s + PAUSE_S if viewer.has_rest else -math.inf
+def _rest_due_s(viewer: Viewer) -> float:
+    """Return when the face at rest is due for a viewer."""
+    return viewer.last_frame_s + PAUSE_S if viewer.has_resting_face else -math.inf
 
 
 def _limit_send_buffers(request: web.Request) -> None:

@@ -1,4 +1,4 @@
-"""The process that learns a mouth profile: a landmark file on standard input, JSON on output."""
+"""Process that learns a mouth profile from a landmark file on standard input; writes JSON."""
 
 import base64
 import json
@@ -8,7 +8,7 @@ from kouxing.shared.errors import USER_ERROR, UserError
 
 
 def main() -> None:
-    """Learn; raise ``UserError`` if the recording has too little speech with lips in view."""
+    """Learn the profile; raise ``UserError`` if too little speech shows the lips."""
     # Imported here, so that the gateway itself does not load the models.
     from kouxing.services.mouth_profiles.landmark_file import parse_landmark_file  # noqa: PLC0415
     from kouxing.services.mouth_profiles.learning import learn_mouth_profile  # noqa: PLC0415

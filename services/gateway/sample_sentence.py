@@ -6,9 +6,9 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
+from kouxing.services.gateway.audio_client import AudioClient, error_text
 from kouxing_client import KouxingError
 
-from kouxing.services.gateway.audio_sessions import AudioSessions, error_text
 from kouxing.shared.audio_file import open_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
@@ -21,11 +21,11 @@ SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由�
 class SampleSentence:
     """Speaks the sample sentence in real time, at most once at a time."""
 
-    def __init__(self, audio_sessions: AudioSessions) -> None:
-        self.session = ""  # while it is spoken
+    def __init__(self, audio_client: AudioClient) -> None:
+        self.session = ""  # session of the sentence while it is spoken
         self.lip_model = ""  # empty: the default; it can change while the sentence is spoken
         self.characters: Characters = ()  # known before the session starts
-        self._audio_sessions = audio_sessions
+        self._audio_client = audio_client
         self._task: asyncio.Task[None] | None = None
 
     def play(self, lip_model: str, on_end: Callable[[str, str], None]) -> None:
@@ -61,7 +61,7 @@ class SampleSentence:
     async def _speak(self) -> None:
         loop = asyncio.get_running_loop()
         source = open_audio(SAMPLE_FILE)
-        async with self._audio_sessions.open(
+        async with self._audio_client.open(
             session=self.session,
             sample_rate_hz=source.sample_rate_hz,
             num_channels=source.num_channels,

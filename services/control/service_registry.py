@@ -1,4 +1,4 @@
-"""The running services, and what they provide.
+"""Keeps the running services and the endpoints that they provide.
 
 A worker provides endpoints and needs others. An observer takes part in every session.
 """
@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import itemgetter
 
-from kouxing.services.control.load import WorkerLoad
-from kouxing.services.control.refusal import Refusal
-from kouxing.services.kinds import PROVIDERS
+from kouxing.services.control.rejection import RequestRejected
+from kouxing.services.control.worker_load import WorkerLoad
+from kouxing.services.service_kinds import PROVIDERS
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Peer
@@ -22,9 +22,9 @@ from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
 MAX_SERVICES = 2000
 MAX_SERVICES_PER_KEY = 1500
-MAX_REMEMBERED = 1000  # lost services that are recognized when they return
+MAX_REMEMBERED = 1000  # limit of lost services that are recognized when they return
 MAX_LATE_S = 5.0  # a service that returns within this time was late, not lost
-TIMEOUT_RESET_S = 60.0  # the usual timeout applies again after this time without a late service
+TIMEOUT_RESET_S = 60.0  # after this time without a late service, the usual timeout applies again
 
 
 @dataclass(slots=True)
@@ -39,8 +39,8 @@ class ServiceRecord:
     metrics: Mapping[str, float] = field(default_factory=dict)
 
 
-class Registry:
-    """The services by instance.
+class ServiceRegistry:
+    """The running services, by instance.
 
     No heartbeat or tick iterates over all services: they are ordered by their newest heartbeat, and
     every lookup has an index.
@@ -85,10 +85,10 @@ class Registry:
     # --- services come and go ------------------------------------------------------------------
 
     def check(self, heartbeat: Heartbeat, peer: Peer) -> None:
-        """Check that a heartbeat may register its service, or comes from its owner.
+        """Check that a heartbeat may register its service, or is from the registered service.
 
-        Raises ``Refusal`` if the instance belongs to another key, an endpoint is malformed or
-        belongs to another kind of service, or there are too many services.
+        Raises ``RequestRejected`` if the instance belongs to another key, an endpoint is malformed
+        or belongs to another kind of service, or there are too many services.
         """
         record = self._services.get(heartbeat.instance)
         if record is None or self.is_other_process(heartbeat, peer):
@@ -96,12 +96,12 @@ class Registry:
         if record is None:
             is_full = len(self._services) >= MAX_SERVICES
             if is_full or self._num_per_key[peer.key] >= MAX_SERVICES_PER_KEY:
-                raise Refusal(
+                raise RequestRejected(
                     ErrorCode.TOO_MANY_SERVICES, "too many services are registered; stop some"
                 )
         elif record.peer.key != peer.key:
             text = f"{heartbeat.instance} is registered with another key"
-            raise Refusal(ErrorCode.NOT_ALLOWED, text)
+            raise RequestRejected(ErrorCode.NOT_ALLOWED, text)
 
     def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float, num_speaking: int = 0) -> None:
         """Register a service, or record its newest heartbeat.
@@ -144,7 +144,7 @@ class Registry:
         return record
 
     def remove(self, instance: str) -> None:
-        """Remove a service; keep its process in case it was declared lost by mistake."""
+        """Remove a service; remember its process, in case it was declared lost by mistake."""
         record = self._services.pop(instance, None)
         if record is None:
             return
@@ -183,11 +183,11 @@ class Registry:
         )
 
     def reclaim_lost(self, instance: str, peer: Peer) -> bool:
-        """Return whether a new registration comes from a process that was declared lost."""
+        """Return whether a new registration is from a process that was declared lost."""
         return self._lost.pop(instance, NO_PEER) == peer
 
-    def replaced_by(self, heartbeat: Heartbeat, peer: Peer) -> str | None:
-        """Return the worker at the same endpoints as a new worker: it must have crashed."""
+    def find_replaced_worker(self, heartbeat: Heartbeat, peer: Peer) -> str | None:
+        """Return the crashed worker, if any, that had the same endpoints as a new worker."""
         if heartbeat.role != "worker":
             return None
         endpoints = _with_keys(heartbeat, peer)
@@ -201,11 +201,11 @@ class Registry:
 
     # --- lookups -------------------------------------------------------------------------------
 
-    def instance_of(self, peer: Peer) -> str | None:
-        """Return the service that sends as a peer."""
+    def instance_by_peer(self, peer: Peer) -> str | None:
+        """Return the service with this peer identity."""
         return self._by_peer.get(peer)
 
-    def instance_on(self, connection: int) -> str | None:
+    def instance_by_connection(self, connection: int) -> str | None:
         """Return the service whose newest heartbeat arrived on a connection."""
         return self._by_connection.get(connection)
 
@@ -244,7 +244,7 @@ class Registry:
     # --- loads and silence ---------------------------------------------------------------------
 
     def load(self, instance: str) -> WorkerLoad:
-        """Return the load of a worker, even of a lost one that has sessions."""
+        """Return the load of a worker. A lost worker with sessions also has a load."""
         return self._loads.setdefault(instance, WorkerLoad())
 
     def forget_load(self, instance: str) -> None:
@@ -253,13 +253,13 @@ class Registry:
             self._loads.pop(instance, None)
 
     def exclude_pause(self, pause_s: float) -> None:
-        """Exclude a time in which control did not run from the age of heartbeats."""
+        """Exclude a pause of control itself from the age of heartbeats."""
         self._paused_s += max(0.0, pause_s)
 
     def adapt_timeout(self, after_s: float, now_s: float) -> None:
         """Increase the heartbeat timeout if a service that was declared lost was only late.
 
-        Otherwise, the sessions of a busy machine would move from one late worker to the next.
+        Otherwise, sessions on a busy machine would move from one late worker to the next.
         """
         if after_s < MAX_LATE_S:
             self._limit_s = min(2 * self._limit_s, max(MAX_LATE_S, self._usual_limit_s))
@@ -269,7 +269,7 @@ class Registry:
         """Return the age of a service's newest heartbeat, without control's own pauses."""
         return now_s - self._paused_s - self._services[instance].heartbeat_s
 
-    def overdue_s(self) -> float:
+    def next_overdue_s(self) -> float:
         """Return the time at which the oldest heartbeat becomes too old."""
         oldest = (
             (next(iter(services.values())), max_age_s)
@@ -279,7 +279,7 @@ class Registry:
         dues_s = (record.heartbeat_s + max_age_s for record, max_age_s in oldest)
         return self._paused_s + min(dues_s, default=math.inf)
 
-    def overdue(self, now_s: float) -> list[str]:
+    def overdue_services(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
         if now_s > self._late_at_s + TIMEOUT_RESET_S:
             self._limit_s = self._usual_limit_s
@@ -292,7 +292,7 @@ class Registry:
         return overdue
 
     def _max_ages_s(self) -> Iterable[tuple[Mapping[str, ServiceRecord], float]]:
-        """Return services by heartbeat interval, oldest heartbeat first, and their age limit."""
+        """Return services by heartbeat interval, oldest heartbeat first, with their age limit."""
         return (
             (self._busy, self._limit_s),
             (self._idle, self._limit_s + IDLE_HEARTBEAT_S - HEARTBEAT_S),
@@ -300,27 +300,29 @@ class Registry:
 
 
 def _with_keys(heartbeat: Heartbeat, peer: Peer) -> dict[str, str]:
-    """Return a service's endpoints; a worker's carry its public key."""
+    """Return a service's endpoints; endpoints of a worker contain its public key."""
     if heartbeat.role != "worker":
         return heartbeat.endpoints
     return {name: with_key(address, peer.key) for name, address in heartbeat.endpoints.items()}
 
 
 def _check_endpoints(heartbeat: Heartbeat) -> None:
-    """Check that a worker may provide its endpoints, and that others can connect to them."""
+    """Check that a worker may provide its endpoints, and that clients can connect to them."""
     if heartbeat.role != "worker":
         return
     if not heartbeat.endpoints:
-        raise Refusal(ErrorCode.BAD_MESSAGE, "a worker must name the endpoints that it provides")
+        raise RequestRejected(
+            ErrorCode.BAD_MESSAGE, "a worker must name the endpoints that it provides"
+        )
     for name, endpoint in heartbeat.endpoints.items():
         provider = PROVIDERS.get(name, heartbeat.service)
         if provider != heartbeat.service:
             text = f"only a {provider} may provide {name!r}, and this is a {heartbeat.service}"
-            raise Refusal(ErrorCode.NOT_ALLOWED, text)
+            raise RequestRejected(ErrorCode.NOT_ALLOWED, text)
         try:
             host, port = split_endpoint(endpoint, name)
         except UserError as error:
-            raise Refusal(ErrorCode.BAD_MESSAGE, str(error)) from None
+            raise RequestRejected(ErrorCode.BAD_MESSAGE, str(error)) from None
         if "*" in (host, port):
             text = f"{name}: {endpoint!r} is not a host and port to connect to"
-            raise Refusal(ErrorCode.BAD_MESSAGE, text)
+            raise RequestRejected(ErrorCode.BAD_MESSAGE, text)
