@@ -29,7 +29,7 @@ from kouxing.services.mouth_profiles.lip_tracks import select_lip_faps
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.offline_recognition import recognize_recording
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_columns
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
@@ -238,9 +238,9 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
         if not sides:
             raise KeyError(shape)
         weight = np.mean(np.stack(sides), axis=0)
-        faps[:, columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
-    faps[:, columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
-    for upper, lower in columns((4, 5)), columns((8, 10)):
+        faps[:, fap_columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
+    faps[:, fap_columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
+    for upper, lower in fap_columns((4, 5)), fap_columns((8, 10)):
         # lips do not pass through each other
         crossed = np.maximum(faps[:, upper] + faps[:, lower], 0.0)
         faps[:, upper] -= 0.5 * crossed
@@ -257,7 +257,7 @@ def openings_of(
 
     The widest opening is the 98th percentile of all frames of a speaker, at least 1.
     """
-    openings = [-faps[:, columns((4, 5))].sum(axis=1) for faps in mouths]
+    openings = [-faps[:, fap_columns((4, 5))].sum(axis=1) for faps in mouths]
     by_speaker: dict[str, list[Array]] = defaultdict(list)
     for speaker, opening in zip(speakers, openings, strict=True):
         by_speaker[speaker].append(opening)

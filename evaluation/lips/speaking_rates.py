@@ -39,7 +39,7 @@ from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline_recognition import recognize_recording
-from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, build_key_frames
 from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING, load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text

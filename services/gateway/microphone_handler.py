@@ -3,11 +3,11 @@
 import contextlib
 
 from aiohttp import WSCloseCode, WSMsgType, web
-from kouxing.services.gateway.audio_client import AudioClient, AudioSession, error_text
 from kouxing_client import KouxingError
 
 from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.audio_input import AudioInput
+from kouxing.services.gateway.audio_sessions import AudioClient, AudioSession, error_text
 from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.services.gateway.web_application import OpenWebSockets

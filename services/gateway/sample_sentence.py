@@ -6,9 +6,9 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
-from kouxing.services.gateway.audio_client import AudioClient, error_text
 from kouxing_client import KouxingError
 
+from kouxing.services.gateway.audio_sessions import AudioClient, error_text
 from kouxing.shared.audio_file import open_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory

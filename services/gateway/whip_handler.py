@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from aiohttp import web
-from kouxing.services.gateway.audio_client import AudioClient, AudioSession, error_text
 from kouxing_client import KouxingError, Refused
 
 from kouxing.services.gateway import browser_messages
+from kouxing.services.gateway.audio_sessions import AudioClient, AudioSession, error_text
 from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_handler import ViewerHandler

@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED, SynthesizerService
+from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED_EVENTS, SynthesizerService
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.records import replace
@@ -92,17 +92,17 @@ def test_a_gap_does_not_delay_other_sessions(service: RecordingSynthesizer) -> N
 
 
 def test_rejects_messages_beyond_the_queue(service: RecordingSynthesizer) -> None:
-    for sequence in range(1, MAX_QUEUED + 10):
+    for sequence in range(1, MAX_QUEUED_EVENTS + 10):
         service.receive_progress("gap", sequence, 5.0 + sequence * 0.02)
-    assert len(service._sessions["gap"].queue) == MAX_QUEUED
+    assert len(service._sessions["gap"].events) == MAX_QUEUED_EVENTS
     for _ in range(300):
         service.on_tick(0.0)
-    assert service.frames("gap")[-1].media_time < to_samples(5.0 + MAX_QUEUED * 0.02 + 0.02)
-    service.receive_progress("gap", MAX_QUEUED + 1, 5.0 + (MAX_QUEUED + 1) * 0.02)
+    assert service.frames("gap")[-1].media_time < to_samples(5.0 + MAX_QUEUED_EVENTS * 0.02 + 0.02)
+    service.receive_progress("gap", MAX_QUEUED_EVENTS + 1, 5.0 + (MAX_QUEUED_EVENTS + 1) * 0.02)
     assert service.frames("gap")[-1].media_time == to_samples(
-        5.0 + (MAX_QUEUED + 1) * 0.02 - SynthesizerConfig().delay_ms / 1e3
+        5.0 + (MAX_QUEUED_EVENTS + 1) * 0.02 - SynthesizerConfig().delay_ms / 1e3
     )
-    assert not service._sessions["gap"].queue
+    assert not service._sessions["gap"].events
 
 
 def test_a_slow_synthesizer_skips_frames_and_reports_it(
@@ -120,7 +120,7 @@ def test_a_slow_synthesizer_skips_frames_and_reports_it(
     service.receive_progress("gap", 151, 20.0)
     for _ in range(2):
         service.on_tick(now_s)
-    assert not service._sessions["gap"].queue
+    assert not service._sessions["gap"].events
     first, newest = service.frames("gap")[before], service.frames("gap")[-1]
     newest_s = 20.0 - SynthesizerConfig().delay_ms / 1e3
     assert first.media_time == newest.media_time == to_samples(newest_s)

@@ -13,8 +13,8 @@ from kouxing.services.synthesizer.lips.ferguson.contour import (
     LipLine,
     build_lip_lines,
     contour,
-    faps_of,
     load_lip_points,
+    opening_to_faps,
 )
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
@@ -70,7 +70,7 @@ def test_the_contour_moves_without_jumps(steps: list[tuple[float, float]]) -> No
 @given(opening=st.floats(0.0, 5.0))
 def test_feature_points_travel_as_measured(opening: float) -> None:
     lines, points = build_lip_lines(), load_lip_points()
-    faps = dict(zip(MOUTH_FAPS, faps_of([opening])[0], strict=True))
+    faps = dict(zip(MOUTH_FAPS, opening_to_faps([opening])[0], strict=True))
     for name, members in LINES.items():
         for member in members:
             point = points[member]

@@ -10,14 +10,14 @@ from kouxing.services.senders.camera import CameraInput
 from kouxing.services.senders.connection import DatagramConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import bundle_messages, encode_message
-from kouxing.services.senders.protocols import connect, parse_target
+from kouxing.services.senders.protocols import make_connection, parse_target
 from kouxing.shared.errors import UserError
 from tests.fake_time import run
 from tests.receivers import LIVE_LINK_ORDER, frame_of, read_live_link, read_osc
 
 
 def connection_to(url: str) -> DatagramConnection:
-    connection = connect(parse_target(url))
+    connection = make_connection(parse_target(url))
     assert isinstance(connection, DatagramConnection)
     return connection
 

@@ -13,7 +13,7 @@ from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
-from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, build_key_frames
 from kouxing.services.synthesizer.lips.ferguson.phone_table import load_table
 from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
@@ -37,7 +37,7 @@ LIPS = load_lip_model(name="ferguson")
 INVENTORY = load_inventory()
 TABLE = load_table(INVENTORY)
 LOWER_LIP = 4  # column of FAP 5
-WIDEST = float(faps_of([5.0])[0, MOUTH_FAPS.index(5)])
+WIDEST = float(opening_to_faps([5.0])[0, MOUTH_FAPS.index(5)])
 DELAY_S = 0.16
 
 
@@ -179,7 +179,7 @@ def test_training_recovers_the_openings() -> None:
         TABLE, opening={**TABLE.opening, "b": 0.0, "a": 5.0, "i": 1.5, "d": 2.5}
     )
     opening = build_key_frames(phones, true, INVENTORY.silence).openings_at(time_s)
-    clip = clip_of(time_s, faps_of(opening))
+    clip = clip_of(time_s, opening_to_faps(opening))
     relative = relative_openings([clip])[0]
     scale = 5.0 / np.percentile(opening, 98)  # the speaker's widest opening is 5
     np.testing.assert_allclose(relative, np.minimum(scale * opening, 5.0), atol=0.01)

@@ -17,7 +17,7 @@ from kouxing.services.gateway.viewer_queue import (
     MessageKind,
     ViewerQueue,
 )
-from kouxing.services.gateway.web_application import WebSockets
+from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
@@ -180,19 +180,21 @@ def binary_types(viewer: Viewer) -> list[int]:
 
 
 def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
-    viewers = ViewerHandler(WebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED)
+    viewers = ViewerHandler(
+        OpenWebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED
+    )
     face = RestingFace(seed=0)
     frame = np.zeros(68, "<f4").tobytes()
     viewers.add_session("talk", 1, "learned")
-    with viewers.connected("", None) as viewer:
+    with viewers.connect_viewer("", None) as viewer:
         viewers.show_frame("talk", 1, 0, frame, now_s=0.0)
-        assert viewers.rest_from_s < 0
+        assert viewers.rest_due_s < 0
         viewers.show_resting_face(face, now_s=0.01)
         assert binary_types(viewer) == [browser_messages.FAP_TYPE, browser_messages.REST_TYPE]
         viewers.show_frame("talk", 1, 1, frame, now_s=0.02)
         viewers.show_resting_face(face, now_s=0.1)
         assert binary_types(viewer) == [browser_messages.FAP_TYPE]
-        assert viewers.rest_from_s == 0.02 + PAUSE_S
+        assert viewers.rest_due_s == 0.02 + PAUSE_S
         viewers.show_resting_face(face, now_s=0.5)
         assert binary_types(viewer) == [browser_messages.REST_TYPE]
 

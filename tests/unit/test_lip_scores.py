@@ -16,7 +16,7 @@ from kouxing.evaluation.lips.lip_scores import groups_of
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.evaluation.lips.speaking_rates import accuracy_of
 from kouxing.evaluation.recognizer.disturbances import CLEAN, MUSIC
-from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.lips import clip_of
@@ -79,7 +79,7 @@ def test_figures_need_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_accuracy_is_one_minus_the_relative_error_of_the_measured_heights() -> None:
-    real = faps_of(np.array([0.0, 1.0, 2.0, 4.0, 5.0, 3.0]))
+    real = opening_to_faps(np.array([0.0, 1.0, 2.0, 4.0, 5.0, 3.0]))
     assert accuracy_of(real, real) == pytest.approx(1.0)
     assert accuracy_of(-real, real) == pytest.approx(-1.0)
     scaled = 0.75 * real

@@ -8,7 +8,7 @@ import pytest
 
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
-from kouxing.services.senders.protocols import connect, parse_target
+from kouxing.services.senders.protocols import make_connection, parse_target
 from kouxing.services.senders.sender_pool import PAUSE_S, WINDOW_S, PlayoutClock
 from kouxing.services.senders.vtube_studio import (
     AccessDenied,
@@ -22,7 +22,7 @@ from tests.receivers import LIVE_LINK_ORDER, Messages, frame_of, read_live_link,
 
 def osc_messages(url: str, frame: FaceFrame) -> Messages:
     """Return the OSC messages of a frame."""
-    return read_osc(list(connect(parse_target(url)).encode(frame)))  # type: ignore[attr-defined]
+    return read_osc(list(make_connection(parse_target(url)).encode(frame)))  # type: ignore[attr-defined]
 
 
 def test_vmc_sends_the_names_of_vrm_0_and_vrm_1() -> None:
@@ -35,7 +35,7 @@ def test_vmc_sends_the_names_of_vrm_0_and_vrm_1() -> None:
     assert values["A"] == values["aa"] == pytest.approx(0.6, abs=0.05)
     assert values["Blink_L"] == values["blinkLeft"] == pytest.approx(0.5, abs=0.05)
     datagrams = list(
-        connect(parse_target("vmc://?shapes=arkit")).encode(frame_of(jawOpen=0.7))  # type: ignore[attr-defined]
+        make_connection(parse_target("vmc://?shapes=arkit")).encode(frame_of(jawOpen=0.7))  # type: ignore[attr-defined]
     )
     assert len(datagrams) == 4
     messages = read_osc(datagrams)

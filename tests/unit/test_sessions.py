@@ -11,7 +11,7 @@ from kouxing.services.control.placement import Placement
 from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
-from kouxing.services.control.session_table import Sessions
+from kouxing.services.control.session_table import SessionTable
 from kouxing.shared.keys import Peer
 from kouxing.shared.records import replace
 from kouxing.shared.wire.control import Heartbeat, SessionInput
@@ -53,7 +53,7 @@ class System:
     def __init__(self, max_sessions: int = 8, max_load: float = 1000.0) -> None:
         self.registry = ServiceRegistry(lost_after_s=3.0)
         self.placement = Placement(self.registry, max_load)
-        self.sessions = Sessions(self.registry, self.placement, max_sessions)
+        self.sessions = SessionTable(self.registry, self.placement, max_sessions)
         for service in PROVIDES:
             self.add(worker(service, f"{service}-1"))
 
