@@ -32,7 +32,9 @@ class ShapeEncoder:
         """Return the message with the names or the targets, in the order of the weights."""
         if self.targets:
             return browser_messages.text("avatar", set=self.shape_set, targets=self.targets)
-        return browser_messages.text("shapes", set=self.shape_set, names=SHAPE_SETS[self.shape_set].names)
+        return browser_messages.text(
+            "shapes", set=self.shape_set, names=SHAPE_SETS[self.shape_set].names
+        )
 
     def encode(self, kind: str, epoch: int, media_time: int, faps: bytes) -> str | bytes:
         """Return the message for a frame: 68 little-endian float32, FAP units.

@@ -19,8 +19,8 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.names import NAME_RULE, is_name
-from kouxing.shared.browser_messages.face import FaceSettings
-from kouxing.shared.browser_messages.speech import AcousticModelName
+from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.speech import AcousticModelName
 
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
