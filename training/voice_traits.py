@@ -122,7 +122,7 @@ def _encoder_outputs(samples: Floats, rng: np.random.Generator) -> Iterator[list
 
 def _mean_state(positions: Sequence[EncoderOutput], states: Floats) -> Floats:
     voice = np.stack([position.voice for position in positions])
-    is_voiced = voice[:, VoiceKind.SPEECH] + voice[:, VoiceKind.SINGING] > MIN_VOICE
+    is_voiced = voice[:, VoiceKind.SPEECH] + voice[:, VoiceKind.SUNG] > MIN_VOICE
     if is_voiced.sum() >= _MIN_VOICED:
         states = states[is_voiced]
     mean: Floats = states.mean(axis=0)

@@ -54,7 +54,7 @@ class VoiceKind(IntEnum):
 
     NONE = 0
     SPEECH = 1
-    SINGING = 2  # or a held sound
+    SUNG = 2  # or a held sound
     LAUGHTER = 3
 
 

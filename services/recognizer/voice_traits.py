@@ -93,7 +93,7 @@ class VoiceTraitsStream:
         outputs: list[float] = (
             position.state @ self._readout.weights + self._readout.bias
         ).tolist()
-        if position.voice[VoiceKind.SPEECH] + position.voice[VoiceKind.SINGING] > MIN_VOICE:
+        if position.voice[VoiceKind.SPEECH] + position.voice[VoiceKind.SUNG] > MIN_VOICE:
             self._num_voiced += 1
             feeling = outputs[_FEELING]
             num_known = min(self._num_voiced + _PRIOR_POSITIONS, _MAX_POSITIONS)

@@ -49,7 +49,7 @@ def test_a_weak_syllable_or_a_closure_does_not_end_the_speech() -> None:
 
 
 def test_a_sung_vowel_is_speech_until_it_ends() -> None:
-    assert speech([(VoiceKind.SPEECH, 0.9, 5), (VoiceKind.SINGING, 0.9, 500)]).all()
+    assert speech([(VoiceKind.SPEECH, 0.9, 5), (VoiceKind.SUNG, 0.9, 500)]).all()
 
 
 def test_laughter_in_bursts_is_not_speech() -> None:

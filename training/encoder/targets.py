@@ -261,7 +261,7 @@ def _sung_copy(piece: Piece, rng: np.random.Generator) -> list[Piece]:
         return []
     targets = np.array(piece.targets[sung.source])
     targets[:, PITCH] = sung.pitch
-    targets[sung.is_sung & (targets[:, VOICE] == VoiceKind.SPEECH), VOICE] = VoiceKind.SINGING
+    targets[sung.is_sung & (targets[:, VOICE] == VoiceKind.SPEECH), VOICE] = VoiceKind.SUNG
     num_positions = min(len(targets), len(sung.samples) // POSITION_SAMPLES)
     samples = as_integers(sung.samples[: POSITION_SAMPLES * num_positions])
     return [Piece(samples, targets[:num_positions], piece.weight)]

@@ -35,7 +35,7 @@ class VoiceActivityDetector:
 
     def update(self, voice: Floats) -> None:
         """Process the probabilities of a position, (4,), by ``VoiceKind``."""
-        probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SINGING])
+        probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SUNG])
         self._num_improbable = 0 if probability >= _IMPROBABLE else self._num_improbable + 1
         if self.is_speech:
             self.is_speech = self._num_improbable < _STOP_POSITIONS
