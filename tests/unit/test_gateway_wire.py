@@ -11,6 +11,7 @@ from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.services.gateway.sample_sentence import SampleSentence
 from kouxing.services.gateway.shape_messages import parse_avatar
+from kouxing.services.gateway.viewer_handler import PAUSE_S, Viewer, ViewerHandler
 from kouxing.services.gateway.viewer_queue import (
     MAX_QUEUED,
     NUM_FRAMES_KEPT,
@@ -136,7 +137,7 @@ UNUSED: Any = lambda *_: None  # noqa: E731 - calls that these tests do not need
 def test_an_avatar_gets_the_weights_of_its_shapes(message_format: str) -> None:
     meshes = [["Basis", "Fcl_MTH_A"], ["Blink", "A", "Fcl_MTH_U"]]
     encoder = parse_avatar({"avatar": meshes, "format": message_format})
-    targets = json.loads(encoder.announcement())["targets"]
+    targets = json.loads(encoder.header_message())["targets"]
     assert sorted(targets) == [[0, 1], [1, 0], [1, 1], [1, 2]]
     faps = np.arange(68).astype("<f4")
     weights = dict(zip(VRM.names, VRM.weights(faps).tolist(), strict=True))
