@@ -227,7 +227,7 @@ def _tracked_faps(tracks: dict[str, Array]) -> Array:
 
 def _rig_faps(tracks: dict[str, Array]) -> Array:
     faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
-    faps[:, columns(_RIG_FAPS)] = 0.0
+    faps[:, fap_columns(_RIG_FAPS)] = 0.0
     for shape, effect in _RIG_SHAPES.items():
         # up to three letters are the side: mouth_suck_dl, mouth_press_l, mouth_funnel_dr
         sides = [

@@ -96,9 +96,11 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
         )
     time_s = np.array(times)
     faps = np.full((len(has_face), len(MOUTH_FAPS)), np.nan)
-    levels = np.array(level_track(samples))
+    levels = np.array(measure_levels(samples))
     landmarks = np.stack([points for points in landmarks_by_image if points is not None])
-    faps[has_face] = mouth_faps(landmarks, np.interp(time_s[has_face], levels[:, 0], levels[:, 1]))
+    faps[has_face] = compute_mouth_faps(
+        landmarks, np.interp(time_s[has_face], levels[:, 0], levels[:, 1])
+    )
     soundfile.write(clip.with_suffix(".flac"), samples, SAMPLE_RATE_HZ)
     _write_tracks(clip.with_suffix(".csv"), time_s, faps)
     metadata = {

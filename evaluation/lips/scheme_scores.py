@@ -156,7 +156,7 @@ def phone_delays_s(
         return []
     events = face_input(condition, sentence.outputs[condition.recognizer])
     hypotheses = [pair for pair in first_hypotheses(events) if pair[0].symbol != inventory.silence]
-    truth = spoken(sentence.sentence.aligned, inventory)
+    truth = drop_pauses(sentence.sentence.aligned, inventory)
     pairs = align_symbols(
         [phone.symbol for phone in truth], [phone.symbol for phone, _ in hypotheses]
     )

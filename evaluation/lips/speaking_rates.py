@@ -145,7 +145,7 @@ def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
 
 def scale_openings(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
     """Scale FAPs (num_frames, num_mouth_faps) so that every speaker's widest opening is R = 5."""
-    full = -float(faps_of([MAX_OPENING])[0, _MIDDLE_LIP_COLUMNS].sum())
+    full = -float(opening_to_faps([MAX_OPENING])[0, _MIDDLE_LIP_COLUMNS].sum())
     _, widest = openings_of(speakers, mouths)
     return [faps * full / widest[speaker] for speaker, faps in zip(speakers, mouths, strict=True)]
 
@@ -184,7 +184,7 @@ def _methods(
 
 
 def _curves_of(motion: KeyFrames) -> MouthCurve:
-    return lambda times_s: faps_of(motion.openings_at(times_s))
+    return lambda times_s: opening_to_faps(motion.openings_at(times_s))
 
 
 def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:

@@ -65,7 +65,7 @@ def align_corpus(
         except (UserError, ValueError) as error:
             errors.add(utterance.utterance_id, str(error))
             continue
-        references.append(AlignedRecording(utterance, spoken(phones, model.inventory)))
+        references.append(AlignedRecording(utterance, drop_pauses(phones, model.inventory)))
     if not references:
         raise errors.no_recording_error(f"in the split {split!r} of {corpus}")
     errors.report_to(print_message)

@@ -39,7 +39,7 @@ from kouxing.services.recognizer.acoustic.light import parse_light_model
 from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end import pcm, resample, vad, whisper_mel
-from kouxing.services.recognizer.search import decoder
+from kouxing.services.recognizer.search import frame_search
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.services.synthesizer import face_animator
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -65,8 +65,8 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "_LOWER _LOWER_OUTER _INNER _OUTER _BOTH",
     ),
     "decoder": (
-        decoder,
-        "IMPOSSIBLE _BEAM _MAX_TOKENS _SLOW_RATE _RATE_FRAMES _MAX_PENALTY_CHANGE",
+        frame_search,
+        "IMPOSSIBLE _BEAM MAX_TOKENS SLOW_RATE _RATE_FRAMES _MAX_PENALTY_CHANGE",
     ),
     "encoder": (encoder, "PHONES_LAG_FRAMES"),
     "expression": (

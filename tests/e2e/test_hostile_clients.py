@@ -11,7 +11,7 @@ from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, Sou
 
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
 from kouxing.evaluation.system.attacks import MemoryUsage
-from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
+from kouxing.services.control.service_registry import MAX_SERVICES_PER_KEY
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key

@@ -1,4 +1,4 @@
-"""Senders over real sockets: receivers that are missing, return, are delayed, or deny access."""
+"""SenderPool over real sockets: receivers that are missing, return, are delayed, or deny access."""
 
 import asyncio
 import contextlib
@@ -43,8 +43,8 @@ def reports() -> list[tuple[str, str]]:
 
 
 @pytest.fixture
-def senders(reports: list[tuple[str, str]]) -> Iterator[Senders]:
-    with contextlib.closing(Senders(0, lambda *report: reports.append(report))) as new_senders:
+def senders(reports: list[tuple[str, str]]) -> Iterator[SenderPool]:
+    with contextlib.closing(SenderPool(0, lambda *report: reports.append(report))) as new_senders:
         yield new_senders
 
 
@@ -62,7 +62,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def problem_of(senders: Senders, url: str) -> str:
+def problem_of(senders: SenderPool, url: str) -> str:
     return next(state.problem for state in senders.states() if state.target == url)
 
 
@@ -153,7 +153,7 @@ def test_media_time_continues_at_rest(senders: SenderPool, receiver: socket.sock
     assert all(0 < step_s < LIMIT_S for step_s in np.diff(rest_s))
 
 
-def test_the_permission_of_vtube_studio_is_requested_once(senders: Senders) -> None:
+def test_the_permission_of_vtube_studio_is_requested_once(senders: SenderPool) -> None:
     with VTubeStudioStub() as stub:
         url = f"vts://127.0.0.1:{stub.port}"
         senders.start(parse_target(url))
@@ -194,7 +194,7 @@ def test_a_sender_can_be_stopped_while_its_connection_ends(
 
 
 def test_vtube_studio_is_not_asked_again_after_a_denial(
-    senders: Senders, monkeypatch: pytest.MonkeyPatch
+    senders: SenderPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, has_ended = VTubeStudioConnection.run, threading.Event()
 

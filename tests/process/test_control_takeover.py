@@ -75,7 +75,7 @@ def test_only_the_recognizer_of_a_session_may_report_it(
     service.send(report() if service is synthesizer else report(ELSEWHERE))
     service.send(make_heartbeat(sender.partition(" ")[0]))
     harness.receive(service)  # the report was read before the heartbeat
-    harness.control._takeover.end_s = 0.0
+    harness.control._recovery.end_s = 0.0
     client.send(CloseSession(session="mine", token="t", request="1"))
     (answer,) = harness.receive(client)
     assert isinstance(answer, Error)
@@ -85,8 +85,8 @@ def test_only_the_recognizer_of_a_session_may_report_it(
 def test_moves_a_session_without_synthesizer_at_the_deadline(harness: ControlHarness) -> None:
     recognizer, synthesizer = harness.services
     recognizer.send(report({**PLACED, "faps": "tcp://127.0.0.1:3"}))
-    harness.step_until(lambda: harness.control._takeover._reported)
-    harness.control._takeover.end_s = 0.0
+    harness.step_until(lambda: harness.control._recovery._reported)
+    harness.control._recovery.end_s = 0.0
     starts: list[StartSession] = []
     while not starts or starts[-1].epoch == 4:
         told = harness.receive(synthesizer)
@@ -102,8 +102,8 @@ def test_stops_unknown_sessions_only_after_the_deadline(harness: ControlHarness)
     recognizer.send(serving)
     (seen,) = harness.receive(recognizer)
     assert not isinstance(seen, CloseSession)
-    harness.control._takeover.end_s = 0.0
-    while harness.control._takeover.is_active:
+    harness.control._recovery.end_s = 0.0
+    while harness.control._recovery.is_active:
         harness.control.step(0.02)
     recognizer.send(serving)
     assert CloseSession(session="mine") in harness.receive(recognizer, 2)
@@ -112,7 +112,7 @@ def test_stops_unknown_sessions_only_after_the_deadline(harness: ControlHarness)
 def test_repeats_session_moved_to_the_client(
     harness: ControlHarness, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lifecycle, "REPEAT_AFTER_S", (0.1, 0.2))
+    monkeypatch.setattr(session_lifecycle, "REPEAT_AFTER_S", (0.1, 0.2))
     recognizer, synthesizer = harness.services
     client.send(OpenSession(session="mine", request="1"))
     for service in harness.services:

@@ -157,7 +157,7 @@ def media_bytes(suffix: str, channels: np.ndarray) -> bytes:
 async def test_answers_a_file_with_its_sound() -> None:
     six = np.zeros((len(SINE), 6))
     six[:, 2] = SINE  # which browsers would mix into another sound than FFmpeg
-    async with serve(SoundUpload()) as post:
+    async with serve(SoundUploadHandler()) as post:
         status, data, warnings = await post(media_bytes("FLAC", six), "a film.flac")
     assert (status, warnings) == (200, "")
     samples, rate_hz = soundfile.read(io.BytesIO(data))

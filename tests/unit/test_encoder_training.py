@@ -69,7 +69,7 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_exported_steps_follow_pytorch() -> None:
     torch.manual_seed(0)
     encoder = AudioEncoder(NUM_PHONES, width=16).eval()
-    session = open_network(export_onnx(encoder).tobytes())
+    session = create_inference_session(export_onnx(encoder).tobytes())
     inputs = network_inputs(HELLO)[:20]
     with torch.no_grad():
         expected = encoder.split(encoder(torch.from_numpy(inputs)[None]))

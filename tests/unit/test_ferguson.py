@@ -190,6 +190,6 @@ def test_training_recovers_the_openings() -> None:
     assert found["sil"] == found["b"] == 0.0
     # a phone without data follows its visemes
     assert found["ang"] == pytest.approx(found["a"], abs=0.3)
-    travel = faps_of([5.0])[0] / scale
+    travel = opening_to_faps([5.0])[0] / scale
     np.testing.assert_allclose(measure_travel([clip]), travel, rtol=0.05, atol=1e-9)
     assert len(measure_travel([clip])) == len(MOUTH_FAPS)

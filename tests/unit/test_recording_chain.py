@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.evaluation.lips.offline_visemes import synthesize
-from kouxing.services.mouth_profiles.lip_tracks import level_track
+from kouxing.services.mouth_profiles.lip_tracks import measure_levels
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor

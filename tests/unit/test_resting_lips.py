@@ -43,7 +43,7 @@ def ajar_amounts(
             frame_s = (number - delay) * FRAME_S
             lips.process_until(frame_s)
             is_phone = phone_s <= frame_s < phone_s + 0.1
-            lips.doubt_at(frame_s, closure if frame_s > SOUND_S else 0.1, 2.0 * is_phone)
+            lips.silence_penalty_at(frame_s, closure if frame_s > SOUND_S else 0.1, 2.0 * is_phone)
             amounts.append(lips.amount_at(frame_s))
     return np.array(amounts)
 
@@ -126,7 +126,7 @@ def test_the_end_of_the_sound_closes_the_lips_in_300_ms() -> None:
     for number in range(94):
         if number == 79:
             lips.add_event(EndOfSound(time_s=number * FRAME_S))
-        lips.follow_voice(number * FRAME_S)
+        lips.process_until(number * FRAME_S)
         amounts.append(lips.amount_at(number * FRAME_S))
     assert amounts[78] == 1.0
     assert amounts[-1] == 0.0

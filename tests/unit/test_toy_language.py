@@ -87,7 +87,7 @@ def test_the_language_is_recognized_live_and_offline(toy: PhoneInventory, path: 
 
 
 def test_a_text_of_the_language_is_aligned(toy: PhoneInventory, path: Path) -> None:
-    aligned = spoken(align_text(load_model(path), SAMPLES, 16_000, "aoe iuy"), toy)
+    aligned = drop_pauses(align_text(load_model(path), SAMPLES, 16_000, "aoe iuy"), toy)
     assert symbols(aligned, toy) == "a o e i u y"
     expected = drop_pauses(
         align_text(load_model(), SAMPLES, 16_000, "啊喔鹅衣乌迂"), load_inventory()

@@ -20,7 +20,7 @@ _Tensors = Mapping[str, NDArray[Any]]
 
 def rebuild_encoder(model: BlockModel) -> BlockEncoder:
     """Rebuild the encoder."""
-    tensors, sizes = _tensors_of(model), model.session.sizes
+    tensors, sizes = _tensors_of(model), model.runner.sizes
     shape = EncoderShape(
         width=sizes.width,
         heads=sizes.heads,

@@ -186,7 +186,7 @@ def _sung_copy(
         return None
     frames = _FRAMES_PER_POSITION * sung.source[:, None] + np.arange(_FRAMES_PER_POSITION)
     targets = recording.targets.select(np.minimum(frames.flatten(), len(recording.targets) - 1))
-    num_frames = min(len(targets), frames_in(len(sung.samples)))
+    num_frames = min(len(targets), count_frames(len(sung.samples)))
     return LabeledRecording(
         samples=as_integers(sung.samples),
         targets=targets.select(slice(num_frames)),

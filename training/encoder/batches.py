@@ -90,8 +90,8 @@ def _excerpt(
             snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
             sound = _add_background(sound, material, rng, snr_db, with_voices=True)
         sound = disturb(sound, rng)
-    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
-    source = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
+    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_PHRASE_POSITIONS]
+    source = speed * np.arange(NUM_PHRASE_POSITIONS) + (speed - 1) * _MIDDLE
     chosen = _rows(targets, source)
     chosen[:, PITCH] += np.float32(np.log2(speed))
     lips = material.columns.lips

@@ -250,7 +250,7 @@ def train_ferguson(
     table = phone_table(openings, aligned_speech(model, rows, errors), inventory)
     errors.report_to(print_message)
     of_fap = dict(zip(MOUTH_FAPS, measure_travel(used), strict=True))
-    for name, point in lip_points().items():
+    for name, point in load_lip_points().items():
         if point.fap is not None:
             travel = of_fap[point.fap]
             result = f"travel {travel:.1f} FAP units" if travel else "not measured; keep its value"

@@ -149,7 +149,7 @@ class Teacher:
             best, states = log_posteriors.topk(min(_NUM_TARGETS, log_posteriors.shape[-1]))
             rows = zip(states.cpu().numpy(), best.softmax(dim=-1).cpu().numpy(), strict=True)
             for (row, probs), sound in zip(rows, sounds, strict=False):
-                window = slice(frames_in(len(sound)))
+                window = slice(count_frames(len(sound)))
                 yield FrameTargets(row[window].astype(np.uint16), probs[window].astype(np.float16))
 
 

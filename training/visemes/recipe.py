@@ -43,7 +43,7 @@ _LEAD_S = 0.015
 _SOURCE = "start and tongue: targets of Crystal.TTVS (Tsinghua University), Apache-2.0"
 
 
-def measure_levels(
+def measure_viseme_levels(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
 ) -> Array:
     """Measure the level of each viseme relative to its speaker's mean, dB, (num_visemes,)."""
@@ -110,7 +110,7 @@ def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> N
     inventory = model.inventory
     labels = [label_clip(model, clip) for clip in used]
     parameters = fit_parameters(collect_frames(used, labels, inventory))
-    parameters = replace(parameters, level_db=measure_levels(used, labels, inventory))
+    parameters = replace(parameters, level_db=measure_viseme_levels(used, labels, inventory))
     reach_s = closure_reach(parameters, used, labels, inventory)
     parameters = replace(
         parameters,

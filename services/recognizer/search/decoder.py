@@ -44,6 +44,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.search.frame_search import (
+    MAX_TOKENS,
     NO_TOKEN,
     SLOW_RATE,
     Hmms,
@@ -58,8 +59,7 @@ from kouxing.services.recognizer.search.path_records import (
     count_record_paths,
 )
 
-_MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
-_MIN_RECORDS = 4 * _MAX_TOKENS
+_MIN_RECORDS = 4 * MAX_TOKENS
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +97,10 @@ class Decoder:
         self._rate = np.empty(len(topology.first_state), dtype=np.float32)
         self._records = np.empty((_MIN_RECORDS, 3), dtype=np.int32)
         self._tokens = Tokens(
-            context=np.empty(_MAX_TOKENS, dtype=np.int32),
-            top=np.empty(_MAX_TOKENS, dtype=np.float32),
-            score=np.empty((_MAX_TOKENS, max_states), dtype=np.float32),
-            link=np.empty((_MAX_TOKENS, max_states), dtype=np.int32),
+            context=np.empty(MAX_TOKENS, dtype=np.int32),
+            top=np.empty(MAX_TOKENS, dtype=np.float32),
+            score=np.empty((MAX_TOKENS, max_states), dtype=np.float32),
+            link=np.empty((MAX_TOKENS, max_states), dtype=np.int32),
         )
         self.reset()
 
@@ -144,7 +144,7 @@ class Decoder:
         token_of = _token_table(len(self._graph.last_phone))
         num_advanced = 0
         while num_advanced < len(scores):
-            if self._num_records + _MAX_TOKENS > len(self._records):
+            if self._num_records + MAX_TOKENS > len(self._records):
                 self.drop_records()
             search = SearchState(self._tokens, token_of, self._records, self._rate)
             num_done, self._num_tokens, self._num_records, token, state = advance_frames(
@@ -218,7 +218,7 @@ class Decoder:
         num_kept, self._last_shared = compact_records(
             shared, paths, self._num_tokens, self._tokens, self._records
         )
-        if num_kept + _MAX_TOKENS > len(self._records) // 2:
+        if num_kept + MAX_TOKENS > len(self._records) // 2:
             records = self._records
             self._records = np.empty((num_kept + _MIN_RECORDS, 3), dtype=np.int32)
             self._records[:num_kept] = records[:num_kept]

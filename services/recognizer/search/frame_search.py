@@ -10,6 +10,7 @@ from kouxing.services.recognizer.search.path_records import IMPOSSIBLE, NO_RECOR
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, ContextGraph
 
 NO_TOKEN = -1
+MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
 SLOW_RATE = np.float32(1.0 / 60.0)
 _BEAM = np.float32(20.0)  # in log scores; a wider beam changes nothing on development data
 _RATE_FRAMES = np.float32(200.0)
