@@ -152,7 +152,7 @@ def test_limits_the_number_of_tokens() -> None:
     for _ in range(60):
         decoder.advance(np.zeros((1, model.num_states), np.float32))
         max_tokens = max(max_tokens, decoder._num_tokens)
-    assert max_tokens == search._MAX_TOKENS
+    assert max_tokens == search.MAX_TOKENS
     path = decoder.final_path()
     assert (path[0].start, path[-1].end) == (0, 60)
     assert all(one.end == two.start for one, two in pairwise(path))
