@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
-from kouxing.services.recognizer.search import decoder as search
+from kouxing.services.recognizer.search import frame_search
 from kouxing.services.recognizer.search.decoder import Decoder, PathSegment
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from tests.languages import MANDARIN, NUM_PHONES, SIL, Table, random_topology
@@ -152,7 +152,7 @@ def test_limits_the_number_of_tokens() -> None:
     for _ in range(60):
         decoder.advance(np.zeros((1, model.num_states), np.float32))
         max_tokens = max(max_tokens, decoder._num_tokens)
-    assert max_tokens == search.MAX_TOKENS
+    assert max_tokens == frame_search.MAX_TOKENS
     path = decoder.final_path()
     assert (path[0].start, path[-1].end) == (0, 60)
     assert all(one.end == two.start for one, two in pairwise(path))
