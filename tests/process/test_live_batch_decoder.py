@@ -13,7 +13,7 @@ from kouxing.shared.overload import SkipPolicy
 class FakeAudio(list[int]):
     """Queued audio."""
 
-    overload = SkipPolicy(1.0, 0.0)
+    skip_policy = SkipPolicy(1.0, 0.0)
 
 
 class FakeSession:
