@@ -21,9 +21,9 @@ SOURCES = (
     *("clients/python/kouxing_client/core.py", "clients/python/kouxing_client/session_core.py"),
 )
 CONTROL_SOURCES = (  # their errors reach the page through control's messages
-    *("services/control/lifecycle.py", "services/control/placement.py"),
-    *("services/control/registry.py", "services/control/requests.py"),
-    *("services/control/sessions.py", "services/recognizer/service.py"),
+    *("services/control/session_lifecycle.py", "services/control/placement.py"),
+    *("services/control/service_registry.py", "services/control/request_handler.py"),
+    *("services/control/session_table.py", "services/recognizer/service.py"),
 )
 # Texts of the command line, of other clients than the page, and of a broken page.
 OTHERS = re.compile(
