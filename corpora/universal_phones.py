@@ -28,7 +28,7 @@ from kouxing.shared.phones.inventory import (
     load_inventory,
 )
 from kouxing.shared.phones.universal.segments import read_ipa
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 _EMODB = "emodb_"
 _MARKS = re.compile("^[!_]|asp$")  # marks for bursts, closures and aspiration

@@ -18,7 +18,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_IND
 from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
+from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
 
 Float32 = NDArray[np.float32]
 

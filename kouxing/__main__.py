@@ -9,10 +9,10 @@ import signal
 def main() -> None:
     """Run the command line."""
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from kouxing.shared.interrupt import install_interrupt
+    from kouxing.shared.interrupt import install_interrupt_handler
 
     if interrupt is signal.default_int_handler:  # not in a shell's background
-        install_interrupt()
+        install_interrupt_handler()
         interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.cli.main import main as run_command_line
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.shared.audio_file import clipping_warnings, limited_blocks, num_clipped, open_audio
-from kouxing.shared.channels import Samples
+from kouxing.shared.audio_file import clipping_warnings, count_clipped, limited_blocks, open_audio
+from kouxing.shared.phase_cancellation import Samples
 from kouxing.shared.terminal import print_message
 
 
@@ -35,7 +35,7 @@ def read_mono_16k(
     for block in blocks:
         content += resampler.accept_waveform(block).data
         num_samples += block.size
-        clipped += num_clipped(block)
+        clipped += count_clipped(block)
     content += resampler.finish().data
     for warning in (*source.warnings, *clipping_warnings(str(path), clipped / max(1, num_samples))):
         print_message(warning)

@@ -45,8 +45,8 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     An invalid setting prints one line and returns 2. An internal error logs a traceback and
     returns 1.
     """
-    from kouxing.shared.connections import raise_file_limit
-    from kouxing.shared.errors import UserError, with_name
+    from kouxing.shared.connection_limits import raise_file_limit
+    from kouxing.shared.errors import UserError, prefix_name
     from kouxing.shared.logs import LOG, configure
     from kouxing.shared.metrics import use_single_malloc_arena
     from kouxing.shared.parent_process import PARENT_VARIABLE
@@ -61,7 +61,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
         print(f"{name}: {error}; install kouxing again (in a checkout: make)", file=sys.stderr)
         return 2
     except UserError as error:
-        print(with_name(name, str(error)), file=sys.stderr)
+        print(prefix_name(name, str(error)), file=sys.stderr)
         return 2
     try:
         service.run()
@@ -80,7 +80,7 @@ def main() -> None:
     gc.disable()  # until the service runs: it frees nothing, and takes a tenth of the startup time
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.service_kinds import KINDS
-    from kouxing.shared.errors import UserError, with_name
+    from kouxing.shared.errors import UserError, prefix_name
 
     parser = argparse.ArgumentParser(prog="python -m kouxing.services.process")
     parser.add_argument("kind", choices=KINDS)
@@ -92,7 +92,7 @@ def main() -> None:
     try:
         status = serve(arguments.kind, arguments.config, arguments.set)
     except UserError as error:
-        print(with_name(arguments.kind, str(error)), file=sys.stderr)
+        print(prefix_name(arguments.kind, str(error)), file=sys.stderr)
         status = 2
     sys.exit(status)
 

@@ -35,6 +35,7 @@ from kouxing.services.synthesizer.lips.learned.closure_rule import ClosureRule
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (
     EndOfSound,
     LipPositions,
@@ -42,7 +43,6 @@ from kouxing.shared.phones.events import (
     SoundEvent,
     SpeechChange,
 )
-from kouxing.shared.records import replace
 
 # Tuned on the same held-out clips as the rule of the live pipeline, except ``vowel``: no clip has
 # one closure in the sound and two in the phones.

@@ -13,7 +13,7 @@ from kouxing.shared.config import (
     ServiceConfig,
     Settings,
     bound_keys,
-    variable,
+    variable_name,
 )
 from kouxing.shared.endpoints import WILDCARDS
 from kouxing.shared.errors import UserError
@@ -56,9 +56,11 @@ def free_port_environment(
                 probe.bind((host, 0))
                 port = str(probe.getsockname()[1])
                 address = f"tcp://{host}:{port}" if bound is BindAddress.ENDPOINT else port
-                environment[variable(name, key)] = address
+                environment[variable_name(name, key)] = address
     if "control" in names:
-        environment[variable(COMMON, "control")] = environment[variable("control", "control")]
+        environment[variable_name(COMMON, "control")] = environment[
+            variable_name("control", "control")
+        ]
     return environment
 
 
@@ -85,7 +87,7 @@ def available_port_environment(settings: Settings) -> dict[str, str]:
                         f"{kind.name}.{key}: {problem}; choose another port,"
                         " or omit it to use a free one"
                     )
-            environment[variable(kind.name, key)] = free[variable(kind.name, key)]
+            environment[variable_name(kind.name, key)] = free[variable_name(kind.name, key)]
     return environment
 
 
@@ -97,13 +99,13 @@ def extra_worker_environments(settings: Settings, number: int) -> dict[str, dict
     environments: dict[str, dict[str, str]] = {}
     for name in WORKERS:
         config = settings.load(KINDS[name].config_type)
-        environment = {variable(name, "instance"): ""}
+        environment = {variable_name(name, "instance"): ""}
         for key, bound in bound_keys(type(config)).items():
             if bound is BindAddress.ENDPOINT:
                 host = str(getattr(config, key)).rpartition(":")[0]
-                environment[variable(name, key)] = f"{host}:*"
+                environment[variable_name(name, key)] = f"{host}:*"
             elif bound is BindAddress.PORT:
-                environment[variable(name, key)] = "0"
+                environment[variable_name(name, key)] = "0"
         environments |= {f"{name}-{count}": environment for count in range(2, number + 1)}
     return environments
 

@@ -1,1 +1,1 @@
-"""Code that the services share: messages, codec, bus, service loop, phones, FAPs."""
+"""Shared code: messages, sockets, the service loop, configuration, phones, FAPs and audio files."""

@@ -1,4 +1,4 @@
-"""Reads npz files of plain arrays. Their unpacked size is checked before they are unpacked."""
+"""Reads npz files of plain arrays, after a check of their unpacked size."""
 
 import io
 import zipfile
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kouxing.shared.user_file import check_content, open_file
 
 MAX_ARRAYS = 1000
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others need much memory
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # other methods need much memory
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _ENTRY = b"PK\1\2"  # signature in the table at the end of an archive
 
@@ -40,7 +40,7 @@ def read_arrays(path: Path, max_bytes: int, expected: str) -> dict[str, NDArray[
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one array, if its header asks for no more memory than the file has bytes."""
+    """Read one array, unless its header states more bytes than the file has."""
     if entry.compress_type not in _METHODS:
         raise ValueError(f"{entry.filename} uses an unsupported compression")
     with archive.open(entry) as stream:

@@ -1,4 +1,4 @@
-"""Audio of files and pipes as blocks of samples."""
+"""Reads the audio of files and pipes as blocks of samples."""
 
 import io
 import sys
@@ -11,7 +11,6 @@ from typing import Any, BinaryIO
 import numpy as np
 import soxr
 
-from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import (
     MediaSound,
@@ -21,6 +20,7 @@ from kouxing.shared.media_file import (
     pcm_of_wav,
     to_float,
 )
+from kouxing.shared.phase_cancellation import PhaseCancellationGuard, Samples
 from kouxing.shared.sound_formats import (
     MAX_ZERO_BYTES,
     NUM_BEGIN_BYTES,
@@ -28,17 +28,17 @@ from kouxing.shared.sound_formats import (
     needs_more,
     needs_whole_file,
     non_audio_kind,
-    stated_bytes,
+    read_stated_size,
 )
 from kouxing.shared.user_file import check_content, open_file
-from kouxing.shared.wav_parts import Readable, WavParts, num_parts
+from kouxing.shared.wav_parts import Readable, WavParts, count_parts
 
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # limit for a session; files above are resampled to it
 BLOCK_S = 0.02
 CLIPPED_LEVEL = 0.999
-CLIPPED_FRACTION = 0.01  # fraction of the samples; the user is warned above it
-_MIN_MISSING_S = 0.05  # a file that lacks more is reported as cut off
+CLIPPED_FRACTION = 0.01  # above this fraction of the samples, the user is warned
+_MIN_MISSING_S = 0.05  # a file that lacks more than this is reported as cut off
 _MAX_SPOOLED_BYTES = 64 << 20  # in memory, for a pipe that must be read completely
 MAX_FILE_BYTES = 8 << 30
 MAX_DURATION_S = 3 * 3600.0  # limit for a recording that is held in memory
@@ -55,7 +55,7 @@ class AudioSource:
     duration_s: float | None  # None: not known
     blocks: Iterator[Samples]
     warnings: list[str] = field(default_factory=list)  # problems; complete after the last block
-    is_live: bool = False  # the pipe is read in real time
+    is_live: bool = False  # whether the audio arrives in real time
     notices: list[str] = field(default_factory=list)  # messages to print before reading
 
 
@@ -68,7 +68,7 @@ def open_audio(
 ) -> AudioSource:
     """Open an audio file, the audio of a video, or a pipe, for reading block by block.
 
-    FFmpeg decodes it. Silence fills the gaps that the file's timestamps have. Rates above 48 kHz
+    FFmpeg decodes it. Silence fills gaps between the file's timestamps. Rates above 48 kHz
     are resampled to 48 kHz, and more than two channels are mixed to two. ``track`` counts from 1.
     The path ``-`` is standard input. Pipes are decoded while they arrive. If no format fits, a pipe
     is read as raw samples. ``raw``: the content is raw samples of this format.
@@ -82,7 +82,7 @@ def open_audio(
 
     def open_source() -> AudioSource:
         if raw is not None:
-            return raw_audio(_Pipe(file), raw, name)
+            return raw_audio(_PeekablePipe(file), raw, name)
         if is_pipe:
             return _open_pipe(file, name, block_s, track)
         return _open_file(file, str(path), name, block_s, track)
@@ -92,7 +92,7 @@ def open_audio(
 
 
 def _with_file(file: BinaryIO, open_source: Callable[[], AudioSource]) -> AudioSource:
-    """Open the source of a file that is closed after the last block, or on an error."""
+    """Open the source of a file. The file is closed after the last block, or on an error."""
     try:
         source = open_source()
     except BaseException:
@@ -114,18 +114,18 @@ def _open_file(
     if num_bytes == 0:
         raise UserError(f"{path}: the file is empty")
     begin = file.read(NUM_BEGIN_BYTES)
-    if num_parts(file) > 1:  # FFmpeg reads one of them
+    if count_parts(file) > 1:  # FFmpeg reads one of them
         if wav := pcm_of_wav(begin):
             return _wav_audio(file, begin, wav, path)
         raise UserError(f"{path}: the file has several parts of sound; convert them separately")
     sound = MediaSound(file, path, begin, track, is_pipe=False)
-    return _source(sound, path, name, block_s, begin, lambda: num_bytes)
+    return _make_source(sound, path, name, block_s, begin, lambda: num_bytes)
 
 
 def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -> AudioSource:
     if stream.isatty():
         raise UserError(f"{name}: this is a terminal; pipe sound into the command")
-    pipe = _Pipe(stream)
+    pipe = _PeekablePipe(stream)
     begin = pipe.peek()
     if not begin:
         raise UserError(f"{name}: no sound arrived; check the command that writes it")
@@ -148,7 +148,7 @@ def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -
     if wav := pcm_of_wav(begin):  # without FFmpeg's delay of 64 KiB
         return _wav_audio(pipe, begin, wav, name)
     sound = MediaSound(pipe, name, begin, track, is_pipe=True)  # type: ignore[arg-type]
-    return _source(sound, name, name, block_s, begin, lambda: pipe.num_bytes)
+    return _make_source(sound, name, name, block_s, begin, lambda: pipe.num_bytes)
 
 
 def _wav_audio(stream: Readable, begin: bytes, wav: WavPcm, name: str) -> AudioSource:
@@ -157,7 +157,7 @@ def _wav_audio(stream: Readable, begin: bytes, wav: WavPcm, name: str) -> AudioS
     return raw_audio(parts, wav.format, name, lambda: parts.num_missing)
 
 
-class _Pipe:
+class _PeekablePipe:
     """A pipe whose first bytes can be read twice."""
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -166,7 +166,7 @@ class _Pipe:
         self.num_bytes = 0  # read so far
 
     def peek(self) -> bytes:
-        """Return the first bytes, as many as are needed to recognize the format."""
+        """Return enough of the first bytes to recognize the format."""
         while (
             len(self._begin) < NUM_BEGIN_BYTES + MAX_ZERO_BYTES
             and len(self._begin.lstrip(b"\0")) < NUM_BEGIN_BYTES
@@ -184,7 +184,7 @@ class _Pipe:
         return self._begin
 
     def read(self, size: int) -> bytes:
-        """Return up to ``size`` bytes as soon as some are there; empty at the end."""
+        """Return up to ``size`` bytes as soon as any have arrived; empty at the end."""
         if self._begin:
             piece, self._begin = self._begin[:size], self._begin[size:]
         else:
@@ -203,7 +203,7 @@ class _Pipe:
 def read_audio(path: Path) -> tuple[Samples, int]:
     """Return all samples, (n, channels), and their rate in Hz.
 
-    Raises ``UserError`` as ``open_audio``, and if it is longer than ``MAX_DURATION_S``.
+    Raises ``UserError`` like ``open_audio``, and if the audio is longer than ``MAX_DURATION_S``.
     """
     source = open_audio(path, block_s=1.0)
     return np.concatenate(list(limited_blocks(source))), source.sample_rate_hz
@@ -247,13 +247,13 @@ def check_video(path: Path) -> None:
         raise UserError(f"{path}: the video must have images and audio; record it with sound")
 
 
-def num_clipped(samples: Samples) -> int:
+def count_clipped(samples: Samples) -> int:
     """Return the number of samples at full scale."""
     return int(np.count_nonzero(np.abs(samples) >= CLIPPED_LEVEL))
 
 
 def clipping_warnings(name: str, fraction: float) -> list[str]:
-    """Return a warning for the user if too large a fraction of the samples is clipped."""
+    """Return a warning if the fraction of clipped samples is above ``CLIPPED_FRACTION``."""
     if fraction <= CLIPPED_FRACTION:
         return []
     return [f"{name}: {fraction:.0%} of the samples are clipped; record at a lower level"]
@@ -264,7 +264,7 @@ def raw_audio(
 ) -> AudioSource:
     """Read raw samples until the end of a stream.
 
-    ``num_missing`` returns the number of bytes that the stream then lacks.
+    ``num_missing`` returns the number of missing bytes at the end of the stream.
     """
     rate_hz, num_channels = min(raw.sample_rate_hz, MAX_RATE_HZ), raw.num_channels
     num_mixed = min(2, num_channels)
@@ -274,7 +274,7 @@ def raw_audio(
     block_bytes = frame_bytes * raw.sample_rate_hz // 50
 
     def pieces() -> Iterator[tuple[int, Samples]]:
-        guard = CancellationGuard(name, num_mixed, warnings)
+        guard = PhaseCancellationGuard(name, num_mixed, warnings)
         rest, num_read = b"", 0
         while more := stream.read(block_bytes):
             num_read += len(more)
@@ -285,13 +285,13 @@ def raw_audio(
             yield raw.sample_rate_hz, guard.mix(channels, channels)
         sizes = (num_read, num_read + num_missing())
         seconds = (size / frame_bytes / raw.sample_rate_hz for size in sizes)
-        warnings.extend(_cut_off(name, *seconds))
+        warnings.extend(_cut_off_warnings(name, *seconds))
 
     blocks = _blocks(pieces(), name, rate_hz, num_mixed, BLOCK_S)
     return AudioSource(name, rate_hz, num_mixed, None, blocks, warnings)
 
 
-def _source(
+def _make_source(
     sound: MediaSound,
     path: str,
     name: str,
@@ -308,7 +308,9 @@ def _source(
             num_read += len(block)
             yield block
         if not sound.warnings:
-            sound.warnings.extend(_missing(path, num_read / rate_hz, begin, num_bytes()))
+            sound.warnings.extend(
+                _missing_audio_warnings(path, num_read / rate_hz, begin, num_bytes())
+            )
 
     return AudioSource(
         name=name,
@@ -337,7 +339,7 @@ def _blocks(
     size = round(block_s * rate_hz)
     rest: list[Samples] = []
     num_rest = 0
-    for piece in _resample(_check(pieces, path), rate_hz, num_channels):
+    for piece in _resample(_check_samples(pieces, path), rate_hz, num_channels):
         rest.append(piece)
         num_rest += len(piece)
         if num_rest >= size:
@@ -349,7 +351,9 @@ def _blocks(
         yield np.concatenate(rest)
 
 
-def _check(pieces: Iterator[tuple[int, Samples]], path: str) -> Iterator[tuple[int, Samples]]:
+def _check_samples(
+    pieces: Iterator[tuple[int, Samples]], path: str
+) -> Iterator[tuple[int, Samples]]:
     """Clip samples to [-1, 1]; raise ``UserError`` if some are not finite."""
     read_s = 0.0
     for rate_hz, samples in pieces:
@@ -367,7 +371,7 @@ def _check(pieces: Iterator[tuple[int, Samples]], path: str) -> Iterator[tuple[i
 def _resample(
     pieces: Iterator[tuple[int, Samples]], rate_hz: int, num_channels: int
 ) -> Iterator[Samples]:
-    """Resample pieces whose rate differs; it may change between pieces."""
+    """Resample pieces with another rate. The rate may change between pieces."""
     resampler: Any = None
     piece_rate_hz = rate_hz
     end = np.zeros((0, num_channels), np.float32)
@@ -383,12 +387,12 @@ def _resample(
         yield resampler.resample_chunk(end, last=True)
 
 
-def _missing(path: str, read_s: float, begin: bytes, num_bytes: int) -> list[str]:
+def _missing_audio_warnings(path: str, read_s: float, begin: bytes, num_bytes: int) -> list[str]:
     """Return a warning if a file is shorter than its header states."""
-    return _cut_off(path, read_s, read_s * (stated_bytes(begin) or 0) / num_bytes)
+    return _cut_off_warnings(path, read_s, read_s * (read_stated_size(begin) or 0) / num_bytes)
 
 
-def _cut_off(path: str, read_s: float, stated_s: float) -> list[str]:
+def _cut_off_warnings(path: str, read_s: float, stated_s: float) -> list[str]:
     if stated_s - read_s < _MIN_MISSING_S:
         return []
     return [f"{path}: the file is cut off after {read_s:.1f} s of {stated_s:.1f} s"]

@@ -15,7 +15,7 @@ from kouxing_client.keys import Key
 from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
 from zmq.utils.monitor import recv_monitor_message
 
-from kouxing.shared.connections import KIB, ConnectionLimiter, Limits
+from kouxing.shared.connection_limits import KIB, ConnectionLimiter, SocketLimits
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.sockets import Socket
@@ -23,11 +23,13 @@ from kouxing.shared.waker import Waker
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
 from kouxing.shared.zap import Zap, answer_handshakes
 
-# Few answers to audio wait: not every client reads them.
-AUDIO = Limits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
-COMMANDS = Limits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
-PHONES = Limits(part_bytes=4 * KIB, queue_length=64)
-SUBSCRIPTIONS = Limits(part_bytes=512, queue_length=32, cost=1.0)  # most of it for the handshake
+# Few answers to audio are queued, because not every client reads them.
+AUDIO = SocketLimits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
+COMMANDS = SocketLimits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
+PHONES = SocketLimits(part_bytes=4 * KIB, queue_length=64)
+SUBSCRIPTIONS = SocketLimits(
+    part_bytes=512, queue_length=32, cost=1.0
+)  # most of it for the handshake
 
 
 class ProbeResult(Enum):
@@ -41,7 +43,7 @@ class ProbeResult(Enum):
 class Bus:
     """The sockets of one process.
 
-    With a key, its sockets accept only the allowed keys, ``zap``. Without one, nothing is
+    With a key, the sockets accept only the allowed keys, ``zap``. Without a key, nothing is
     encrypted, and every peer is accepted. ``extra_connections`` are allowed in addition to the
     usual limit. Raises ``UserError`` if the allowed keys cannot be read.
     """
@@ -61,24 +63,24 @@ class Bus:
         self.close()
 
     def bind_router(
-        self, endpoint: str, key: str, limits: Limits = AUDIO, *, role: str = ""
+        self, endpoint: str, key: str, limits: SocketLimits = AUDIO, *, role: str = ""
     ) -> Socket:
         """Bind a socket that receives from many peers.
 
-        If a role is given, only keys with such a role (``service``: any service) may connect.
+        If ``role`` is set, only keys with this role (``service``: any service) may connect.
         """
         if role and self.zap is not None:
             self.zap.required_roles[key] = role
         return self._bind(zmq.ROUTER, endpoint, key, limits)
 
     def bind_publisher(
-        self, endpoint: str, key: str, on_joined: Callable[[str], None] = lambda session: None
+        self, endpoint: str, key: str, on_subscribe: Callable[[str], None] = lambda session: None
     ) -> Socket:
         """Bind a socket that many peers subscribe to.
 
-        ``on_joined`` is called with the session when the subscriptions of a peer are in effect.
+        ``on_subscribe`` is called with the session when the subscriptions of a peer are in effect.
         """
-        return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS, on_joined)
+        return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS, on_subscribe)
 
     def connect_dealer(self, endpoint: str) -> Socket:
         """Connect to a router. Messages are queued until it is available."""
@@ -151,13 +153,13 @@ class Bus:
         kind: int,
         endpoint: str,
         key: str,
-        limits: Limits,
-        on_joined: Callable[[str], None] = lambda session: None,
+        limits: SocketLimits,
+        on_subscribe: Callable[[str], None] = lambda session: None,
     ) -> Socket:
         split_endpoint(endpoint, key)
         raw = self._open(kind, limits.num_answers)
         raw.setsockopt(zmq.IPV6, "[" in endpoint)
-        raw.setsockopt_string(zmq.ZAP_DOMAIN, key)  # with one, libzmq refuses ZMTP 1 and 2
+        raw.setsockopt_string(zmq.ZAP_DOMAIN, key)  # with a domain, libzmq rejects ZMTP 1 and 2
         if self._key is not None:
             raw.setsockopt(zmq.CURVE_SERVER, 1)
             raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
@@ -186,7 +188,7 @@ class Bus:
             limited,
             routes=kind == zmq.ROUTER,
             publishes=kind == zmq.XPUB,
-            on_joined=on_joined,
+            on_subscribe=on_subscribe,
         )
         self._sockets.append(socket)
         return socket

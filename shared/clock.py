@@ -9,8 +9,8 @@ import time
 from collections import deque
 
 MEDIA_RATE_HZ = 16_000
-MAX_GAP_S = 10.0  # a longer gap in media time gets no frames
-STALL_LIMIT_S = 0.5  # longer than a process waits for the processor of a busy machine
+MAX_GAP_S = 10.0  # longer gaps in media time have no frames
+STALL_LIMIT_S = 0.5  # longer than a busy machine delays a process
 
 
 def to_samples(time_s: float) -> int:
@@ -56,7 +56,7 @@ def now_ns() -> int:
 
 
 class StallDetector:
-    """Detects that this process did not run for longer than a limit: it was stopped, or starved.
+    """Detects that this process was stopped or starved for longer than a limit.
 
     All times are in seconds on the same monotonic clock. ``resumed_at_s`` is the end of the latest
     stall; minus infinity before the first.
@@ -68,11 +68,11 @@ class StallDetector:
         self._checked_s = now_s
 
     def restart(self, now_s: float) -> None:
-        """Measure the next pause from now; the time since the last check was no stall."""
+        """Measure the next pause from now on; the time since the last check was not a stall."""
         self._checked_s = now_s
 
     def check(self, now_s: float, *, expected_s: float = 0.0) -> float:
-        """Return how much longer than expected the time since the last check was; 0 if no stall.
+        """Return the unexpected part of the time since the last check; 0 without a stall.
 
         ``expected_s`` is the longest time that the process meant to wait.
         """
@@ -84,6 +84,6 @@ class StallDetector:
         return pause_s
 
     def elapsed_s(self, now_s: float) -> float:
-        """Return the time since the last check, at most the limit: a stall does not count."""
+        """Return the time since the last check, up to the limit, because a stall does not count."""
         elapsed_s, self._checked_s = now_s - self._checked_s, now_s
         return min(elapsed_s, self._limit_s)

@@ -1,7 +1,7 @@
 """Configuration: defaults < TOML file < environment < command line.
 
-A TOML file has one table per service (``[recognizer]``) and ``[common]`` for the keys that every
-service has. The environment variable of a key is ``KOUXING_<SERVICE>_<KEY>``, or ``KOUXING_<KEY>``
+A TOML file has one table per service (``[recognizer]``), and ``[common]`` for the keys of all
+services. The environment variable of a key is ``KOUXING_<SERVICE>_<KEY>``, or ``KOUXING_<KEY>``
 for all services. Within one source, a value for one service overrides a value for all services. An
 unknown key, table or variable is an error that names the nearest known one.
 
@@ -53,7 +53,7 @@ from kouxing.shared.user_file import check_content, read_text
 PREFIX = "KOUXING_"
 _MAX_FILE_BYTES = 64 << 10
 _MAX_DOTS = 1000  # per line; tomllib's memory grows with the square of a key's parts
-COMMON = "common"  # table of the keys that every service has
+COMMON = "common"  # table of the keys of all services
 
 
 class BindAddress(Enum):
@@ -66,14 +66,14 @@ class BindAddress(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ValueHint:
-    """Describes the values of a key, if their type does not say enough."""
+    """Describes the values of a key whose type is not specific enough."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class KnownNames:
-    """Restricts a text to names and texts that match ``pattern``; ``others`` describes these."""
+    """Restricts a text to names, or texts that match ``pattern``, which ``others`` describes."""
 
     names: Callable[[], Iterable[str]]
     pattern: str = "(?!)"
@@ -144,11 +144,11 @@ def _check_boolean(value: object) -> object:
     return value
 
 
-def _lower(value: object) -> object:
+def _to_lower(value: object) -> object:
     return value.lower() if isinstance(value, str) else value
 
 
-def _split(value: object) -> object:
+def _split_text(value: object) -> object:
     return tuple(value.split()) if isinstance(value, str) else value
 
 
@@ -160,10 +160,10 @@ BoundEndpoint = Annotated[Endpoint, BindAddress.ENDPOINT]
 Host = Annotated[str, AfterValidator(_check_host), ValueHint("a host name or address")]
 BoundHost = Annotated[Host, BindAddress.HOST]
 BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
-LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_lower)]
-Texts = Annotated[tuple[str, ...], BeforeValidator(_split)]
+LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_to_lower)]
+TextList = Annotated[tuple[str, ...], BeforeValidator(_split_text)]
 """A list in a TOML file; elsewhere a text with spaces between the items."""
-HostNames = Annotated[Texts, AfterValidator(_check_hosts_of), ValueHint("a list of host names")]
+HostNames = Annotated[TextList, AfterValidator(_check_hosts_of), ValueHint("a list of host names")]
 
 
 class ServiceConfig(BaseModel):
@@ -198,7 +198,7 @@ class ServiceConfig(BaseModel):
         host, _ = split_endpoint(self.control, "control")
         return local_address() if is_loopback(host) else local_address(host)
 
-    def reachable(self, endpoint: str) -> str:
+    def advertised_endpoint(self, endpoint: str) -> str:
         """Return the endpoint by which others reach a bound endpoint."""
         host, _ = split_endpoint(endpoint, "endpoint")
         bound_host = self.advertised_host if host in WILDCARDS and not self.advertise else host
@@ -216,13 +216,13 @@ Address = tuple[str, str]  # a table and a key
 
 @dataclass(frozen=True, slots=True)
 class _RawValue:
-    """A value as the user wrote it."""
+    """A value as the user entered it."""
 
     text: str
     origin: str
 
 
-Layer = dict[Address, _RawValue]  # the values of one source
+Layer = dict[Address, _RawValue]  # values of one source
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +238,7 @@ class Setting:
 
     @property
     def is_default(self) -> bool:
-        """Whether no source has a value."""
+        """Whether no source sets the key."""
         return self.origin.startswith("default")
 
     @property
@@ -268,12 +268,14 @@ class Settings:
         self._tables: dict[str, type[ServiceConfig]] = dict(types)
         environment = os.environ if environment is None else environment
         addresses = [(table, key) for table in self._tables for key in self._keys(table)]
-        variables = {variable(*address): address for address in addresses}
+        variables = {variable_name(*address): address for address in addresses}
         self._names = {".".join(address): address for address in addresses}
         self._layers = (
             {} if file is None else self._read_file(file),
-            _find({n: text for n, text in environment.items() if n.startswith(PREFIX)}, variables),
-            self._assigned(assignments or {}),
+            _make_layer(
+                {n: text for n, text in environment.items() if n.startswith(PREFIX)}, variables
+            ),
+            self._command_line_layer(assignments or {}),
         )
 
     def load(self, config_type: type[Config], overrides: Mapping[str, str] | None = None) -> Config:
@@ -295,7 +297,7 @@ class Settings:
                 value=getattr(config, key),
                 origin=values[key].origin if key in values else _default_origin(config, field),
                 default=_default(field),
-                allowed=allowed(field),
+                allowed=describe_allowed_values(field),
                 meaning=_key_help(config_type, key),
             )
             for key, field in config_type.model_fields.items()
@@ -305,7 +307,9 @@ class Settings:
         self, config_type: type[Config], overrides: Mapping[str, str]
     ) -> tuple[Config, dict[str, _RawValue]]:
         table = next((n for n, known in self._tables.items() if known is config_type), COMMON)
-        assigned = self._assigned({f"{table}.{key}": text for key, text in overrides.items()})
+        assigned = self._command_line_layer(
+            {f"{table}.{key}": text for key, text in overrides.items()}
+        )
         values = {
             key: layer[name, key]
             for layer in (*self._layers, assigned)
@@ -317,15 +321,15 @@ class Settings:
             config = config_type.model_validate_strings({k: g.text for k, g in values.items()})
         except ValidationError as error:
             key = str(error.errors()[0]["loc"][0])
-            raise self._not_allowed((table, key), values[key]) from None
+            raise self._value_error((table, key), values[key]) from None
         _check_hosts(table, config)
         return config, values
 
     def _keys(self, table: str) -> Mapping[str, FieldInfo]:
         return self._tables[table].model_fields
 
-    def _assigned(self, values: Mapping[str, str]) -> Layer:
-        return _find(values, self._names, "--set")
+    def _command_line_layer(self, values: Mapping[str, str]) -> Layer:
+        return _make_layer(values, self._names, "--set")
 
     def _read_file(self, file: Path) -> Layer:
         text = read_text(file, _MAX_FILE_BYTES)
@@ -338,30 +342,31 @@ class Settings:
             if table not in self._tables or not isinstance(entries, dict):
                 raise UserError(f"{file}: unknown table [{table}]; {_hint(table, self._tables)}")
             values |= {f"{table}.{key}": value for key, value in entries.items()}
-        layer = _find({n: _as_text(v) for n, v in values.items()}, self._names, str(file))
+        layer = _make_layer({n: _as_text(v) for n, v in values.items()}, self._names, str(file))
         for name, value in values.items():
             table, key = address = self._names[name]
             is_list = typing.get_origin(self._keys(table)[key].annotation) is tuple
             if not isinstance(value, list if is_list else str | int | float):
-                raise self._not_allowed(address, layer[address])
+                raise self._value_error(address, layer[address])
         return layer
 
-    def _not_allowed(self, address: Address, value: _RawValue) -> UserError:
+    def _value_error(self, address: Address, value: _RawValue) -> UserError:
         table, key = address
         field = self._keys(table)[key]
         similar = difflib.get_close_matches(value.text, _names(field), n=1, cutoff=0.5)
         hint = f"; did you mean {similar[0]}?" if similar else ""
         return UserError(
-            f"{table}.{key}: {value.text!r} (from {value.origin}) is not {allowed(field)}{hint}"
+            f"{table}.{key}: {value.text!r} (from {value.origin}) is not"
+            f" {describe_allowed_values(field)}{hint}"
         )
 
 
-def variable(table: str, key: str) -> str:
+def variable_name(table: str, key: str) -> str:
     """Return the environment variable of a service's key, or of a common key for all services."""
     return PREFIX + (key if table == COMMON else f"{table}_{key}").upper()
 
 
-def allowed(field: FieldInfo) -> str:
+def describe_allowed_values(field: FieldInfo) -> str:
     """Describe the allowed values of a key, such as "an integer from 1 to 20"."""
     kind = field.annotation
     marks: dict[type, Any] = {type(mark): mark for mark in field.metadata}
@@ -403,8 +408,8 @@ def bound_keys(config_type: type[ServiceConfig]) -> dict[str, BindAddress]:
 def parse_assignments(assignments: Iterable[str], service: str = "") -> dict[str, str]:
     """Split the values of ``--set`` into keys and values.
 
-    The name of ``service`` before a key is left out. Raises ``UserError`` if an assignment is
-    not ``KEY=VALUE``.
+    The name of ``service`` before a key is removed. Raises ``UserError`` if an assignment is not
+    ``KEY=VALUE``.
     """
     values = {}
     for assignment in assignments:
@@ -415,7 +420,7 @@ def parse_assignments(assignments: Iterable[str], service: str = "") -> dict[str
     return values
 
 
-def _find(values: Mapping[str, str], known: Mapping[str, Address], origin: str = "") -> Layer:
+def _make_layer(values: Mapping[str, str], known: Mapping[str, Address], origin: str = "") -> Layer:
     """Return the values of a source by table and key; without ``origin``, of the environment."""
     layer: Layer = {}
     for name, text in values.items():
@@ -447,7 +452,7 @@ def _default_origin(config: ServiceConfig, field: FieldInfo) -> str:
 
 
 def _key_help(config_type: type[ServiceConfig], key: str) -> str:
-    meaning = _docstrings(config_type).get(key, "")
+    meaning = _key_docstrings(config_type).get(key, "")
     factory = config_type.model_fields[key].default_factory
     if isinstance(factory, DependentDefault):
         names: dict[float, list[str]] = {}
@@ -460,8 +465,8 @@ def _key_help(config_type: type[ServiceConfig], key: str) -> str:
 
 
 @cache
-def _docstrings(config_type: type[ServiceConfig]) -> dict[str, str]:
-    """Return the text below each key in the source. pydantic would parse it at every start."""
+def _key_docstrings(config_type: type[ServiceConfig]) -> dict[str, str]:
+    """Return the text below each key in the source. pydantic would parse it at every startup."""
     texts = {}
     for base in config_type.__mro__[-3::-1]:  # from ServiceConfig, after BaseModel and object
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body

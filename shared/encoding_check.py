@@ -1,7 +1,7 @@
-"""Detects data that is not 16-bit PCM, though a client announced it.
+"""Detects data that is not 16-bit PCM although a client announced 16-bit PCM.
 
-Such data sounds like loud noise. Real noise may be just as loud, so data is refused only if another
-reading of the same bytes is sound, or if it has the frames of a codec.
+Such data sounds like loud noise. Real noise may be equally loud. Data is therefore rejected only
+if the same bytes are plausible sound in another encoding, or contain the frames of a codec.
 """
 
 from collections.abc import Callable
@@ -15,13 +15,13 @@ from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, find_sound_start
 Array = NDArray[np.float64]
 Measure = tuple[float, float, float]  # spectral flatness, correlation of neighbors, RMS
 
-BLOCK = 2400  # samples of each channel that are judged together: whole samples of any encoding
-_MAX_BLOCKS = 60  # that are not silent; then the check ends
-_MAX_REFUSED = 2  # blocks that are not PCM
+BLOCK = 2400  # samples per channel that are checked together; a multiple of all sample sizes
+_MAX_BLOCKS = 60  # non-silent blocks after which the check ends
+_MAX_REFUSED = 2  # non-PCM blocks after which the data is rejected
 _MIN_SOUND = 3  # blocks of sound that end the check
 _SEGMENT = 200  # samples of a spectrum
 _FULL_SCALE = 32768
-_MAX_SAMPLE = 1.5  # of another reading
+_MAX_SAMPLE = 1.5  # largest plausible sample in another encoding
 _SILENCE, _QUIET, _AUDIBLE = 0.01, 0.003, 0.05  # root mean square, of full scale
 # Ranges of misread data, and of the reading with the right encoding.
 _MIN_WIDE_RMS, _MIN_WIDE_FLATNESS, _MAX_SOUND_FLATNESS = 0.3, 0.45, 0.3
@@ -74,16 +74,16 @@ class EncodingCheck:
         self._error = ""
         self._begin = b""
         self._waiting = b""
-        self._num_blocks = 0  # that are not silent
+        self._num_blocks = 0  # number of non-silent blocks
         self._num_sound = 0
-        self._refused: list[str] = []  # what the refused blocks look like
+        self._refused: list[str] = []  # likely encodings of the rejected blocks
         self._packet_starts: list[int] = []
 
     def check(self, message: bytes) -> None:
         """Check a message of any length.
 
-        Raises ``UserError`` if the data has another encoding; the text names the likely one. Then
-        all later messages are also refused.
+        Raises ``UserError`` if the data has another encoding; the text names the likely encoding.
+        All later messages are then also rejected.
         """
         if self._is_done or not message:
             return
@@ -131,9 +131,9 @@ class EncodingCheck:
             and other_rms > _QUIET
         ]
         if likely:
-            self._refuse(min(likely)[1])
+            self._reject(min(likely)[1])
         elif is_white and self._is_compressed(data[::2]):
-            self._refuse("compressed data")
+            self._reject("compressed data")
         elif not is_white and (
             correlation > _MIN_SOUND_CORRELATION
             and rms > _AUDIBLE
@@ -142,7 +142,7 @@ class EncodingCheck:
             self._num_sound += 1
             self._is_done = self._num_sound == _MIN_SOUND
 
-    def _refuse(self, kind: str) -> None:
+    def _reject(self, kind: str) -> None:
         self._refused.append(kind)
         if len(self._refused) == _MAX_REFUSED:
             kinds = " or ".join(sorted(set(self._refused)))

@@ -1,4 +1,4 @@
-"""The form of an endpoint, and which hosts can reach it."""
+"""Parses endpoints, and classifies their hosts."""
 
 import contextlib
 import ipaddress
@@ -74,7 +74,7 @@ def local_address(towards: str = "192.0.2.1") -> str:
     """Return the local address for connections to a host, without sending anything.
 
     Without a host, or if it cannot be reached, this is the address of the default route, or
-    127.0.0.1 without one.
+    127.0.0.1 without a route.
     """
     for host in dict.fromkeys((towards, "192.0.2.1")):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -1,4 +1,4 @@
-"""Errors of the user, whose text names the cause and the remedy."""
+"""The exception for users' mistakes, and helpers for its text."""
 
 import contextlib
 import importlib.util
@@ -23,7 +23,7 @@ def install_command(package: str) -> str:
 
 
 @contextlib.contextmanager
-def naming_option(option: str, key: str, *, is_given: bool) -> Iterator[None]:
+def rename_key_in_errors(option: str, key: str, *, is_given: bool) -> Iterator[None]:
     """Replace a configuration key in errors with the option that has set it, if it was given."""
     try:
         yield
@@ -33,6 +33,6 @@ def naming_option(option: str, key: str, *, is_given: bool) -> Iterator[None]:
         raise UserError(str(error).replace(f"{key}:", f"{option}:", 1)) from None
 
 
-def with_name(name: str, text: str) -> str:
-    """Return a message that starts with the name of its service, once."""
+def prefix_name(name: str, text: str) -> str:
+    """Prefix a message with the name of its service, unless it already starts with it."""
     return text if text.startswith((f"{name}:", f"{name}.")) else f"{name}: {text}"

@@ -31,7 +31,7 @@ def font_for(text: str, size_px: float) -> ImageFont.FreeTypeFont:
 
 
 def text_runs(text: str, size_px: float) -> list[tuple[str, ImageFont.FreeTypeFont]]:
-    """Split a text into parts with one font each: not every Chinese font has tone marks."""
+    """Split a text into runs with one font each, because some Chinese fonts lack tone marks."""
     runs = ("".join(letters) for _, letters in groupby(text, _is_chinese))
     return [(run, font_for(run, size_px)) for run in runs]
 

@@ -1,8 +1,8 @@
-"""Ctrl-C that ends a command, even if a library drops the exception.
+"""Ends a command on Ctrl-C, even if a library drops the exception.
 
-Python raises ``KeyboardInterrupt`` in the code that runs at this moment. The exception is lost if a
-library called this code, for example FFmpeg to read a file, or if a module with ``except:`` is
-being imported. Then it is raised again.
+Python raises ``KeyboardInterrupt`` in the running code. The exception is lost if a library called
+this code, for example FFmpeg to read a file, or if a module with ``except:`` is being imported. It
+is therefore raised repeatedly until it is handled.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from typing import Any
 _REPEAT_S = 0.5
 
 
-def install_interrupt() -> None:
+def install_interrupt_handler() -> None:
     """Raise ``KeyboardInterrupt`` on Ctrl-C, repeatedly until it is handled.
 
     Libraries that drop it print no traceback.
@@ -30,13 +30,13 @@ def is_interrupted() -> bool:
 
 
 def clear_interrupt() -> None:
-    """Stop repeating the exception: it is handled."""
+    """Stop repeating the exception, because it is handled."""
     if _is_installed():
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 def _is_installed() -> bool:
-    return signal.getsignal(signal.SIGALRM) is _repeat  # else the timer belongs to another program
+    return signal.getsignal(signal.SIGALRM) is _repeat  # otherwise the timer belongs to other code
 
 
 @contextlib.contextmanager

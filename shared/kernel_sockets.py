@@ -1,4 +1,4 @@
-"""The kernel's view of libzmq's sockets: addresses and byte counts, by file descriptor."""
+"""Queries the kernel about libzmq's sockets: addresses and byte counts, by file descriptor."""
 
 import contextlib
 import fcntl
@@ -31,7 +31,7 @@ class Traffic(NamedTuple):
     """bytes that wait because the peer's kernel accepts no more"""
 
 
-def inode_of(descriptor: int) -> int | None:
+def get_inode(descriptor: int) -> int | None:
     """Return the inode of the socket behind a descriptor, None if it is not a socket."""
     try:
         status = os.fstat(descriptor)
@@ -40,14 +40,14 @@ def inode_of(descriptor: int) -> int | None:
     return status.st_ino if stat.S_ISSOCK(status.st_mode) else None
 
 
-def address_of(descriptor: int) -> str:
-    """Return the peer's network (see ``network_of``), empty if the peer is gone."""
+def get_peer_address(descriptor: int) -> str:
+    """Return the peer's network (see ``get_network``), empty if the peer is gone."""
     with contextlib.suppress(OSError), _borrow_socket(descriptor) as connection:
-        return network_of(str(connection.getpeername()[0]))
+        return get_network(str(connection.getpeername()[0]))
     return ""
 
 
-def port_of(descriptor: int) -> int:
+def get_local_port(descriptor: int) -> int:
     """Return the local port, or 0 if the socket has no port."""
     with contextlib.suppress(OSError), _borrow_socket(descriptor) as connection:
         name = connection.getsockname()
@@ -55,8 +55,8 @@ def port_of(descriptor: int) -> int:
     return 0
 
 
-def network_of(host: str) -> str:
-    """Return the addresses that one host controls as one name.
+def get_network(host: str) -> str:
+    """Return one name for all addresses that a host controls.
 
     Loopback addresses become "loopback" and an IPv6 address its /64 network. Returns an empty
     string if ``host`` is not an IP address.
@@ -73,7 +73,7 @@ def network_of(host: str) -> str:
     return str(ipaddress.ip_network((address, prefix), strict=False).network_address)
 
 
-def traffic_of(descriptor: int) -> Traffic:
+def get_traffic(descriptor: int) -> Traffic:
     """Return the byte counts of a TCP connection. Only Linux reports them."""
     if not _IS_LINUX:
         return Traffic()
@@ -98,7 +98,7 @@ def reset(descriptor: int, inode: int) -> None:
 
 
 def hold(descriptor: int, inode: int) -> socket.socket | None:
-    """Let libzmq close a connection, but keep it open for the peer.
+    """Make libzmq close a connection, but keep it open for the peer.
 
     Closing the returned socket resets the connection. Returns None if the descriptor is closed or
     reused.
@@ -114,7 +114,7 @@ def _copy(descriptor: int, inode: int) -> socket.socket | None:
     """Return a copy that libzmq cannot close, None if the descriptor is closed or reused."""
     with contextlib.suppress(OSError):
         connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, os.dup(descriptor))
-        if inode_of(connection.fileno()) == inode:
+        if get_inode(connection.fileno()) == inode:
             return connection
         connection.close()
     return None

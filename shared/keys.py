@@ -1,7 +1,7 @@
 """CURVE keys: the identity of each process, and the list of keys that may connect.
 
-The keys are in ``$XDG_STATE_HOME/kouxing`` or ``~/.local/state/kouxing``. The first process that
-starts creates the folder:
+The keys are in ``$XDG_STATE_HOME/kouxing`` or ``~/.local/state/kouxing``. The first process
+creates the folder:
 
 - ``NAME.key``: the key pair of a service or client, with control's public key;
 - ``allowed``: the keys that may connect, one line ``PUBLIC-KEY NAME ROLE...`` each.
@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.names import NAME, NAME_RULE, is_name
+from kouxing.shared.name_rules import NAME, NAME_RULE, is_name
 from kouxing.shared.output_file import write_private
 from kouxing.shared.user_file import parse_json, read_text
 
@@ -84,7 +84,7 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
     ``control`` is control's address; empty: this machine. Raises ``UserError`` if the key cannot be
     read or created, other users can read it, or it belongs to another system than control's key.
     """
-    if credential := _credential(f"{name}.key"):
+    if credential := _find_credential(f"{name}.key"):
         return read_key(credential)
     with _locked_folder() as folder:
         path, control_path = folder / f"{name}.key", folder / "control.key"
@@ -109,7 +109,7 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
         control_key = read_key(control_path) if control_path.exists() else None
         if control_key is not None and control_key.public != key.control:
             if name == CONTROL:
-                raise _bad_key(path)
+                raise _key_error(path)
             raise UserError(
                 f"{path} belongs to another system than {control_path}. If control runs on another"
                 f" machine, run: rm {control_path} {folder / _ALLOWED}. If it runs here, run:"
@@ -133,7 +133,7 @@ def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
     replaced: list[Path] = []
     for name, key in keys.items():
         path, grant = key_folder() / f"{name}.key", grants.get(key.public, Grant("", ()))
-        if _credential(path.name):
+        if _find_credential(path.name):
             continue
         if zmq.curve_public(key.secret.encode()) != key.public.encode():
             reasons.append(f"{path}: the secret key does not belong to the public key")
@@ -158,12 +158,12 @@ def _replace_hint(*paths: Path) -> str:
     return "; ".join([*revoke, shlex.join(("rm", "-r", *map(str, paths)))])
 
 
-def user_key(*, control: str = "") -> Key:
+def load_user_key(*, control: str = "") -> Key:
     """Return the key of the user's commands and clients. Parameter and errors as ``load_key``."""
     return load_key(CLIENT, CLIENT_ROLES, control=control)
 
 
-def local_keys() -> dict[str, Key]:
+def load_local_keys() -> dict[str, Key]:
     """Return this machine's keys by name, without control's. Raises ``UserError`` as ``read_key``.
 
     The folder of the keys may not exist.
@@ -179,7 +179,7 @@ def control_endpoint(address: str, *, insecure: bool) -> str:
 
     Raises ``UserError`` if the user's key cannot be read (see ``load_key``).
     """
-    return with_key(address, "" if insecure else user_key(control=address).control)
+    return with_key(address, "" if insecure else load_user_key(control=address).control)
 
 
 def rejection_hint(control: str, name: str, roles: Collection[str]) -> str:
@@ -198,7 +198,7 @@ def rejection_hint(control: str, name: str, roles: Collection[str]) -> str:
     )
 
 
-def key_text(key: Key) -> str:
+def format_key(key: Key) -> str:
     """Return the content of a key file."""
     return json.dumps(asdict(key), indent=1) + "\n"
 
@@ -214,15 +214,15 @@ def read_grants() -> dict[str, Grant]:
 
     Raises ``UserError`` if the list cannot be read, or other users can change it.
     """
-    if credential := _credential(_ALLOWED):
+    if credential := _find_credential(_ALLOWED):
         return _read_grants(credential)
     with _locked_folder() as folder:
         return _read_grants(folder / _ALLOWED)
 
 
 def grants_file() -> Path:
-    """Return the file that ``read_grants`` reads. Every change replaces the file."""
-    return _credential(_ALLOWED) or key_folder() / _ALLOWED
+    """Return the file of ``read_grants``. Every change replaces the file."""
+    return _find_credential(_ALLOWED) or key_folder() / _ALLOWED
 
 
 def add_key(name: str, roles: Collection[str], path: Path) -> None:
@@ -242,22 +242,22 @@ def revoke_key(name: str) -> None:
         remaining = {public: grant for public, grant in grants.items() if grant.name != name}
         if len(remaining) == len(grants):
             raise UserError(f"no key is named {name!r}; list them with 'kouxing keys list'")
-        _write(folder / _ALLOWED, _lines(remaining))
+        _write(folder / _ALLOWED, _format_grants(remaining))
 
 
 def save_grants(grants: Grants) -> None:
     """Save the list that control sent, so that it is available after a restart.
 
-    On control's machine this does nothing: the list there may be newer. Raises ``UserError`` if the
-    list cannot be written.
+    On control's machine, this does nothing, because the list there may be newer. Raises
+    ``UserError`` if the list cannot be written.
     """
     with _locked_folder() as folder:
         is_controls = (folder / "control.key").exists()
         if not is_controls and _read_grants(folder / _ALLOWED) != grants:
-            _write(folder / _ALLOWED, _lines(grants))
+            _write(folder / _ALLOWED, _format_grants(grants))
 
 
-def may_follow(grant: Grant, topic: bytes) -> bool:
+def may_subscribe(grant: Grant, topic: bytes) -> bool:
     """Return whether a key may subscribe to a topic prefix."""
     if any(role == f"{_SUBSCRIBER}*" or not role.startswith(_SUBSCRIBER) for role in grant.roles):
         return True
@@ -270,7 +270,7 @@ def _new_key(control: str = "") -> str:
     from kouxing_client.keys import Key  # noqa: PLC0415
 
     public, secret = (part.decode() for part in zmq.curve_keypair())
-    return key_text(Key(public, secret, control or public))
+    return format_key(Key(public, secret, control or public))
 
 
 def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> None:
@@ -291,7 +291,7 @@ def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> Non
     grants[json.loads(text)["public"]] = Grant(name, tuple(roles))
     _check_number(grants)
     _write(path, text)
-    _write(folder / _ALLOWED, _lines(grants))
+    _write(folder / _ALLOWED, _format_grants(grants))
 
 
 def read_key(path: Path) -> Key:
@@ -307,10 +307,10 @@ def read_key(path: Path) -> Key:
             return key
     except (ValueError, TypeError):
         pass
-    raise _bad_key(path)
+    raise _key_error(path)
 
 
-def _bad_key(path: Path) -> UserError:
+def _key_error(path: Path) -> UserError:
     if path.parent != key_folder():
         return UserError(f"{path} is not a key file; copy it again")
     return UserError(
@@ -346,7 +346,7 @@ def _parse_grants(path: Path) -> dict[str, Grant]:
 
 
 def _check_number(grants: Grants) -> None:
-    """Reject more keys or roles than one message to the services holds."""
+    """Reject more keys or roles than fit in one message to the services."""
     for grant in grants.values():
         if len(grant.roles) > MAX_ROLES:
             raise UserError(
@@ -358,11 +358,11 @@ def _check_number(grants: Grants) -> None:
             f"there are {len(grants)} keys, but the maximum is {MAX_KEYS};"
             " revoke some with 'kouxing keys revoke'"
         )
-    if len(_lines(grants)) > _MAX_ALLOWED_BYTES:
+    if len(_format_grants(grants)) > _MAX_ALLOWED_BYTES:
         raise UserError("the keys have too many roles; revoke some with 'kouxing keys revoke'")
 
 
-def _lines(grants: Grants) -> str:
+def _format_grants(grants: Grants) -> str:
     return "".join(
         f"{public} {' '.join((name, *roles))}\n" for public, (name, roles) in grants.items()
     )
@@ -386,7 +386,7 @@ def _locked_folder() -> Iterator[Path]:
         os.close(descriptor)
 
 
-def _credential(name: str) -> Path | None:
+def _find_credential(name: str) -> Path | None:
     """Return a file in ``$CREDENTIALS_DIRECTORY``, None if it does not exist."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     path = Path(folder, name) if folder else None

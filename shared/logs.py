@@ -1,4 +1,4 @@
-"""Logs as JSON lines on standard error. A line names its session, but has no speech content."""
+"""Writes logs as JSON lines to standard error. A line names its session, never speech content."""
 
 import json
 import logging
@@ -47,8 +47,8 @@ class RateLimit:
 def configure(service: str, level: str) -> None:
     """Send the log of this process to standard error as JSON lines.
 
-    A library's line is logged once per ``LIBRARY_PERIOD_S``, because clients may cause it. Lines
-    about their closed connections are not logged.
+    Each log line of a library is logged once per ``LIBRARY_PERIOD_S``, because clients may cause
+    it. Lines about closed connections are not logged.
     """
     limit = RateLimit(LIBRARY_PERIOD_S)
 

@@ -1,4 +1,4 @@
-"""Decodes the sound of files and pipes with FFmpeg, at the times that the container states."""
+"""Decodes the sound of files and pipes with FFmpeg, at the timestamps of the container."""
 
 import io
 import re
@@ -10,9 +10,9 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.channels import CancellationGuard, Samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import is_interrupted
+from kouxing.shared.phase_cancellation import PhaseCancellationGuard, Samples
 from kouxing.shared.sound_formats import (
     MAX_OGG_PAGE_BYTES,
     MIN_UNKNOWN_BYTES,
@@ -32,9 +32,9 @@ OPTIONS = {"protocol_whitelist": "none"}  # no network access, and no files from
 _PIPE_OPTIONS = OPTIONS | {"probesize": "512", "formatprobesize": "8192"}
 _PACKET_OPTIONS = _PIPE_OPTIONS | {"probesize": "4096"}  # with the list of tracks
 _JITTER_S = 0.05  # timestamps that differ less from the number of samples are inexact
-_MAX_OVERLAP_S = 1.0  # timestamps that go back further start again
-_MAX_GAP_S = 3600.0  # a larger one is an error in the timestamps
-_MAX_GAP_OF_BROADCAST_S = 10.0  # its timestamps may start again at any value
+_MAX_OVERLAP_S = 1.0  # timestamps that go back further are a restart
+_MAX_GAP_S = 3600.0  # a larger gap is an error in the timestamps
+_MAX_GAP_OF_BROADCAST_S = 10.0  # timestamps of broadcasts may restart at any value
 _MIN_MISSING_S = 0.1  # a track that lacks more is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 _WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
@@ -64,10 +64,10 @@ class WavPcm(NamedTuple):
 class MediaSound:
     """One audio track of a media file, with one or two channels.
 
-    ``track`` counts from 1. Without a number, the default track is read, or the first one if
-    no track is the default; tracks that cannot be decoded are ignored. ``name`` is the file's, for
-    messages. ``blocks`` yields the sample rate and samples, (n, channels); the rate may change.
-    ``warnings`` is complete after the last block.
+    ``track`` counts from 1. Without a number, the default track is read, or the first track if no
+    track is the default; tracks that cannot be decoded are ignored. ``name`` is the file's name
+    for messages. ``blocks`` yields the sample rate and samples, (n, channels); the rate may
+    change. ``warnings`` is complete after the last block.
 
     Raises ``UserError`` if FFmpeg cannot read the file, or it has no such track; while reading, if
     nothing can be decoded.
@@ -159,7 +159,7 @@ class MediaSound:
         return stream
 
     def _decode(self) -> Iterator[Any]:
-        """Yield the frames of the track. Damaged packets are left out, as FFmpeg does."""
+        """Yield the frames of the track. Like FFmpeg, skip damaged packets."""
         self._read_end_s = self._track_end_s = 0.0  # end of all tracks, and of this one
         self._first_place: int | None = None  # position of the first packet in the file, bytes
         self._num_damaged = 0
@@ -212,7 +212,7 @@ class MediaSound:
         start_s = start_of(self._container)
         origin_s = (first.time or 0.0) if start_s is None else start_s
         position_s = 0.0
-        guard = CancellationGuard(self._name, self.num_channels, self.warnings)
+        guard = PhaseCancellationGuard(self._name, self.num_channels, self.warnings)
         frame: Any = first
         with self._container:
             while frame is not None:
@@ -266,7 +266,7 @@ class MediaSound:
         return -_MAX_OVERLAP_S < ahead_s < _MAX_GAP_S
 
     def _stated_s(self) -> float | None:
-        """Return the duration that the file states, or that FFmpeg estimates."""
+        """Return the duration from the file's header, or FFmpeg's estimate."""
         if self._container.duration is None:
             return None
         return float(self._container.duration / av.time_base)
@@ -296,7 +296,7 @@ class MediaSound:
             )
 
     def _states_length(self) -> bool:
-        """Return whether the duration is from a header, not estimated from the file's size."""
+        """Return whether the duration is stated in a header, not estimated from the file's size."""
         container = self._container
         if not _HEADERS_STATE_LENGTH.match(container.format.name):
             return False
@@ -309,7 +309,7 @@ class MediaSound:
 
 
 def start_of(container: Any) -> float | None:
-    """Return the timestamp that is the start of a file, seconds; None if unknown."""
+    """Return the timestamp at the start of a file, seconds; None if unknown."""
     start_s = None if container.start_time is None else container.start_time / av.time_base
     if _TIMES_COUNT_FROM_ZERO.match(container.format.name):
         return min(0.0, start_s or 0.0)
@@ -331,7 +331,7 @@ def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:
 
 
 class _GuardedFile:
-    """A file that keeps an exception, such as Ctrl-C. FFmpeg would take it for the end."""
+    """A file that keeps exceptions such as Ctrl-C, because FFmpeg would take them for the end."""
 
     def __init__(self, file: BinaryIO, *, can_seek: bool) -> None:
         self.name = str(getattr(file, "name", ""))

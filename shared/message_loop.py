@@ -10,12 +10,12 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import Metrics
-from kouxing.shared.sockets import Poller, Received, Socket
+from kouxing.shared.sockets import Poller, ReceivedMessage, Socket
 from kouxing.shared.wire.codec import BadMessage
 from kouxing.shared.wire.message import VERSION, Message
 from kouxing.shared.wire.session import Error, ErrorCode
 
-MAX_TURN_S = 0.05  # for the messages of one socket, before the others get their turn
+MAX_TURN_S = 0.05  # time for the messages of one socket before the next socket
 
 Handler = Callable[[Any, Peer], None]
 
@@ -32,7 +32,7 @@ class MessageLoop:
         self.current_session = ""
         self._warning_limit = RateLimit()
         self._poller = Poller()
-        self.waker = self._poller.waker  # once woken, it ends every `wait` until it is cleared
+        self.waker = self._poller.waker  # ends every `wait` until it is cleared
         bus.wake_on_connections(self.waker)
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
         self._paused: set[Socket] = set()
@@ -51,7 +51,7 @@ class MessageLoop:
         self.bus.drop(socket)
 
     def pause(self, socket: Socket, *, paused: bool) -> None:
-        """Leave a socket's messages in its queue, so that the senders wait."""
+        """Pause or resume a socket. Messages of a paused socket stay queued; their senders wait."""
         if paused and socket not in self._paused:
             self._paused.add(socket)
             self._poller.remove(socket)
@@ -60,7 +60,7 @@ class MessageLoop:
             self._poller.add(socket)
 
     def wait(self, timeout_s: float) -> list[Socket]:
-        """Wait up to the timeout for messages; return the sockets that have some."""
+        """Wait up to the timeout for messages; return the sockets with messages."""
         return self._poller.wait(timeout_s)
 
     def warn(self, reason: str, text: str, session: str = "", level: int = logging.WARNING) -> None:
@@ -70,7 +70,7 @@ class MessageLoop:
             LOG.log(level, text, extra={"session": session})
 
     def handle_messages(self, socket: Socket) -> None:
-        """Handle the messages that a socket has received, up to its fair share."""
+        """Handle a socket's received messages, for up to ``MAX_TURN_S``."""
         handlers = self._handlers.get(socket)
         if handlers is None:  # a handler has closed the socket in this step
             return
@@ -81,7 +81,7 @@ class MessageLoop:
                 break
 
     def _dispatch(
-        self, socket: Socket, handlers: dict[type[Message], Handler], received: Received
+        self, socket: Socket, handlers: dict[type[Message], Handler], received: ReceivedMessage
     ) -> None:
         message, sender = received.message, received.sender
         if isinstance(message, BadMessage):

@@ -1,4 +1,4 @@
-"""Counters, gauges and latencies of a service, small enough for every heartbeat.
+"""Counters, gauges and latencies of a service, compact enough for every heartbeat.
 
 Heartbeats and the Prometheus page (``shared.prometheus``) have the same values.
 """
@@ -79,7 +79,7 @@ class Metrics:
 
 
 def percentile(ordered: Sequence[float], percent: int) -> float:
-    """Return the nearest-rank percentile of sorted values, at least one."""
+    """Return the nearest-rank percentile of sorted, non-empty values."""
     return ordered[percent * (len(ordered) - 1) // 100]
 
 
@@ -110,7 +110,7 @@ def trim_heap() -> None:
 
 
 class LoadMeter:
-    """Measures how much of at least the last ``period_s`` a loop worked, rather than waited."""
+    """Measures the fraction of at least the last ``period_s`` in which a loop worked."""
 
     def __init__(self, period_s: float, now_s: float) -> None:
         self._period_s = period_s
@@ -133,7 +133,7 @@ class LoadMeter:
         self._busy_s += duration_s
 
     def load(self, now_s: float) -> float:
-        """Return the fraction of time, 0 to 1, since an earlier call. Call this regularly."""
+        """Return the fraction of working time since an earlier call, 0 to 1. Call it regularly."""
         busy_s = self._busy_at(now_s)
         self._marks.append((now_s, busy_s))
         while len(self._marks) > 2 and self._marks[1][0] <= now_s - self._period_s:

@@ -1,4 +1,4 @@
-"""Writes the files that a user asked for, completely or not at all."""
+"""Writes output files, either completely or not at all."""
 
 import contextlib
 import errno

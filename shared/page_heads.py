@@ -1,4 +1,4 @@
-"""The cache folder of the page's heads, for a package without their GLB files."""
+"""The cache folder for the page's heads, which the package does not contain as GLB files."""
 
 import os
 from pathlib import Path

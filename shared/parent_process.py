@@ -1,6 +1,7 @@
-"""The link of a service to the process that started it, if that process restarts services.
+"""The link of a service to its parent process, if the parent restarts services.
 
-Two environment variables describe it. Their names start with an underscore: they are no settings.
+Two environment variables describe the link. Their names start with an underscore, because they are
+not settings.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Limits the number of connections of a process, and chooses the connections to end."""
+"""Limits the number of connections of a process, and chooses which connections must end."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from kouxing.shared.keys import MAX_KEY_SHARE
 
 if TYPE_CHECKING:
-    from kouxing.shared.connections import Connection
+    from kouxing.shared.connection_limits import PeerConnection
 
 MAX_CONNECTIONS = 400  # limit for clients; libzmq takes up to 0.1 MB for each
-FILES_PER_CLIENT = 6  # its own, one for a service, and four in the tarpit
+FILES_PER_CLIENT = 6  # one for the client, one for a service, and four in the tarpit
 RESERVED_FILES = 256  # for models, pages and outgoing connections
 
 
@@ -31,12 +31,12 @@ class PeerQuota:
         self.max_clients = max(1, min(MAX_CONNECTIONS + extra_connections, max_clients))
         self._is_service = is_service
 
-    def excess(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, str]]:
+    def excess(self, connections: Sequence[PeerConnection]) -> Iterator[tuple[PeerConnection, str]]:
         """Yield the connections that must end, with the reason.
 
-        ``connections`` start with the oldest one. Silent connections end first, and among them
-        connections of the owner that has the most. An owner first loses its oldest silent
-        connection, then its newest one.
+        ``connections`` are sorted from the oldest. Silent connections end first, starting with the
+        owner that has the most. An owner first loses its oldest silent connection, then its newest
+        connection.
         """
         if len(connections) <= MAX_KEY_SHARE * self.max_clients:
             return
@@ -49,7 +49,7 @@ class PeerQuota:
             else:
                 known.append(connection)
         silent.reverse()
-        ranks: dict[Connection, int] = {}  # among the connections of the same owner, from 1
+        ranks: dict[PeerConnection, int] = {}  # among the connections of the same owner, from 1
         nums: Counter[str] = Counter()
         for connection in (*services, *known, *silent):
             nums[connection.owner] += 1

@@ -1,10 +1,10 @@
-"""Scheduling of processes that must be in time."""
+"""Raises the scheduling priority of real-time processes."""
 
 import contextlib
 import os
 from pathlib import Path
 
-NICENESS = -10  # gives several times the processor time of an ordinary program
+NICENESS = -10  # several times the processor time of an ordinary program
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 AUTOGROUP = Path("/proc/self/autogroup")
 

@@ -1,8 +1,8 @@
-"""The metrics of a service for Prometheus, and its health check, over HTTP.
+"""Serves the metrics of a service for Prometheus, and its health check, over HTTP.
 
 ``/metrics`` has the metrics of ``shared.metrics`` under names by Prometheus' conventions;
 docs/metrics.md lists them. ``/healthz`` answers 200 while the service's loop runs, and 503 if it
-hangs. Neither names a session, so readers do not learn who speaks.
+hangs. Neither contains session names, so readers cannot identify speakers.
 """
 
 import contextlib
@@ -24,8 +24,8 @@ from prometheus_client.core import (
 from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import BUCKETS_MS, Distribution, Metrics
 
-REQUEST_LIMIT_S = 5.0  # for a peer to send its request and read the answer
-MAX_REQUESTS = 16  # at the same time; above this, the oldest connection is closed
+REQUEST_LIMIT_S = 5.0  # limit for a peer to send its request and read the answer
+MAX_REQUESTS = 16  # concurrent requests; above this, the oldest connection is closed
 # Counters with these prefixes become one metric with a label: name, label and help text.
 LABELED = {
     "in_": ("messages_received", "kind", "Messages received."),

@@ -1,4 +1,4 @@
-"""A stream of messages that survives a reconnection: from the recognizer to the synthesizer.
+"""A message stream from recognizer to synthesizer that survives reconnections.
 
 Messages have sequence numbers, and the receiver acknowledges them cumulatively. The sender keeps
 unacknowledged messages, because ZeroMQ drops messages in flight when a peer disconnects.
@@ -9,18 +9,18 @@ from collections import deque
 from collections.abc import Callable
 from itertools import islice
 
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
-from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import batch_messages
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 
 RESEND_AFTER_S = 0.5
-MAX_RESENT = 200  # messages at a time; more would delay a busy receiver further
+MAX_RESENT = 200  # messages resent at a time; more would delay a busy receiver further
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
 ACKNOWLEDGE_INTERVAL_S = 0.05  # minimum time between acknowledgements by ``tick``
-MAX_UNACKNOWLEDGED_S = 0.1  # usually, another message causes an earlier tick
+MAX_UNACKNOWLEDGED_S = 0.1  # limit; usually, another message causes an earlier tick
 
 
 class ReliableSender:
@@ -32,13 +32,13 @@ class ReliableSender:
         self.epoch = epoch
         self._next = 1
         self.unacknowledged: deque[Message] = deque()  # oldest first; the owner limits their number
-        self._waiting: list[Message] = []  # to be sent together
+        self._waiting: list[Message] = []  # messages to send together
         self._progress_s = 0.0
 
     def send(self, message: Message, now_s: float) -> None:
         """Send a message with the next number.
 
-        Results wait for the ``progress`` after them, because only that makes a frame.
+        Results wait for the following ``progress``, because only a ``progress`` makes a frame.
         """
         numbered = replace(message, session=self._session, epoch=self.epoch, sequence=self._next)
         self._next += 1
@@ -50,13 +50,13 @@ class ReliableSender:
             self.flush()
 
     def flush(self) -> None:
-        """Send the messages that wait for others."""
+        """Send the waiting messages."""
         if self._waiting:
             self._socket.send(batch_messages(self._waiting))
             self._waiting.clear()
 
     def acknowledge(self, up_to: int, now_s: float) -> list[Message]:
-        """Drop the messages up to a number, which the receiver has; return them."""
+        """Drop the acknowledged messages up to a number; return them."""
         acknowledged = []
         while self.unacknowledged and self.unacknowledged[0].sequence <= up_to:
             acknowledged.append(self.unacknowledged.popleft())
@@ -75,7 +75,7 @@ class ReliableSender:
 
 
 class ReliableReceiver:
-    """The receiving end for one session: each message once and in order.
+    """The receiving end for one session: delivers each message once and in order.
 
     The receiver sets session, epoch and sequence number of what ``make_acknowledgement`` returns.
     """

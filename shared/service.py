@@ -1,8 +1,8 @@
 """The loop that every service runs: startup, main loop, shutdown.
 
 A service sleeps until a message arrives or periodic work is due (``on_tick``). SIGTERM or SIGINT
-ends the main loop; then the service finishes its work within a deadline. A second signal exits at
-once. Heartbeats are sent from the loop, so that control detects a loop that hangs.
+ends the main loop; then the service finishes its work within a deadline. A second signal exits
+immediately. The loop sends the heartbeats, so that control detects a loop that hangs.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ SNAPSHOT_S = 1.0  # interval between computations of rates and percentiles for h
 SESSIONS_PER_HEARTBEAT = 16  # limit for a worker, so that a heartbeat's cost does not grow
 RESYNC_AFTER_S = 0.55  # delay of a heartbeat after which control may have moved the sessions
 REPLY_TIMEOUT_S = 0.5
-NO_REPLY_S = 10.0  # after this time without a reply from control, the service finds the reason
+NO_REPLY_S = 10.0  # after this time without a reply from control, the reason is logged
 FIRST_REPLY_S = 3.0  # limit at startup
 LOAD_PERIOD_S = 2.0
 DRAIN_TIMEOUT_S = 5.0
@@ -87,7 +87,7 @@ class Service(MessageLoop):
         self.key = None if config.insecure else self._load_key()
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
         super().__init__(Bus(self.key, extra_connections=extra_connections))
-        self.stall = StallDetector(time.monotonic())
+        self.stall_detector = StallDetector(time.monotonic())
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # endpoints that it provides, by name
         self.facts = SessionFacts()  # facts about the sessions of this service
@@ -95,15 +95,15 @@ class Service(MessageLoop):
         self.tick_callbacks: set[Callable[[], float]] = set()  # as `on_tick`
         self._exit_requested = False
         self._hand_over_end_s = 0.0
-        self._ticked_s = self._tick_due_s = 0.0
+        self._last_tick_s = self._tick_due_s = 0.0
         self._heartbeat_due_s = time.monotonic()
         self._num_reported = 0  # sessions in earlier heartbeats
         self._snapshot: dict[str, float] = {}  # newest rates and percentiles
         self._snapshot_due_s = -math.inf
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
-        self._reply_s = time.monotonic() - NO_REPLY_S + FIRST_REPLY_S
+        self._last_reply_s = time.monotonic() - NO_REPLY_S + FIRST_REPLY_S
         self._control_instance = ""
-        self.busy = LoadMeter(LOAD_PERIOD_S, time.monotonic())
+        self.load_meter = LoadMeter(LOAD_PERIOD_S, time.monotonic())
         self._metrics_server: MetricsServer | None = None
         self.control = self._connect_to_control() if has_control else None
 
@@ -138,7 +138,7 @@ class Service(MessageLoop):
         return {}
 
     def on_control_restart(self) -> None:
-        """React to a restart of control, which has forgotten what is not in heartbeats."""
+        """React to a restart of control, which has only the data of heartbeats."""
 
     def gauges(self) -> dict[str, float]:
         """Return additional figures by name, for heartbeats and Prometheus."""
@@ -226,23 +226,23 @@ class Service(MessageLoop):
         start_s = time.monotonic()
         due_s = min(self._tick_due_s, self._heartbeat_due_s)
         timeout_s = max(0.0, min(timeout_s, due_s - start_s))
-        self.busy.start_waiting(start_s)
-        self.stall.restart(start_s)
+        self.load_meter.start_waiting(start_s)
+        self.stall_detector.restart(start_s)
         sockets = self.wait(timeout_s)
         now_s = time.monotonic()
-        self.busy.start_working(now_s)
-        self.stall.check(now_s, expected_s=timeout_s)
+        self.load_meter.start_working(now_s)
+        self.stall_detector.check(now_s, expected_s=timeout_s)
         self.resync_with_control()
         for socket in sockets:
             self.handle_messages(socket)
         self.resync_with_control()
         now_s = time.monotonic()
         if sockets or self.waker.clear():
-            is_early = now_s < self._ticked_s + TICK_S
-            next_tick_s = self._ticked_s + FOLLOW_UP_S if is_early else now_s
+            is_early = now_s < self._last_tick_s + TICK_S
+            next_tick_s = self._last_tick_s + FOLLOW_UP_S if is_early else now_s
             self._tick_due_s = min(self._tick_due_s, next_tick_s)
         if now_s >= self._tick_due_s:
-            self._ticked_s = now_s
+            self._last_tick_s = now_s
             due_s = min((callback() for callback in tuple(self.tick_callbacks)), default=math.inf)
             self._tick_due_s = max(now_s + TICK_S, min(due_s, self.on_tick(now_s)))
         self.send_heartbeat_if_due()
@@ -282,7 +282,7 @@ class Service(MessageLoop):
         self.warn(error.code, error.text, error.session)
 
     def send_heartbeat_if_due(self) -> None:
-        """Send a heartbeat if it is time; long work calls this in between."""
+        """Send a heartbeat if it is due. Long work calls this regularly."""
         now_s = time.monotonic()
         if now_s >= self._heartbeat_due_s:
             self._send_heartbeat()
@@ -312,7 +312,7 @@ class Service(MessageLoop):
     def _send_heartbeat(self, *, all_sessions: bool = False) -> None:
         now_s = time.monotonic()
         self._sent_ns = now_ns()
-        sessions, load = self.session_inputs(), self.busy.load(now_s)
+        sessions, load = self.session_inputs(), self.load_meter.load(now_s)
         is_idle = not sessions or self.kind.role != "worker"
         self._heartbeat_due_s = now_s + (IDLE_HEARTBEAT_S if is_idle else HEARTBEAT_S)
         parent_process.send_pulse(is_idle=is_idle)
@@ -345,7 +345,7 @@ class Service(MessageLoop):
         )
 
     def _next_sessions(self, sessions: dict[str, SessionInput]) -> dict[str, SessionInput]:
-        """Return the sessions for the next heartbeat: some of them, if a worker has many."""
+        """Return the sessions for the next heartbeat, only some of them if a worker has many."""
         if self.kind.role != "worker" or len(sessions) <= SESSIONS_PER_HEARTBEAT:
             return sessions
         names = list(sessions)
@@ -354,16 +354,16 @@ class Service(MessageLoop):
         return {name: sessions[name] for name in (names + names)[start : self._num_reported]}
 
     def _check_replies(self, now_s: float) -> None:
-        """Find out why control does not reply."""
-        if self.control is not None and now_s - self._reply_s > NO_REPLY_S:
-            self._reply_s = now_s
+        """Start to look for the reason if control does not reply."""
+        if self.control is not None and now_s - self._last_reply_s > NO_REPLY_S:
+            self._last_reply_s = now_s
             if not self.control.can_send:  # another program was at the address, or other keys
                 self.unregister(self.control)
                 self.control = self._connect_to_control()
             threading.Thread(target=self._warn_about_control, daemon=True).start()
 
     def _warn_about_control(self) -> None:
-        """Log why control does not answer, and what to do; runs on a thread, as it waits."""
+        """Log why control does not answer, with the remedy. Runs on a thread, because it waits."""
         host, port = split_endpoint(self.config.control, "control")
         if reason := reach_error(host, port, is_zeromq=True):
             LOG.warning("waiting for control at %s: %s", self.config.control, reason)
@@ -380,7 +380,7 @@ class Service(MessageLoop):
         LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))
 
     def _on_heartbeat_reply(self, reply: HeartbeatReply, _sender: Peer) -> None:
-        self._reply_s = time.monotonic()
+        self._last_reply_s = time.monotonic()
         self._replied_ns = reply.sent_ns
         self.clock_offset.update(reply.sent_ns, reply.received_ns, reply.replied_ns, now_ns())
         if not self._control_instance:

@@ -1,4 +1,4 @@
-"""Follows a session inside the loop of a service."""
+"""Subscribes to a session inside the loop of a service."""
 
 import time
 from collections.abc import Callable, Collection, Mapping
@@ -77,7 +77,7 @@ class _ServiceTransport:
 
     @property
     def resumed_at_s(self) -> float:
-        return self._service.stall.resumed_at_s
+        return self._service.stall_detector.resumed_at_s
 
     def subscribe(
         self,

@@ -1,4 +1,4 @@
-"""A kind of service, as its package declares it."""
+"""The declaration of a kind of service."""
 
 from __future__ import annotations
 

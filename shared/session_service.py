@@ -1,4 +1,4 @@
-"""A service that serves sessions, which control starts and stops."""
+"""Base of the services with sessions, which control starts and stops."""
 
 import time
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ class SessionService(Service):
         """Stop serving a session, if it exists."""
 
     def flush_session(self, session: str) -> None:
-        """Drop audio of a session that is not yet shown."""
+        """Drop audio of a session whose face is not shown yet."""
 
     def served_sessions(self) -> Iterable[StartSession]:
         """Return the sessions that a restarted control restores from this service."""

@@ -1,4 +1,4 @@
-"""A ZeroMQ socket that carries messages, with limits against hostile peers.
+"""ZeroMQ sockets that carry messages, with limits against hostile peers.
 
 Undecodable messages are returned as ``BadMessage``.
 """
@@ -13,29 +13,35 @@ from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
 from kouxing_client.sockets import connect
 
-from kouxing.shared.connections import KIB, LONG_PENALTY_S, PENALTY_S, Connection, LimitedSocket
+from kouxing.shared.connection_limits import (
+    KIB,
+    LONG_PENALTY_S,
+    PENALTY_S,
+    LimitedSocket,
+    PeerConnection,
+)
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import NO_PEER, Grant, Peer, may_follow
-from kouxing.shared.names import is_name
-from kouxing.shared.records import Record
+from kouxing.shared.fast_record import Record
+from kouxing.shared.keys import NO_PEER, Grant, Peer, may_subscribe
+from kouxing.shared.name_rules import is_name
 from kouxing.shared.waker import Waker
-from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
+from kouxing.shared.wire.codec import BadMessage, decode, encode, make_topic
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, Joined
 from kouxing.shared.zap import Zap
 
-ERROR_COST = 4.0  # a message that is answered with an error takes this from the sender's budget
-ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report is 15 MB
+ERROR_COST = 4.0  # cost for the sender's budget of a message that is answered with an error
+ANSWER_COST = 0.25  # cost per KiB of an answer: the longest status report is 15 MB
 MAX_PARTS = 4
-MAX_DROPPED = 20_000  # parts of one message, before other sockets get their turn
-MAX_FOLLOWED = 4096  # subscriptions; with more, every message is encoded
-MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
+MAX_DROPPED = 20_000  # parts of one message that are dropped before the next socket
+MAX_SUBSCRIPTIONS = 4096  # subscriptions; with more, every message is encoded
+MAX_BATCH = 200  # messages from one socket before the next socket
 T = TypeVar("T", int, str)
 _MORE, _READABLE = zmq.DONTWAIT | zmq.SNDMORE, int(zmq.POLLIN)
 
 
-class Received(Record, frozen=True):
+class ReceivedMessage(Record, frozen=True):
     """A message or the reason why it is bad, and its sender (ROUTER sockets only)."""
 
     message: Message | BadMessage
@@ -54,7 +60,7 @@ class Socket:
         *,
         routes: bool = False,
         publishes: bool = False,
-        on_joined: Callable[[str], None] = lambda session: None,
+        on_subscribe: Callable[[str], None] = lambda session: None,
     ) -> None:
         self.raw = raw
         self._key = key
@@ -62,13 +68,13 @@ class Socket:
         self._limited = limited  # if the socket is bound
         self._routes = routes
         self._publishes = publishes
-        self._on_joined = on_joined
-        self._connection: Connection | None = None  # connection of the last message
+        self._on_subscribe = on_subscribe
+        self._connection: PeerConnection | None = None  # connection of the last message
         self._sender = NO_PEER  # sender of the last message
         self._has_unread_parts = False  # unread parts of the last message remain
-        self._unread_parts_from: Connection | None = None
+        self._unread_parts_from: PeerConnection | None = None
         self._name = secrets.token_hex(8)
-        self._followed: set[bytes] = set()  # subscriptions, now or before
+        self._subscribed_topics: set[bytes] = set()  # subscriptions, now or before
         self._prefixes: tuple[bytes, ...] = ()  # prefixes that are not a whole topic
 
     @property
@@ -78,15 +84,15 @@ class Socket:
 
     @property
     def file_descriptor(self) -> int:
-        """Becomes readable when the state may have changed (edge-triggered)."""
+        """Descriptor that becomes readable when the state may have changed (edge-triggered)."""
         return int(self.raw.getsockopt(zmq.FD))
 
     def send(self, message: Message, *, to: Peer = NO_PEER) -> bool:
-        """Queue a message (on a ROUTER: to one peer). Return False if the queue is full.
+        """Queue a message, on a ROUTER for one peer. Return False if the queue is full.
 
         An answer to the message that is being handled reduces its sender's budget.
         """
-        if self._publishes and not self._is_followed(topic(type(message), message.session)):
+        if self._publishes and not self._has_subscriber(make_topic(type(message), message.session)):
             return True
         parts = encode(message)
         if self._connection is not None and to == self._sender:
@@ -104,22 +110,22 @@ class Socket:
             self._limited.num_sent += 1
         return True
 
-    def _is_followed(self, label: bytes) -> bool:
+    def _has_subscriber(self, label: bytes) -> bool:
         """Return whether a topic may have a subscriber. Otherwise encoding is unnecessary."""
-        return label in self._followed or label.startswith(self._prefixes)
+        return label in self._subscribed_topics or label.startswith(self._prefixes)
 
-    def _follow(self, subscription: bytes) -> None:
+    def _add_subscription(self, subscription: bytes) -> None:
         """Record that a subscription, a topic or a prefix of topics, is in effect."""
-        if len(self._followed) == MAX_FOLLOWED:
+        if len(self._subscribed_topics) == MAX_SUBSCRIPTIONS:
             self._prefixes = (b"",)
-        elif subscription not in self._followed:
-            self._followed.add(subscription)
+        elif subscription not in self._subscribed_topics:
+            self._subscribed_topics.add(subscription)
             if subscription.count(b"/") < 2:  # not a whole topic
                 self._prefixes += (subscription,)
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:
         """Subscribe to a kind of message, of one session or of all (None)."""
-        prefix = f"{kind.kind}/".encode() if session is None else topic(kind, session)
+        prefix = f"{kind.kind}/".encode() if session is None else make_topic(kind, session)
         self.raw.setsockopt(zmq.SUBSCRIBE, prefix)
 
     def subscribe_session(self, kinds: Iterable[type[Message]], session: str) -> None:
@@ -132,7 +138,7 @@ class Socket:
         for kind in subscribed:
             self.subscribe(kind, session)
 
-    def receive(self) -> Iterator[Received]:
+    def receive(self) -> Iterator[ReceivedMessage]:
         """Yield the messages that have arrived, at most ``MAX_BATCH``.
 
         A publishing socket answers a new subscription to ``joined/<session>/`` with a ``joined``
@@ -144,15 +150,15 @@ class Socket:
                     return
                 # This check is cheaper than an exception.
                 if number and not int(self.raw.get(zmq.EVENTS)) & _READABLE:
-                    self.note_empty()
+                    self.record_empty()
                     return
                 try:
                     if self._has_unread_parts:
                         self._drop_unread_parts()
-                    parts, key = self._take()
+                    parts, key = self._receive_parts()
                 except zmq.Again:
                     if not self._has_unread_parts:
-                        self.note_empty()
+                        self.record_empty()
                     return
                 if self._connection is not None and self._connection.is_disconnected:
                     continue
@@ -165,23 +171,23 @@ class Socket:
                 inode = self._connection.inode if self._connection is not None else 0
                 self._sender = Peer(parts.pop(0), key, inode) if self._routes else NO_PEER
                 try:
-                    yield Received(decode(parts), self._sender)
+                    yield ReceivedMessage(decode(parts), self._sender)
                 except BadMessage as error:
-                    yield Received(error, self._sender)
+                    yield ReceivedMessage(error, self._sender)
         finally:
             self._connection = None
 
     def disconnect_stalled(self, kinds: Collection[type[Message]], sessions: Iterable[str]) -> None:
         """Disconnect subscribers that stopped reading. Call this about once a second.
 
-        This affects only subscribers to one of ``kinds`` of one of ``sessions``: late frames of a
-        live session are worthless. libzmq reconnects the subscriber when it continues.
+        This affects only subscribers to one of ``kinds`` of one of ``sessions``, because late
+        frames of a live session are useless. libzmq reconnects the subscriber when it continues.
         """
         if self._limited is not None:
-            topics = [topic(kind, session) for session in sessions for kind in kinds]
+            topics = [make_topic(kind, session) for session in sessions for kind in kinds]
             self._limited.disconnect_stalled(topics)
 
-    def note_empty(self) -> None:
+    def record_empty(self) -> None:
         """Record that all complete messages have been received."""
         if self._limited is not None:
             self._limited.num_polls += 1
@@ -203,8 +209,8 @@ class Socket:
     def can_send(self) -> bool:
         """Whether ``send`` would queue a message.
 
-        This stays False after a peer broke the protocol in the handshake: libzmq then gives up
-        the connection and its queue.
+        This stays False after a peer broke the protocol in the handshake, because libzmq then
+        abandons the connection and its queue.
         """
         return bool(self.raw.poll(0, zmq.POLLOUT))
 
@@ -223,7 +229,7 @@ class Socket:
         """Close. Queued messages are dropped after ``linger_s``."""
         self.raw.close(linger=int(linger_s * 1000))
 
-    def _take(self) -> tuple[list[bytes], str]:
+    def _receive_parts(self) -> tuple[list[bytes], str]:
         """Return the first parts of a message and its sender's key; raise ``zmq.Again`` if none."""
         frame = self.raw.recv(zmq.DONTWAIT, copy=False)
         parts = [frame.bytes]
@@ -234,7 +240,7 @@ class Socket:
         self._has_unread_parts = frame.more
         key = "" if self._zap is None else _property(frame, "User-Id", "")
         if self._limited is not None:
-            self._connection = self._limited.deliver(descriptor, key)
+            self._connection = self._limited.count_delivery(descriptor, key)
             if self._has_unread_parts and self._connection is not None:
                 self._unread_parts_from = self._connection
                 self._connection.disconnect("its message has too many parts", PENALTY_S)
@@ -262,12 +268,12 @@ class Socket:
                 self._connection.topics.discard(subscription)
             if self._connection.is_disconnected:
                 return
-        may = grant is None or may_follow(grant, subscription)  # everyone may without keys
+        may = grant is None or may_subscribe(grant, subscription)  # everyone may without keys
         if verb == b"\x00":
             self.raw.setsockopt(zmq.UNSUBSCRIBE, subscription)
         elif verb == b"\x01" and may:
             self.raw.setsockopt(zmq.SUBSCRIBE, subscription)
-            self._follow(subscription)
+            self._add_subscription(subscription)
             self._confirm_subscription(subscription)
 
     def _confirm_subscription(self, subscription: bytes) -> None:
@@ -275,7 +281,7 @@ class Socket:
         session = subscription.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
         if subscription.startswith(prefix) and is_name(session):
             self.send(Joined(session=session, publisher=self._name))
-            self._on_joined(session)
+            self._on_subscribe(session)
 
 
 def _property(frame: zmq.Frame, name: int | str, default: T) -> T:
@@ -324,5 +330,5 @@ class Poller:
             if raw in ready:
                 readable.append(socket)
             else:
-                socket.note_empty()
+                socket.record_empty()
         return readable

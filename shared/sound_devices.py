@@ -1,4 +1,4 @@
-"""Live audio from microphones, and from outputs and programs of this machine."""
+"""Records live audio from microphones, and from outputs and programs of this machine."""
 
 import json
 import queue
@@ -11,9 +11,9 @@ from types import ModuleType
 from typing import Any
 
 from kouxing.shared.audio_file import AudioSource, raw_audio
-from kouxing.shared.channels import Samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import RawFormat
+from kouxing.shared.phase_cancellation import Samples
 
 _RATE_HZ = 16_000
 _LATENCY_MS = 20  # latency of recordings of outputs and programs
@@ -31,10 +31,10 @@ class SoundDevice:
 
     kind: str  # mic, monitor (everything that an output plays) or program
     name: str
-    target: str = ""  # parec's option for it; empty for a microphone
+    target: str = ""  # parec's option for the device; empty for a microphone
 
 
-def sound_devices() -> list[SoundDevice]:
+def list_sound_devices() -> list[SoundDevice]:
     """Return all devices, without kinds that this machine does not support."""
     devices: list[SoundDevice] = []
     for list_kind in (_microphones, _monitors):
@@ -45,7 +45,7 @@ def sound_devices() -> list[SoundDevice]:
     return devices
 
 
-def microphone(name: str) -> AudioSource:
+def open_microphone(name: str) -> AudioSource:
     """Read the microphone whose name contains ``name`` until interrupted. Empty: the default one.
 
     Raises ``UserError`` if the sound library or the microphone is missing.
@@ -76,7 +76,7 @@ def microphone(name: str) -> AudioSource:
     return AudioSource(name or "microphone", _RATE_HZ, 1, None, blocks(), is_live=True)
 
 
-def monitor(name: str = "") -> AudioSource:
+def open_monitor(name: str = "") -> AudioSource:
     """Record what this machine plays until interrupted, or until the recorded program ends.
 
     ``name`` is a part of the name of an output or a program; empty: the default output.

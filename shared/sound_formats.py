@@ -1,4 +1,4 @@
-"""Recognizes the formats of sound, and of other files, by their first bytes."""
+"""Recognizes the formats of sound and other files by their first bytes."""
 
 import codecs
 import re
@@ -7,7 +7,7 @@ from typing import Literal
 import av
 
 NUM_BEGIN_BYTES = 16_384  # enough for all of this module; three frames of the largest size
-_MAX_LEADING_ZEROS = 4  # that are part of a format
+_MAX_LEADING_ZEROS = 4  # zeros at the start that are part of a format
 MAX_ZERO_BYTES = 131_072  # padding before a format
 _NUM_FRAMED_BYTES = 8192  # size of the checked start of a stream that may begin within a frame
 _NUM_HEADER_BYTES = 4096  # size of the checked start of a WAV or MP4 file
@@ -49,7 +49,7 @@ _FRAME = re.compile(rb"\xff(?:[\xe2\xe3\xf2\xf3\xfa\xfb][\x10-\xef]|[\xf0\xf1\xf
 _TS_SYNC = 0x47
 _TS_PACKETS = ((0, 188), (4, 192))  # the offset of the first byte, and the packet's size
 MAX_OGG_PAGE_BYTES = 27 + 255 + 255 * 255
-MIN_UNKNOWN_BYTES = 10**9  # writers that do not know the length state 0, or this much or more
+MIN_UNKNOWN_BYTES = 10**9  # headers of unknown length state 0, or this size or more
 # Offset of a file's size, its number of bytes and their order, and the bytes that it excludes.
 _SIZES: dict[bytes, tuple[int, int, Literal["little", "big"], int]] = {
     b"RIFF": (4, 4, "little", 8),
@@ -149,7 +149,7 @@ def why_unreadable(begin: bytes, reason: str) -> str:
     )
 
 
-def stated_bytes(begin: bytes) -> int | None:
+def read_stated_size(begin: bytes) -> int | None:
     """Return the size that a WAV, W64, AVI, AIFF, CAF or WMA header states; None if unknown."""
     if begin.startswith(b"caff"):
         return _stated_bytes_of_caf(begin)
@@ -201,7 +201,7 @@ def misread_wav_codec(begin: bytes) -> str | None:
 
 
 def needs_whole_file(begin: bytes) -> bool:
-    """Return whether a file can be decoded only once its end is there."""
+    """Return whether a file can be decoded only when it is complete."""
     if begin.startswith((b"caff", b"wvpk", b"\xb7\xd8\0\x20")):
         return True
     return begin[4:8] in (b"ftyp", b"mdat", b"wide") and not _has_index_first(begin)

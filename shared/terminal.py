@@ -1,4 +1,4 @@
-"""The terminal, for every command: messages to the user, and files with results."""
+"""Terminal output of all commands: messages, progress, tables and result files."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file for the
 
 
 def print_message(text: str) -> None:
-    """Print a message to standard error; ignore a full disk.
+    """Print a message to standard error, because standard output is for results.
 
-    Standard output is for results.
+    A full disk is ignored.
     """
     with contextlib.suppress(OSError):
         CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def open_progress() -> Progress:
-    """Return progress bars for a terminal. They disappear when they are done."""
+    """Return progress bars for a terminal, which disappear when they are done."""
     from rich.progress import Progress  # noqa: PLC0415 (few commands need it)
 
     return Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive)
@@ -90,7 +90,7 @@ def print_table(
 def _column_widths(
     columns: Sequence[str], rows: Sequence[Sequence[str]], available: int
 ) -> list[int]:
-    """Return widths that hold the longest words; narrow columns grow first, up to ``available``."""
+    """Return widths for the longest words. Narrow columns grow first, up to ``available``."""
     cells_of_column = [*zip(columns, *rows, strict=True)]
     widths = [
         max(cell_len(word) for cell in cells for word in ["", *cell.split()])
@@ -107,7 +107,7 @@ def _column_widths(
 
 
 def command_name() -> str:
-    """Return how the user starts this program: ``kouxing``, or its path if it is not in PATH."""
+    """Return the command that starts this program: ``kouxing``, or its path if not in PATH."""
     called = Path(sys.argv[0])
     if shutil.which("kouxing") or called.name != "kouxing":
         return "kouxing"

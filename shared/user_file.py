@@ -1,7 +1,7 @@
-"""Reads files given by a user: only regular files, up to a size limit, with clear errors.
+"""Reads users' files: only regular files, up to a size limit, with clear errors.
 
-A FIFO blocks its reader, and a device may never end. Such files are rejected by their status,
-before they are opened. A file that grows is read up to the size that it had.
+A FIFO blocks its reader, and a device may never end. Such files are rejected by their status before
+they are opened. A growing file is read up to its size at the start.
 """
 
 import contextlib
@@ -89,9 +89,9 @@ def _reject_constant(word: str) -> float:
 
 @contextlib.contextmanager
 def check_content(path: Path, expected: str) -> Iterator[None]:
-    """Raise ``UserError`` for every error of the enclosed parser, whatever its class.
+    """Raise ``UserError`` for every error of the enclosed parser, of any class.
 
-    ``expected`` describes what the file must be; it can add what to do.
+    ``expected`` describes a valid file; it may add a remedy.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""WAV files and pipes with several parts of sound: several ``data`` chunks, or joined files."""
+"""Reads WAV files and pipes with several parts: several ``data`` chunks, or joined files."""
 
 import math
 from typing import BinaryIO, Protocol
@@ -71,7 +71,7 @@ class WavParts:
         return content
 
 
-def num_parts(file: BinaryIO) -> int:
+def count_parts(file: BinaryIO) -> int:
     """Return the number of parts of sound, or 0 if this is not a WAV file; rewind the file."""
     count = offset = file.seek(0)
     while (kind := file.read(4)).strip().isalnum():

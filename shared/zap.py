@@ -1,4 +1,4 @@
-"""The ZAP handler (ZeroMQ RFC 27): checks the key of each new connection."""
+"""The ZAP handler (ZeroMQ RFC 27), which checks the key of each new connection."""
 
 import threading
 from collections.abc import Callable, Collection
@@ -7,13 +7,13 @@ import zmq
 from zmq.utils import z85
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.kernel_sockets import network_of
+from kouxing.shared.kernel_sockets import get_network
 from kouxing.shared.keys import Grant, Grants, grants_file, read_grants
 from kouxing.shared.logs import LOG
 
 
 class Zap:
-    """The keys that may connect to this process's sockets, read again after every change.
+    """The keys that may connect to this process's sockets; reloaded after every change.
 
     ``required_roles`` has the role that a key needs, by the configuration key of the socket. Every
     allowed key may connect to the other sockets. ``disconnect`` is called with the keys that were
@@ -30,7 +30,7 @@ class Zap:
 
     def refresh(self) -> None:
         """Read the list again if it has changed."""
-        with self._lock:  # the second of two callers also waits for the new list
+        with self._lock:  # concurrent callers also wait for the new list
             version = self._newest_version()
             if version == self.version:
                 return
@@ -90,7 +90,7 @@ def answer_handshakes(
 
     def may_connect(address: str, domain: str, key: str) -> bool:
         if zap is None:
-            return not is_blocked(network_of(address))
+            return not is_blocked(get_network(address))
         return not is_blocked(key) and zap.may_connect(key, domain)
 
     def answer() -> None:

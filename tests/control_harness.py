@@ -10,8 +10,8 @@ from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.endpoints import key_of, with_key
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import load_key
-from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession

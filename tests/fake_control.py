@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
 from kouxing.shared.bus import Bus
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
-from kouxing.shared.records import replace
 from kouxing.shared.sockets import Poller, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionStarted, StartSession

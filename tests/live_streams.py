@@ -9,7 +9,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.session import SessionFacts
 from tests.samples import START as START_AT_16_KHZ
 

@@ -22,7 +22,7 @@ from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.cli.service_process import ServiceProcess
 from kouxing.services.service_kinds import KINDS, free_port_environment, kind_of
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.config import variable
+from kouxing.shared.config import variable_name
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
@@ -177,7 +177,7 @@ class System(LocalSystem):
                 **NOTHING_SKIPPED,
                 **ANY_LOAD,
                 **addresses,
-                **{variable(name, "instance"): name for name in named},
+                **{variable_name(name, "instance"): name for name in named},
                 **(settings or {}),
             },
         )
@@ -195,7 +195,7 @@ class System(LocalSystem):
     def add(self, name: str, **settings: str) -> None:
         """Start a worker such as ``recognizer-2``, and wait until control has registered it."""
         kind = kind_of(name)
-        instance = {variable(kind, "instance"): name}
+        instance = {variable_name(kind, "instance"): name}
         self.start(name, **own_addresses([kind]), **instance, **settings)
         self.wait_until(lambda report: name in {state.instance for state in report.services})
 
@@ -259,7 +259,9 @@ class Gateway:
         }
         self._program = program or (*SERVICE, "gateway")
         self._control = control
-        self._environment = {variable("gateway", key): value for key, value in settings.items()}
+        self._environment = {
+            variable_name("gateway", key): value for key, value in settings.items()
+        }
         self.start()
 
     def start(self) -> None:

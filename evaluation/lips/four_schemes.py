@@ -39,8 +39,8 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
-from kouxing.shared.records import replace
 
 SCHEMES = (1, 2, 3, 4)
 ALIGNED, RECOGNIZED, LIVE, NEXT_PHONE = SCHEMES

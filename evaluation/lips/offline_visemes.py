@@ -18,8 +18,8 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_tim
 from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.records import replace
 
 _BLOCK_S = 2.0
 _REACH_S = 1.5  # visemes further away have no visible weight

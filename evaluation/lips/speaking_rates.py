@@ -48,7 +48,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import Syllable
-from kouxing.shared.phones.syllables import group_syllables
+from kouxing.shared.phones.syllable_captions import group_syllables
 from kouxing.shared.terminal import print_table
 
 Array = NDArray[np.float64]

@@ -36,7 +36,10 @@ def new(
     from kouxing.evaluation.mos.study import new_study
 
     study = new_study(folder)
-    sizes = plural(len(study.sentences), "sentence"), plural(len(study.conditions), "condition")
+    sizes = (
+        plural(len(study.sentences), "sentence"),
+        plural(len(study.conditions), "condition"),
+    )
     print_message(f"created a study of {' in '.join(sizes)}; next: kouxing mos serve {folder}")
 
 

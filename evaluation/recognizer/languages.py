@@ -38,10 +38,10 @@ from kouxing.evaluation.tables import percent
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import UNIVERSAL, find_language, load_inventory
 from kouxing.shared.phones.universal.segments import read_ipa
-from kouxing.shared.records import replace
 from kouxing.shared.terminal import CONSOLE, plural, print_table
 
 AUTO, OWN, HAMA = "auto", "own", "hama"

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from kouxing.evaluation.report.markdown import Results, Table, display_floor_ms, join_values
 from kouxing.evaluation.tables import format_number, percent
+from kouxing.services.recognizer.hop_controller import MAX_HOP
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.overload import MAX_HOP
 
 _LOOK_AHEAD_MS, _FRAME_MS = 60, 20
 _FRAME_BYTES, _FRAMES_PER_S = 4 * NUM_FAPS, 50

@@ -16,9 +16,9 @@ import zmq
 from kouxing_client import Refused
 from kouxing_client.keys import Key
 
-from kouxing.shared import control_client
+from kouxing.shared import client_connection
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.keys import user_key
+from kouxing.shared.keys import load_user_key
 
 # The first bytes of ZeroMQ's wire protocol, ZMTP 3.0, and flags of its frames.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -141,7 +141,7 @@ def _flood(make_message: Callable[[int], list[bytes]], kind: int = zmq.DEALER) -
     def attack(endpoint: str, source: str, seconds: float) -> None:
         with zmq.Context() as context, context.socket(kind) as raw:
             raw.sndtimeo, raw.linger = 100, 0
-            connect(raw, endpoint, user_key(), source)
+            connect(raw, endpoint, load_user_key(), source)
             number, end_s = 0, time.monotonic() + seconds
             while time.monotonic() < end_s:
                 with contextlib.suppress(zmq.Again):
@@ -169,7 +169,7 @@ def keyed_connections(endpoint: str, source: str, seconds: float) -> None:
             while time.monotonic() < end_s:
                 raw = stack.enter_context(context.socket(zmq.DEALER))
                 raw.linger = 0
-                connect(raw, endpoint, user_key(), source)
+                connect(raw, endpoint, load_user_key(), source)
                 raw.send(b"", zmq.NOBLOCK)
         time.sleep(max(0.0, end_s - time.monotonic()))
 
@@ -181,7 +181,7 @@ def silent_subscribers(control: str, source: str, seconds: float) -> None:
     """
     end_s = time.monotonic() + seconds
     with (
-        control_client.connect(control) as client,
+        client_connection.connect_client(control) as client,
         zmq.Context() as context,
         contextlib.ExitStack() as stack,
     ):
@@ -189,7 +189,7 @@ def silent_subscribers(control: str, source: str, seconds: float) -> None:
         for _ in range(NUM_SILENT_SUBSCRIBERS):
             raw = stack.enter_context(context.socket(zmq.SUB))
             raw.rcvhwm, raw.rcvbuf, raw.linger = 1, 4096, 0
-            connect(raw, session.info["faps"], user_key(), source)
+            connect(raw, session.info["faps"], load_user_key(), source)
             raw.subscribe(f"fap-frame/{session.name}/")
         while time.monotonic() < end_s:
             if session.try_push(bytes(640)):
@@ -201,7 +201,7 @@ def silent_subscribers(control: str, source: str, seconds: float) -> None:
 def many_sessions(control: str, _source: str, seconds: float) -> None:
     """Open sessions until control refuses, and keep them."""
     end_s = time.monotonic() + seconds
-    with control_client.connect(control) as client:
+    with client_connection.connect_client(control) as client:
         with contextlib.suppress(Refused):
             while time.monotonic() < end_s:
                 client.open_session()

@@ -32,8 +32,8 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
@@ -139,7 +139,7 @@ def _result(
     source: str,
     speech: NDArray[np.float32],
 ) -> AttackResult:
-    with connect(system.control) as client:
+    with connect_client(system.control) as client:
         services = client.status().services
     endpoints = {key: endpoint for state in services for key, endpoint in state.endpoints.items()}
     processes = {kind: system.supervisor.process(kind).pid for kind in KINDS}
@@ -165,7 +165,7 @@ def _result(
 
 def _delays_ms(control: str, speech: NDArray[np.float32]) -> dict[str, float | None]:
     """Stream a session through all phases; return the 95th percentile of its delays by phase."""
-    with connect(control) as client:
+    with connect_client(control) as client:
         times_s, delays_s, _ = stream(client, speech, SynthesizerConfig().delay_ms / 1e3)
     phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
     phase = np.digitize(times_s, phase_ends_s)

@@ -26,8 +26,8 @@ from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import to_seconds
-from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
@@ -131,7 +131,7 @@ def measure(
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalSystem(Path(folder), console) as system,
-        connect(system.control) as client,
+        connect_client(system.control) as client,
     ):
         processes = {name: system.supervisor.process(name).pid for name in KINDS}
         time.sleep(SETTLE_S)

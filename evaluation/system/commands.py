@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 
 from kouxing.corpora.options import OptionalClips, Picture
 from kouxing.services.cli.options import Language
-from kouxing.shared.overload import MAX_HOP
+from kouxing.services.recognizer.hop_controller import MAX_HOP
 from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output, write_json
 
 SENTENCE = Path(__file__).parents[2] / "shared" / "demo" / "hello-female.wav"

@@ -25,7 +25,7 @@ from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_pre
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.face.high_level import VISEMES
+from kouxing.shared.face.high_level_faps import VISEMES
 from kouxing.shared.terminal import print_table
 
 MODELS = ("blocks", "light")

@@ -31,8 +31,8 @@ from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, Loca
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
 from kouxing.shared.terminal import print_table
@@ -295,7 +295,7 @@ def _measure_fault(
     with (
         _start_system(fault, folder, timing, console) as system,
         system.on_client(),
-        connect(system.control, key=system.key) as client,
+        connect_client(system.control, key=system.key) as client,
     ):
         if not undisturbed:
             undisturbed.append(speak_undisturbed(client, sound))

@@ -27,8 +27,8 @@ from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
-from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_table
 
@@ -56,7 +56,7 @@ def measure(path: Path, console: Console, language: str | None = None) -> Latenc
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalSystem(Path(folder), console) as system,
-        connect(system.control) as client,
+        connect_client(system.control) as client,
     ):
         before = _cpu_s(client)
         delays = [stream(client, sound, delay_s, language)[1:] for _ in range(NUM_REPEATS)]

@@ -28,8 +28,8 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import plural, print_table
 
@@ -142,7 +142,7 @@ def _step(
     delay_s: float,
     language: str | None,
 ) -> Step:
-    with connect(control) as client:
+    with connect_client(control) as client:
         generator = LoadGenerator(client, speech, num_asked, language)
         generator.start()
         from_s = time.perf_counter() + SETTLE_S

@@ -21,10 +21,10 @@ from kouxing.services.service_kinds import (
     free_port_environment,
     read_settings,
 )
-from kouxing.shared.config import variable
-from kouxing.shared.control_client import connect
+from kouxing.shared.client_connection import connect_client
+from kouxing.shared.config import variable_name
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import CLIENT, control_endpoint, read_key, user_key
+from kouxing.shared.keys import CLIENT, control_endpoint, load_user_key, read_key
 
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 180.0
@@ -68,7 +68,7 @@ class System:
 
     def status(self) -> Status:
         """Return the status report of control."""
-        with self.on_client(), connect(self.control, key=self.key, timeout_s=2.0) as client:
+        with self.on_client(), connect_client(self.control, key=self.key, timeout_s=2.0) as client:
             return client.status()
 
 
@@ -96,11 +96,11 @@ class LocalSystem(System):
             **(settings or {}),
         }
         self.control = control_endpoint(self.environment["KOUXING_CONTROL"], insecure=False)
-        self.key = user_key()
+        self.key = load_user_key()
         self._restarts = not spare
         self._spare_name = f"{spare}-2"
         more = {
-            name: {**addresses, variable(spare, "instance"): SPARE}
+            name: {**addresses, variable_name(spare, "instance"): SPARE}
             for name, addresses in extra_worker_environments(read_settings(), 2).items()
             if name == self._spare_name
         }
@@ -176,7 +176,7 @@ class HostsSystem(System):
     def _start(self, host: str) -> None:
         service, address = self._services[host], self.network.address(host)
         addresses = {
-            variable(service, key): f"tcp://{address}:{port}"
+            variable_name(service, key): f"tcp://{address}:{port}"
             for key, port in PORTS[service].items()
         }
         environment = {
@@ -187,7 +187,7 @@ class HostsSystem(System):
         }
         module = (sys.executable, "-m", "kouxing.services.process")
         command = self.network.command(host, *module, service)
-        environment |= {variable(service, "instance"): host}
+        environment |= {variable_name(service, "instance"): host}
         with (self._logs / f"{host}.log").open("wb") as log:
             self._processes[host] = subprocess.Popen(  # noqa: S603 - our own module
                 command,

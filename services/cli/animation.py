@@ -30,10 +30,10 @@ from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
-from kouxing.shared.records import replace
 from kouxing.shared.terminal import print_message
 
 T = TypeVar("T", Phone, TimedSyllable)

@@ -10,12 +10,12 @@ from kouxing.services.cli.options import CaptionKind
 from kouxing.services.driver.render.captions import Caption, Captions
 from kouxing.services.recognizer.alignment import find_syllable_times
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
-from kouxing.shared.phones.syllables import group_syllables
+from kouxing.shared.phones.syllable_captions import group_syllables
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-from kouxing.shared.records import replace
 
 if TYPE_CHECKING:
     from kouxing.services.cli.animation import FaceMotion

@@ -23,7 +23,7 @@ from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 from kouxing.shared.keys import control_endpoint
-from kouxing.shared.names import NAME_RULE, is_name
+from kouxing.shared.name_rules import NAME_RULE, is_name
 from kouxing.shared.terminal import (
     CONSOLE,
     Force,
@@ -96,7 +96,7 @@ def speak(
     from kouxing.services.recognizer.mouth_profile import read_mouth_profile
     from kouxing.shared.audio_file import open_audio
     from kouxing.shared.media_file import RawFormat
-    from kouxing.shared.sound_devices import microphone, monitor
+    from kouxing.shared.sound_devices import open_microphone, open_monitor
 
     profile = b"" if mouth is None else read_mouth_profile(mouth)
     if device and source not in ("mic", "monitor"):
@@ -114,9 +114,9 @@ def speak(
     if raw and track is not None:
         raise UserError("--track does not apply to raw samples; leave out --raw or --track")
     if source == "mic":
-        audio = microphone(device)
+        audio = open_microphone(device)
     elif source == "monitor":
-        audio = monitor(device)
+        audio = open_monitor(device)
     else:
         raw_format = RawFormat(rate or 16_000, channels or 1)
         audio = open_audio(Path(source), track=track, raw=raw_format if raw else None)
@@ -140,9 +140,9 @@ def speak(
 
 def devices() -> None:
     """List the devices for 'kouxing speak mic' and 'kouxing speak monitor'."""
-    from kouxing.shared.sound_devices import sound_devices
+    from kouxing.shared.sound_devices import list_sound_devices
 
-    devices = sound_devices()
+    devices = list_sound_devices()
     if not devices:
         print_message("no microphone and no sound server was found")
     for device in devices:
@@ -231,7 +231,7 @@ def express(
     control: Control = "",
 ) -> None:
     """Show expressions on a face; without expressions, clear the current ones."""
-    from kouxing.shared.control_client import connect
+    from kouxing.shared.client_connection import connect_client
 
     words = list(arguments or ())
     session = _session_name(words.pop(0)) if words and "=" not in words[0] else ""
@@ -240,7 +240,7 @@ def express(
         raise UserError("--hold needs an expression: kouxing express joy=0.4 --hold 2")
     hold_s = DEFAULT_HOLD_S if hold is None else hold
     check_expressions(strengths, hold_s)
-    with connect(control_address(control)) as client:
+    with connect_client(control_address(control)) as client:
         all_sessions = [state.session for state in client.status().sessions]
         for name in [session] if session else ["", *all_sessions]:
             client.set_face(name, expressions=strengths, hold_s=hold_s)
@@ -256,10 +256,10 @@ def _parse_strength(text: str) -> tuple[str, float]:
 
 def status(control: Control = "", json_file: JsonFile = None, force: Force = False) -> None:
     """Show services, sessions, rates and latencies."""
-    from kouxing.shared.control_client import connect
+    from kouxing.shared.client_connection import connect_client
 
     check_output(json_file, force=force)
-    with connect(control_address(control), timeout_s=3.0) as client:
+    with connect_client(control_address(control), timeout_s=3.0) as client:
         report = client.status()
     out = Console()
     services = []

@@ -14,10 +14,10 @@ from kouxing.services.cli.clients import find_system
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.bus import Bus, ProbeResult
-from kouxing.shared.control_client import connect
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import CLIENT, CLIENT_ROLES, local_keys, rejection_hint, user_key
+from kouxing.shared.keys import CLIENT, CLIENT_ROLES, load_local_keys, load_user_key, rejection_hint
 from kouxing.shared.terminal import plural
 
 MAX_CLOCK_OFFSET_MS = 1000.0
@@ -47,7 +47,7 @@ def examine(address: str) -> Iterator[CheckResult]:
     keys: Mapping[str, Key | None] = {"none": None}
     if not config.insecure:
         try:
-            keys = local_keys() or {CLIENT: user_key(control=endpoint_address)}
+            keys = load_local_keys() or {CLIENT: load_user_key(control=endpoint_address)}
         except UserError as error:
             yield CheckResult("keys", "cannot be used", str(error))
             return
@@ -61,7 +61,7 @@ def examine(address: str) -> Iterator[CheckResult]:
         return
     key = next(iter(accepted.values()))
     try:
-        with connect(
+        with connect_client(
             with_key(endpoint_address, key.control if key else ""), key=key, timeout_s=5.0
         ) as client:
             services = client.status().services

@@ -11,8 +11,8 @@ from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 from kouxing.services.cli.curves import CURVE_EXPORTERS, CurveExporter, Curves, Row, json_line
 from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
 from kouxing.services.cli.streaming import missed_warning
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import to_seconds
-from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
 from kouxing.shared.face.mouth_shapes import mouth_cues
@@ -20,7 +20,7 @@ from kouxing.shared.interrupt import catch_interrupt
 from kouxing.shared.phones import events
 from kouxing.shared.phones.alphabets import Alphabet, respell
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
-from kouxing.shared.phones.syllables import SyllableTrack
+from kouxing.shared.phones.syllable_captions import SyllableCaptions
 from kouxing.shared.terminal import CONSOLE, plural, print_message
 
 OPEN_POLL_S = 0.05  # the services repeat what they published shortly before
@@ -52,7 +52,7 @@ def follow(
         raise UserError("--as livelink is a table; add --output face.csv")
     curve_form = None if form is None or is_speech else CurveFormat(form)
     exporter = None if output is None else _open_exporter(output, curve_form)
-    with connect(control) as client:
+    with connect_client(control) as client:
         followed = _wait_for_session(session, client)
         results = followed.results(Phone if is_speech else FapFrame, keep_all=True)
         arriving = _iter_until_interrupt(results, followed.name)
@@ -130,7 +130,7 @@ def _phone_lines(phones: Iterable[events.Phone]) -> Iterator[str]:
 
 def _syllable_lines(phones: Iterable[events.Phone], inventory: PhoneInventory) -> Iterator[str]:
     """Yield a line for each syllable when it is final. Pauses have no line."""
-    track = SyllableTrack(inventory)
+    track = SyllableCaptions(inventory)
     for phone in phones:
         for syllable in track.update(phone):
             if syllable.final and syllable.duration_s > 0 and syllable.text != inventory.silence:

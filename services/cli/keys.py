@@ -12,9 +12,9 @@ from kouxing.shared.keys import (
     add_key,
     key_folder,
     load_key,
+    load_user_key,
     read_grants,
     revoke_key,
-    user_key,
 )
 from kouxing.shared.terminal import Force, check_output, print_message, print_table
 
@@ -26,7 +26,7 @@ def init() -> None:
     """Create all keys of a system on this machine, for its services and for your commands."""
     for kind in KINDS.values():
         load_key(kind.name, kind.key_roles)
-    user_key()
+    load_user_key()
     print_message(f"the keys are in {key_folder()}")
 
 

@@ -25,7 +25,7 @@ from kouxing.services.cli.options import (
 )
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 from kouxing.shared.terminal import (
     Force,

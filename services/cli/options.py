@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from kouxing.services.driver.config import HEAD_NAMES, DriverConfig, Framing
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
 from kouxing.shared.phones.alphabets import Alphabet
 from kouxing.shared.phones.inventory import find_language, language_codes

@@ -19,9 +19,9 @@ import ray
 
 from kouxing.services.cli.service_process import POLL_S, ServiceProcess
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.config import BindAddress, Settings, bound_keys, variable
+from kouxing.shared.config import BindAddress, Settings, bound_keys, variable_name
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import key_text, load_key
+from kouxing.shared.keys import format_key, load_key
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 from kouxing.shared.service_kind import ServiceKind
 
@@ -98,7 +98,7 @@ class RayWorkers:
         Raises ``UserError`` if a setting is wrong, or the workers' key is missing.
         """
         insecure = settings.load(kind.config_type).insecure
-        key = "" if insecure else key_text(load_key(kind.name, (f"service:{kind.name}",)))
+        key = "" if insecure else format_key(load_key(kind.name, (f"service:{kind.name}",)))
         running = set(_names(kind.name))
         wanted = {f"{kind.name}-{index}" for index in range(number)}
         for name in sorted(wanted - running):
@@ -147,9 +147,9 @@ def _environment(kind: ServiceKind, settings: Settings) -> dict[str, str]:
     bound = bound_keys(kind.config_type)
     for setting in settings.describe(kind.config_type):
         if not setting.is_default:
-            environment[variable(kind.name, setting.key)] = setting.text
+            environment[variable_name(kind.name, setting.key)] = setting.text
         elif bound.get(setting.key) is BindAddress.ENDPOINT:
-            environment[variable(kind.name, setting.key)] = "tcp://0.0.0.0:*"
+            environment[variable_name(kind.name, setting.key)] = "tcp://0.0.0.0:*"
     return environment
 
 

@@ -19,7 +19,7 @@ from kouxing.services.cli.animation import FaceMotion, animate
 from kouxing.services.cli.cues import write_cues
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.mouth_shapes import REST, Cue, mouth_cues
 from kouxing.shared.phones.inventory import AUTO, find_language
 from kouxing.shared.terminal import write_text

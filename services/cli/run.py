@@ -24,17 +24,17 @@ from kouxing.services.service_kinds import (
     extra_worker_environments,
     read_settings,
 )
-from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
+from kouxing.shared.config import COMMON, Settings, parse_assignments, variable_name
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
-from kouxing.shared.errors import UserError, naming_option
-from kouxing.shared.interrupt import clear_interrupt, install_interrupt
+from kouxing.shared.errors import UserError, rename_key_in_errors
+from kouxing.shared.interrupt import clear_interrupt, install_interrupt_handler
 from kouxing.shared.keys import check_keys, control_endpoint
 from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 
 if TYPE_CHECKING:
     from kouxing.shared.audio_file import AudioSource
 
-BOUND_CONTROL = variable("control", "control")
+BOUND_CONTROL = variable_name("control", "control")
 _SAMPLE_SESSION = "demo"
 
 
@@ -79,7 +79,7 @@ def run(
     reservation = _enter(reserve(out))
     arguments = ["--config", str(config)] if config else []
     startup = _enter(starting(lambda: print_message("waiting until another kouxing has started")))
-    with naming_option("--port", "gateway.port", is_given=port is not None):
+    with rename_key_in_errors("--port", "gateway.port", is_given=port is not None):
         addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
     bound_control = addresses.get(BOUND_CONTROL, control_config.bound_control)
@@ -88,7 +88,7 @@ def run(
         **_assigned_environment(given),
         **head_environment(head or driver.head, out),
         **addresses,
-        variable(COMMON, "control"): control,
+        variable_name(COMMON, "control"): control,
         BOUND_CONTROL: bound_control,
     }
     if not control_config.insecure:
@@ -143,7 +143,7 @@ def head_environment(name: str, out: Path) -> dict[str, str]:
     The GLB for the page is in the folder ``out``. Raises ``UserError`` if there is no such head, or
     the GLB cannot be written.
     """
-    environment = {variable("driver", "head"): name}
+    environment = {variable_name("driver", "head"): name}
     if name == DriverConfig().head:
         return environment
     from kouxing.services.driver.head.glb_export import export_glb
@@ -155,7 +155,7 @@ def head_environment(name: str, out: Path) -> dict[str, str]:
     except OSError as error:
         raise UserError(f"cannot create {out}: {error.strerror}; set driver.out") from None
     export_glb(load_head(name), page_head)
-    return environment | {variable("gateway", "head"): str(page_head)}
+    return environment | {variable_name("gateway", "head"): str(page_head)}
 
 
 def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
@@ -164,7 +164,7 @@ def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
     for name, value in assignments.items():
         table, _, key = name.partition(".")
         for service in (COMMON, *KINDS) if table == COMMON else (table,):
-            environment[variable(service, key)] = value
+            environment[variable_name(service, key)] = value
     return environment
 
 
@@ -187,7 +187,7 @@ def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) ->
         setting.text
         for kind in KINDS.values()
         for setting in settings.describe(kind.config_type)
-        if setting.is_default and variable(kind.name, setting.key) in moved
+        if setting.is_default and variable_name(kind.name, setting.key) in moved
     ]
     running = find_control() if BOUND_CONTROL in moved else ""
     if running:
@@ -204,7 +204,7 @@ def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) ->
 
 def _install_signal_handlers() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    install_interrupt()  # a shell's background processes ignore SIGINT
+    install_interrupt_handler()  # a shell's background processes ignore SIGINT
 
 
 def _open_browser(page: str) -> None:

@@ -13,8 +13,8 @@ from kouxing_client import Client, FapFrame, KouxingError, Results, Session
 
 from kouxing.services.senders.sender_pool import SenderPool
 from kouxing.services.senders.target import Target
-from kouxing.shared.control_client import connect
-from kouxing.shared.interrupt import catch_interrupt, install_interrupt
+from kouxing.shared.client_connection import connect_client
+from kouxing.shared.interrupt import catch_interrupt, install_interrupt_handler
 from kouxing.shared.terminal import print_message
 
 SEARCH_PERIOD_S = 0.2
@@ -28,9 +28,9 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
     While there are no frames, the face's idle motion is sent, which the seed determines. Raises
     ``UserError`` if control does not answer, or there are too many targets.
     """
-    install_interrupt()  # a background shell ignores SIGINT
+    install_interrupt_handler()  # a background shell ignores SIGINT
     with (
-        connect(control) as client,
+        connect_client(control) as client,
         contextlib.closing(SenderPool(idle_motion_seed, _report)) as senders,
         catch_interrupt(),
     ):

@@ -11,8 +11,8 @@ from kouxing_client import Client, KouxingError, Phone, Refused
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from kouxing.shared.audio_file import AudioSource, clipping_warnings, num_clipped
-from kouxing.shared.control_client import connect
+from kouxing.shared.audio_file import AudioSource, clipping_warnings, count_clipped
+from kouxing.shared.client_connection import connect_client
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt
 from kouxing.shared.terminal import plural
@@ -51,7 +51,7 @@ def stream(
     ``mouth_profile`` is the speaker's, if any. ``language`` is the language of the speech. Raises
     ``UserError`` if the system does not answer, refuses the session or stops answering.
     """
-    with connect(control) as client:
+    with connect_client(control) as client:
         return _Streaming(client, source, console).run(
             record=record,
             name=session,
@@ -140,7 +140,7 @@ class _Streaming:
                 with contextlib.suppress(Refused):  # `_check_errors` reports the next one
                     self._session.push(block.astype("<f4").tobytes(), PUSH_TIMEOUT_S)
                 num_sent += len(block)
-                num_clipping += num_clipped(block)
+                num_clipping += count_clipped(block)
                 self._peak = max(self._peak, float(np.abs(block).max()))
                 self._update(0.0)
                 if paced and not source.is_live:

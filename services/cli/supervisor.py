@@ -18,8 +18,8 @@ from rich.console import Console
 from kouxing.services.cli.log_file import LogFile
 from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
 from kouxing.services.service_kinds import KINDS, WORKERS, kind_of
-from kouxing.shared.control_client import connect
-from kouxing.shared.errors import USER_ERROR, UserError, with_name
+from kouxing.shared.client_connection import connect_client
+from kouxing.shared.errors import USER_ERROR, UserError, prefix_name
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # delays before restarting a service that crashed twice
@@ -86,7 +86,7 @@ class Supervisor:
         Raises ``UserError`` if a service cannot start, or this takes longer than ``START_LIMIT_S``.
         """
         end_s = time.monotonic() + START_LIMIT_S
-        with connect(control, timeout_s=2.0) as client:
+        with connect_client(control, timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.check()
                 with contextlib.suppress(KouxingError):  # control does not run yet
@@ -99,7 +99,7 @@ class Supervisor:
     @staticmethod
     def page_address(control: str) -> str:
         """Return the address of the gateway's page, including its token."""
-        with connect(control) as client:
+        with connect_client(control) as client:
             services = client.status().services
         gateway = next(service for service in services if service.service == "gateway")
         return gateway.endpoints["page"].removesuffix("/")
@@ -230,7 +230,7 @@ class Supervisor:
                 if text.startswith((f"{kind_of(name)}:", f"{kind_of(name)}.")):
                     self._errors[name] = text  # `check` raises it
                 elif text:
-                    self._print(with_name(name, text))
+                    self._print(prefix_name(name, text))
 
     def _warn(self, text: str) -> None:
         self._print(text, "yellow")

@@ -25,10 +25,10 @@ from kouxing.services.control.status_reporter import StatusReporter
 from kouxing.shared.bus import COMMANDS
 from kouxing.shared.clock import StallDetector, now_ns
 from kouxing.shared.endpoints import with_key
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
-from kouxing.shared.records import replace
 from kouxing.shared.service import Service
 from kouxing.shared.wire.control import Event, EventName, Heartbeat, HeartbeatReply, SessionStarted
 from kouxing.shared.wire.face import CurrentFace, FaceSettings, SetFace
@@ -80,7 +80,7 @@ class ControlService(Service):
         self._events = self.bus.bind_publisher(config.events, "control.events")
         public = self.key.public if self.key else ""
         self.endpoints = {
-            name: with_key(config.reachable(socket.endpoint), public)
+            name: with_key(config.advertised_endpoint(socket.endpoint), public)
             for name, socket in (("commands", self._commands), ("events", self._events))
         }
         requests = self._requests = RequestHandler(self.bus, self._commands, self.metrics)

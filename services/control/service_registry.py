@@ -14,8 +14,8 @@ from kouxing.services.control.worker_load import WorkerLoad
 from kouxing.services.service_kinds import PROVIDERS
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
-from kouxing.shared.records import replace
 from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import ErrorCode, SessionFacts

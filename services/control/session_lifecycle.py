@@ -10,9 +10,9 @@ from kouxing.services.control.request_handler import RequestHandler
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
+from kouxing.shared.fast_record import replace
 from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import Metrics
-from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Event, EventName
 from kouxing.shared.wire.message import Message

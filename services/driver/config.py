@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from kouxing.shared.config import KnownNames, Switch, ValueHint
 from kouxing.shared.face.config import FaceConfig
-from kouxing.shared.names import NAME
+from kouxing.shared.name_rules import NAME
 
 HEAD_NAMES = tuple(
     sorted(path.stem for path in (Path(__file__).parent / "head" / "assets").glob("*.npz"))

@@ -21,8 +21,8 @@ from kouxing.shared.face.expressions import (
     check_amount,
     check_expressions,
 )
-from kouxing.shared.face.lip_models import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
-from kouxing.shared.names import is_name
+from kouxing.shared.face.lip_constants import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.name_rules import is_name
 from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.speech import AcousticModelName

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator
 
-from kouxing.shared.config import BoundHost, BoundPort, HostNames, Texts, ValueHint
+from kouxing.shared.config import BoundHost, BoundPort, HostNames, TextList, ValueHint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 
@@ -42,12 +42,12 @@ def _check_targets(values: tuple[str, ...]) -> tuple[str, ...]:
 
 
 Origins = Annotated[
-    Texts,
+    TextList,
     AfterValidator(_check_origins),
     ValueHint("a list of origins such as https://example.org"),
 ]
 Targets = Annotated[
-    Texts,
+    TextList,
     AfterValidator(_check_targets),
     ValueHint("a list of addresses such as vmc://127.0.0.1:39540"),
 ]

@@ -12,7 +12,7 @@ from kouxing.services.gateway.audio_sessions import AudioClient, error_text
 from kouxing.shared.audio_file import open_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.phones.known_text import Characters, characters_of
+from kouxing.shared.phones.text_captions import Characters, split_characters
 
 SAMPLE_FILE = Path(str(resources.files("kouxing.shared") / "demo" / "hello-female.wav"))
 SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"
@@ -49,7 +49,7 @@ class SampleSentence:
         try:
             if not self.characters:  # takes 0.3 s
                 self.characters = await asyncio.to_thread(
-                    characters_of, SAMPLE_TEXT, load_inventory()
+                    split_characters, SAMPLE_TEXT, load_inventory()
                 )
             await self._speak()
         except (UserError, KouxingError) as refusal:

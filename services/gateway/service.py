@@ -33,17 +33,17 @@ from kouxing.services.gateway.whip_handler import WhipHandler
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
-from kouxing.shared.phones.syllables import SyllableTrack
-from kouxing.shared.records import replace
+from kouxing.shared.phones.syllable_captions import SyllableCaptions
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
-from kouxing.shared.wire.events import phone_of
+from kouxing.shared.wire.events import message_to_phone
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import StatusReport, StatusRequest
@@ -60,7 +60,7 @@ class _FollowedSession:
     """A session to which the gateway subscribes, from its first use until it ends."""
 
     follower: ServiceFollower
-    syllables: SyllableTrack
+    syllables: SyllableCaptions
 
 
 class GatewayService(SessionService):
@@ -299,7 +299,7 @@ class GatewayService(SessionService):
             on_new_epoch=lambda: self._restart(session),
         )
         characters = self._sample.characters if self._sample.session == start.session else ()
-        track = SyllableTrack(self._inventory(start), characters)
+        track = SyllableCaptions(self._inventory(start), characters)
         session = _FollowedSession(follower, track)
         return session
 
@@ -341,7 +341,7 @@ class GatewayService(SessionService):
             final=phone.final,
         )
         self._viewers.forward(phone.session, MessageKind.TEXT, message)
-        for syllable in syllables.update(phone_of(phone)):
+        for syllable in syllables.update(message_to_phone(phone)):
             message = browser_messages.text(
                 "syllable",
                 index=syllable.index,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.shared.audio_file import clipping_warnings, limited_blocks, num_clipped, open_audio
+from kouxing.shared.audio_file import clipping_warnings, count_clipped, limited_blocks, open_audio
 from kouxing.shared.errors import USER_ERROR, UserError
 
 MAX_DURATION_S = 3600
@@ -26,7 +26,7 @@ def decode(path: Path) -> None:
         output.setparams((1, 2, source.sample_rate_hz, 0, "NONE", ""))
         for block in limited_blocks(source, MAX_DURATION_S):
             num_samples += len(block)
-            clipped += num_clipped(block)
+            clipped += count_clipped(block)
             mono = np.rint(block.mean(axis=1) * 32768).clip(-32768, 32767)
             output.writeframes(mono.astype("<i2").tobytes())
     clipped_fraction = clipped / max(1, num_samples * source.num_channels)

@@ -14,7 +14,7 @@ import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.services.lip_models import lip_models
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.logs import LOG
 from kouxing.shared.page_heads import page_heads_folder
 from kouxing.shared.phones.inventory import language_titles

@@ -30,8 +30,8 @@ from kouxing.services.recognizer.speech_scorer import (
     ScoreEvent,
 )
 from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
-from kouxing.shared.records import replace
 
 _DEFAULT_CONFIDENCE = 0.5  # confidence of a phone that was not emitted before it was final
 

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.user_file import read_file
 
 Floats = NDArray[np.float32]

@@ -5,8 +5,8 @@ from typing import Any, TypeAlias
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.records import replace
 
 WithProgress: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]  # ``iter``, or a progress bar
 

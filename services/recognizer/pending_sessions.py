@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (
     EndOfSound,
     LipPositions,
@@ -22,8 +23,7 @@ from kouxing.shared.phones.events import (
     SpeechChange,
     Waveform,
 )
-from kouxing.shared.phones.final_time import FinalTime
-from kouxing.shared.records import replace
+from kouxing.shared.phones.final_time import FinalTimeTracker
 
 WARM_UP_S = 2.8  # duration of the reprocessed audio; docs/recognition.md explains the choice
 # Audio starts at a multiple of this time. Network blocks and positions divide it, so they are
@@ -39,7 +39,7 @@ class ReplayWindow:
 
     def __init__(self) -> None:
         self.last_droppable_sequence = 0  # last message that a replacement can do without
-        self._final = FinalTime()  # final time of the events that the synthesizer has
+        self._final = FinalTimeTracker()  # final time of the events that the synthesizer has
         # (sequence, end) of each message
         self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED_MESSAGES)
 

@@ -31,17 +31,17 @@ from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
 from kouxing.shared.clock import to_samples
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
 from kouxing.shared.phones.events import Progress, Waveform
-from kouxing.shared.records import replace
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
-from kouxing.shared.wire.events import message_of
+from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
@@ -74,14 +74,16 @@ class RecognizerService(SessionService):
             self, {Acknowledge: self._on_acknowledge, Error: self.on_error}
         )
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio", role="client")
-        self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones", self._on_joined)
+        self._phones = self.bus.bind_publisher(
+            config.phones, "recognizer.phones", self._on_subscribe
+        )
         self._unpaced_audio = self.bus.bind_router(
             config.unpaced_audio, "recognizer.unpaced_audio", role="client"
         )
         self.endpoints = {
-            "audio": config.reachable(self._audio.endpoint),
-            "phones": config.reachable(self._phones.endpoint),
-            "unpaced_audio": config.reachable(self._unpaced_audio.endpoint),
+            "audio": config.advertised_endpoint(self._audio.endpoint),
+            "phones": config.advertised_endpoint(self._phones.endpoint),
+            "unpaced_audio": config.advertised_endpoint(self._unpaced_audio.endpoint),
         }
         with ThreadPoolExecutor(max_workers=1) as executor:  # a restart must be quick
             loading = executor.submit(load_model, config.acoustic)
@@ -96,7 +98,7 @@ class RecognizerService(SessionService):
         self._live = LiveBatchDecoder(
             self._sessions,
             self._recognizer,
-            self.busy,
+            self.load_meter,
             self.waker.wake,
             on_early=self._send_results,
             on_decoded=self._send_decoded,
@@ -386,7 +388,9 @@ class RecognizerService(SessionService):
         results = session.new_results(self._recognizer)
         acoustic = session.acoustic_message(results)
         published = [*session.published_messages(results)]
-        messages = [message_of(result) for result in results if not isinstance(result, Waveform)]
+        messages = [
+            event_to_message(result) for result in results if not isinstance(result, Waveform)
+        ]
         if acoustic is not None:
             session.replay.send(acoustic, now_s)
         for message in published:
@@ -402,7 +406,7 @@ class RecognizerService(SessionService):
                 name = EventName.LAUGHTER_START if result.is_laughter else EventName.LAUGHTER_STOP
                 self.publish_event(name, session.name, media_time=to_samples(result.time_s))
 
-    def _on_joined(self, session: str) -> None:
+    def _on_subscribe(self, session: str) -> None:
         if (joined := self._sessions.get(session)) is not None:
             joined.replay.repeat(time.monotonic())
 

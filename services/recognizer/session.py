@@ -16,15 +16,15 @@ from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.encoding_check import EncodingCheck
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange
-from kouxing.shared.records import replace
-from kouxing.shared.replay import Replay
+from kouxing.shared.replaying_publisher import ReplayingPublisher
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
+from kouxing.shared.wire.events import SpeechMessage, event_to_message, message_to_event
 from kouxing.shared.wire.face import CurrentFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode
@@ -70,7 +70,7 @@ class RecognizerSession:
         max_lag_s: float = math.inf,
     ) -> None:
         self.start = start
-        self.replay = Replay(publisher, now_s)
+        self.replay = ReplayingPublisher(publisher, now_s)
         self.first_epoch = start.epoch
         self.face = CurrentFace(start.face, now_s)
         self.socket = socket
@@ -278,7 +278,7 @@ class RecognizerSession:
         """Yield the messages of results for subscribers."""
         for result in results:
             if isinstance(result, Phone | LipPositions | SpeechChange):
-                yield self._number(message_of(result))
+                yield self._number(event_to_message(result))
             else:
                 yield from map(self._number, self._sound_packets.add(result))
 
@@ -301,7 +301,7 @@ class RecognizerSession:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
             if isinstance(message, SpeechMessage) and not isinstance(message, LipMessage):
-                self.replay_window.update(event_of(message), self.last_sequence)
+                self.replay_window.update(message_to_event(message), self.last_sequence)
 
 
 class _LeadLimiter:

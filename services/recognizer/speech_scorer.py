@@ -26,6 +26,7 @@ from kouxing.services.recognizer.speech_segmenter import (
     SpeechSegmenter,
     SpeechStart,
 )
+from kouxing.shared.fast_record import Record, replace
 from kouxing.shared.phones.events import (
     AudioSkipped,
     EndOfSound,
@@ -33,7 +34,6 @@ from kouxing.shared.phones.events import (
     Progress,
     Waveform,
 )
-from kouxing.shared.records import Record, replace
 
 
 class FrameScores(Record, frozen=True):

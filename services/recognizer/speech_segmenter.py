@@ -21,8 +21,8 @@ from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameStream
 from kouxing.services.recognizer.voice_traits import VoiceTraits, load_voice_readout
+from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import LipPositions
-from kouxing.shared.records import Record
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
 _DETECTION_S = 0.06  # the encoder's look-ahead, and a position

@@ -19,6 +19,7 @@ from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import SpeechScorer
 from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (
     AudioSkipped,
     EndOfSound,
@@ -28,7 +29,6 @@ from kouxing.shared.phones.events import (
     SpeechChange,
     Waveform,
 )
-from kouxing.shared.records import replace
 
 MAX_JITTER = MEDIA_RATE_HZ // 10  # a larger jump of the media time is a gap; samples
 SILENT_DB = -120.0  # the level after the last sample

@@ -19,7 +19,7 @@ from typing import ClassVar
 
 from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
 from kouxing.services.senders.face_frame import FaceFrame
-from kouxing.shared.face.high_level import fap_table
+from kouxing.shared.face.high_level_faps import fap_table
 
 VERSION = 6
 FRAME_RATE_HZ = 50  # rate of the time code

@@ -8,7 +8,7 @@ from kouxing.services.lip_models import lip_model_info, lip_model_names
 from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig, LiveConfig
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 
 _DEFAULT_DELAY_MS = lip_model_info(DEFAULT_LIP_MODEL).delay_ms
 

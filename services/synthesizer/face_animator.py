@@ -34,7 +34,7 @@ from kouxing.services.synthesizer.modifiers.speech_motion import (
 from kouxing.services.synthesizer.phone_renumberer import PhoneRenumberer
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.expression_motion import JAW, mix
+from kouxing.shared.face.expression_motion import JAW, mix_expression
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import (
     AudioSkipped,
@@ -330,7 +330,7 @@ class FaceAnimator:
         if difference.any():
             free = max(self._expression.free, 1.0 - self._transition_s / _CLOSE_LIPS_AFTER_S)
             jaw = faps[JAW] + difference[JAW]  # the jaw does not open the lips
-            mix(faps, difference.astype(np.float32), free)
+            mix_expression(faps, difference.astype(np.float32), free)
             faps[JAW] = max(jaw, 0.0)
 
     def _make_target(self, mouth: MouthFrame) -> NDArray[np.float32]:

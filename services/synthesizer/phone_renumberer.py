@@ -4,8 +4,8 @@ A recognizer that replaces a lost one numbers phones from 0. Phones of the lost 
 not final are void. If the new recognizer finds a void phone again, the phone keeps its index.
 """
 
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.records import replace
 
 _MAX_ONSET_DIFFERENCE_S = 0.05  # maximum onset difference of a phone found by two recognizers
 

@@ -33,6 +33,7 @@ from kouxing.shared.endpoints import key_of
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import MAX_TURN_S, Handler
@@ -40,14 +41,13 @@ from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.records import replace
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import (
     SPEECH_MESSAGES,
     SpeechMessage,
-    event_of,
     is_state_report,
+    message_to_event,
     split_batch,
 )
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
@@ -89,8 +89,8 @@ class SynthesizerService(SessionService):
         )
         self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps", self._on_subscribe)
         self.endpoints = {
-            "phone_input": config.reachable(self._input.endpoint),
-            "faps": config.reachable(self._faps.endpoint),
+            "phone_input": config.advertised_endpoint(self._input.endpoint),
+            "faps": config.advertised_endpoint(self._faps.endpoint),
         }
         load_lip_model(name=config.lips)  # so that the first session does not wait
         handlers: dict[type[Message], Handler] = dict.fromkeys(SPEECH_MESSAGES, self._on_input)
@@ -311,7 +311,7 @@ class SynthesizerService(SessionService):
         return None
 
     def _queue_event(self, session: SynthesizerSession, message: SpeechMessage) -> None:
-        event = event_of(message)
+        event = message_to_event(message)
         language = session.start.facts.language or DEFAULT_LANGUAGE
         if isinstance(event, Phone) and event.symbol not in load_inventory(language).index:
             text = f"{event.symbol!r} is not a phone of {language}"

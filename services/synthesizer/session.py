@@ -14,9 +14,9 @@ from kouxing.shared.clock import to_seconds
 from kouxing.shared.overload import SkipPolicy
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, SoundEvent
-from kouxing.shared.phones.final_time import FinalTime
+from kouxing.shared.phones.final_time import FinalTimeTracker
 from kouxing.shared.reliable import ReliableReceiver
-from kouxing.shared.replay import Replay
+from kouxing.shared.replaying_publisher import ReplayingPublisher
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FapFrame
@@ -37,14 +37,14 @@ class SynthesizerSession:
         max_lag_s: float,
     ) -> None:
         self.start = start
-        self.replay = Replay(publisher, time.monotonic())
+        self.replay = ReplayingPublisher(publisher, time.monotonic())
         self.face = face
         self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledgement)
         self.input_epoch = 0  # epoch of the newest message from the recognizer; 0 before the first
         self.relax_at_s = time.monotonic() + RECOGNIZER_TIMEOUT_S  # start of frames without sound
         self.output_sequence = 0
         self.newest_frame: FapFrame | None = None
-        self.final_time = FinalTime()
+        self.final_time = FinalTimeTracker()
         self.events: deque[SoundEvent] = deque()  # frames are being made for the first event
         self.pending_frames: Iterator[Frame] | None = None  # remaining frames of the first event
         self.skip_policy = SkipPolicy(max_lag_s)

@@ -1,4 +1,4 @@
-"""Requested expressions, on a speaking face or on one at rest.
+"""Shows requested expressions on a speaking or resting face.
 
 Expressions ease in, stay for a time and fade, smoothed by a two-pole filter. Brows, lids, cheeks
 and mouth corners are added to the speech. Lips that are closed for speech stay closed:
@@ -16,7 +16,7 @@ a       freedom of the lips, 0 to 1                           1         (6,)
     both lips move up by c if c > 0, else by a c
 
 ``a`` is 0 where the gap is at most 20 or the lower lip is this close to its closure (f), and 1 from
-80 upwards. Without speech all lips are free; they are bound again when speech starts.
+80 upwards. Without speech, all lips are free. They are bound again when speech starts.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
+from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_gain
 
@@ -68,7 +68,7 @@ class ExpressionMotion:
         self._is_shown = False
 
     def show(self, strengths: Mapping[str, float], hold_s: float) -> None:
-        """Replace the current expressions for a time; without strengths they fade now.
+        """Replace the current expressions for a time; without strengths, they fade now.
 
         Unknown names are ignored.
         """
@@ -98,11 +98,11 @@ class ExpressionMotion:
         if is_held or self._is_shown:
             goal = is_held * self._goal
             shown = self._shown.step(goal, step_s, self._ease_s if is_held else _FADE_S)
-            mix(faps, shown, self._free)
+            mix_expression(faps, shown, self._free)
             self._is_shown = bool(np.abs(shown).max() > _VISIBLE)
 
 
-def mix(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:
+def mix_expression(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:
     """Add an expression (68,) to a face (68,), in place; ``free`` is the minimum of ``a``."""
     gap = -(faps[UPPER] + faps[LOWER])
     room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - CLOSED

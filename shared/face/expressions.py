@@ -5,7 +5,7 @@ from enum import StrEnum
 
 from kouxing.shared.errors import UserError
 
-MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS = 0.5, 2.0  # at 1 the lip model's movements are unchanged
+MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS = 0.5, 2.0  # 1 leaves the lip model unchanged
 MAX_HOLD_S = 3600.0
 DEFAULT_HOLD_S = 3.0  # expressions fade after this time
 

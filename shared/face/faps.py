@@ -6,7 +6,7 @@ is ``value * FAPU / 1024``, an angle ``value * 1e-5`` rad.
 
 from dataclasses import dataclass
 
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 NUM_FAPS = 68
 MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the first byte

@@ -1,4 +1,4 @@
-"""Idle motion: blinks, gaze, breath and small head motion.
+"""Idle motion: blinks, gaze, breathing and small head motion.
 
 Blinks: 17 to 20 per minute in conversation, at log-normal intervals. The lid falls in about 80 ms
 and rises half as fast (Bentivoglio et al. 1997; VanderWerf et al. 2003). Gaze: saccades last 21 ms
@@ -10,7 +10,7 @@ respiratory drive and timing in healthy subjects"). The eyes compensate head tur
 (vestibulo-ocular reflex).
 
 The motion depends only on the seed, the time and recent states. A generator that starts late soon
-makes the same motion as one that started with the session.
+matches a generator that started with the session.
 """
 
 import math
@@ -25,7 +25,7 @@ from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNI
 from kouxing.shared.face.smoothing import smooth_step, smoothing_gain
 
 RESTING_RATE_HZ = 25.0
-STALL_S = 1.0  # a face without new frames for this time fades to rest
+STALL_S = 1.0  # after this time without new frames, a face fades to rest
 FADE_S = 0.3
 
 _DEGREE = math.pi / 180.0 / RADIANS_PER_ANGLE_UNIT
@@ -54,7 +54,7 @@ _BREATH_HZ, _BREATH_SD_DEG = (0.18, 0.28), 0.2
 
 
 def fap_slice(first: str, last: str) -> slice:
-    """Return where successive FAPs are in an array (68,)."""
+    """Return the slice of consecutive FAPs in an array (68,)."""
     return slice(FAP_NUMBER[first] - 1, FAP_NUMBER[last])
 
 
@@ -65,8 +65,8 @@ EYES_PITCH = fap_slice("pitch_l_eyeball", "pitch_r_eyeball")
 _HEAD = fap_slice("head_pitch", "head_roll")
 
 
-class State(Enum):
-    """Conversational state; it controls gaze and head motion."""
+class ConversationState(Enum):
+    """Conversational state, which controls gaze and head motion."""
 
     LISTENING = "listening"  # or silence
     ATTENDING = "attending"  # listening to a speaker
@@ -76,16 +76,16 @@ class State(Enum):
     THINKING = "thinking"  # a pause within the session's speech
 
 
-_PAUSES = (State.ENDING, State.THINKING)
+_PAUSES = (ConversationState.ENDING, ConversationState.THINKING)
 _LIVELINESS_IN_PAUSES = 0.3  # factor for the head in pauses
 # fraction of the fixations on the listener
 _ON_LISTENER = {
-    State.LISTENING: 0.8,
-    State.ATTENDING: 0.95,
-    State.STARTING: 0.3,
-    State.SPEAKING: 0.88,
-    State.ENDING: 1.0,
-    State.THINKING: 0.5,
+    ConversationState.LISTENING: 0.8,
+    ConversationState.ATTENDING: 0.95,
+    ConversationState.STARTING: 0.3,
+    ConversationState.SPEAKING: 0.88,
+    ConversationState.ENDING: 1.0,
+    ConversationState.THINKING: 0.5,
 }
 
 
@@ -93,8 +93,8 @@ class IdleMotion:
     """Motion of eyes and head; the same seed gives the same motion. Times must not decrease."""
 
     def __init__(self, seed: int) -> None:
-        self.is_still = False  # the head does not turn
-        self.has_eye_contact = False  # the eyes do not leave the viewer
+        self.is_still = False  # whether the head holds still
+        self.has_eye_contact = False  # whether the eyes stay on the viewer
         self._seed = seed
         waves, self._blink_rng, self._fixation_rng = (
             np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
@@ -110,7 +110,7 @@ class IdleMotion:
         self._wave_size = size * np.array([_BREATH_SD_DEG, *_HEAD_SD_DEG])[:, None] * _DEGREE
         self._liveliness = 1.0
         self._time_s = 0.0
-        self._state = State.LISTENING
+        self._state = ConversationState.LISTENING
         self._blink_s = self._draw_blink(0.0)
         self._blink_slowness = 1.0  # relative to the usual duration
         self._gaze_from = self._gaze_to = np.zeros(2)
@@ -120,7 +120,10 @@ class IdleMotion:
         self._reaction_s = math.inf  # when the gaze follows a new state
 
     def apply(
-        self, faps: NDArray[np.float32], time_s: float, state: State = State.LISTENING
+        self,
+        faps: NDArray[np.float32],
+        time_s: float,
+        state: ConversationState = ConversationState.LISTENING,
     ) -> None:
         """Add the motion, at a time since the first frame, to FAPs (68,) in place."""
         if state is not self._state:
@@ -199,7 +202,7 @@ class IdleMotion:
 
 
 class RestingFace:
-    """A face that no session moves: idle motion, unless the seed is 0, and expressions."""
+    """The face without a session: shows expressions and, unless the seed is 0, idle motion."""
 
     def __init__(self, seed: int) -> None:
         self._motion = IdleMotion(seed) if seed else None

@@ -1,10 +1,10 @@
-"""Nine drawn mouths (A to H and X) and the Oculus visemes as cues: one mouth at a time.
+"""Converts FAPs to mouth cues: nine drawn mouths (A to H and X), or Oculus visemes.
 
-The letters follow Rhubarb Lip Sync (D. S. Wolf, README, "Mouth shapes"), after the studio
+The letters follow Rhubarb Lip Sync (D. S. Wolf, README, "Mouth shapes") and the studio
 Hanna-Barbera: A closed, B slightly open, C open, D wide open, E slightly rounded, F puckered, G
 lower lip at the upper teeth, H tongue behind the upper teeth, X rest. They are computed from the
-FAPs of the face, so they match its lips in any language. Thresholds are FAP units, chosen for the
-openings of filmed speakers: 60, 370 and 500 separate A to D.
+FAPs of the face, so they match its lips in any language. Thresholds are in FAP units, chosen for
+the openings of filmed speakers: 60, 370 and 500 separate A to D.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -61,7 +61,7 @@ def oculus_viseme(faps: Float32) -> str:
 
 
 def mouth_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
-    """Yield a cue for each change of the drawn mouth, as soon as it is certain.
+    """Yield a cue for each change of the drawn mouth, as soon as the change is certain.
 
     ``frames`` are times in seconds and FAPs (68,). The first cue starts at the first frame. Closed
     lips are A, and after 0.2 s X.
@@ -90,7 +90,7 @@ def _cues(
     mouth_of: Callable[[float, Float32], str],
     at_once: frozenset[str],
 ) -> Iterator[Cue]:
-    """Yield the mouths that last two frames; those in ``at_once`` may last one."""
+    """Yield the mouths that last two frames. Mouths in ``at_once`` may last one frame."""
     shown = candidate = ""
     since_s = 0.0
     for time_s, faps in frames:

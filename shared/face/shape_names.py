@@ -55,7 +55,7 @@ def find_shapes(set_name: str, names: Iterable[str]) -> dict[str, str]:
 
 
 def choose_set(names: Iterable[str]) -> ShapeSetName:
-    """Return the set that moves an avatar: the first that is complete, or the nearest to that.
+    """Return the set that moves an avatar: the first complete set, or the most complete one.
 
     Raises ``UserError`` if the avatar cannot speak; the text names what the nearest set lacks.
     """
@@ -82,7 +82,7 @@ def _key(name: str) -> str:
 
 
 def _spell_out_side(name: str) -> str:
-    """Remove a number at the end, and write the side before it as a word."""
+    """Remove a number at the end of a name, and spell out the side before it."""
     name = re.sub(r"[._ ](div)?\d+$", "", name)  # Blender appends .001, Daz _div2
     return re.sub(
         r"(?:[._\- ]([LRlr])|(?<=[a-z])([LR]))$",

@@ -1,4 +1,4 @@
-"""Conversion between FAPs and blendshapes: ARKit's 52, Oculus' 15 visemes, VRM 1's expressions.
+"""Converts between FAPs and blendshapes: ARKit's 52, Oculus' 15 visemes, VRM 1's expressions.
 
 Both directions are linear in the basis. A face with weights ``w`` has the FAPs
 
@@ -29,9 +29,9 @@ both eyes of ARKit. In VRM, "blink" holds what both eyes have in common, "blinkL
 weight in VRM: it distinguishes vowels, but consonants also raise it and have no shape.
 
 Equation (2) is solved exactly by block pivoting (J. Kim, H. Park, "Fast nonnegative matrix
-factorization", SIAM J. Scientific Computing 33(6), 2011; here with two bounds). Guess which weights
-are 0, which are 1 and which are free. Solve for the free weights. Then move the weights that
-violate a bound or an optimality condition, and repeat.
+factorization", SIAM J. Scientific Computing 33(6), 2011; here with two bounds). Guess which
+weights are 0, 1 or free. Solve for the free weights. Then reassign the weights that violate a
+bound or an optimality condition, and repeat.
 """
 
 from collections.abc import Callable, Mapping
@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.high_level import VISEMES, fap_table
+from kouxing.shared.face.high_level_faps import VISEMES, fap_table
 from kouxing.shared.face.shape_names import ShapeSetName
 
 Float32 = NDArray[np.float32]
@@ -137,7 +137,7 @@ class ShapeSet:
             at_one[wrong] = above[wrong]
 
 
-def _arkit() -> ShapeSet:
+def _build_arkit() -> ShapeSet:
     rows, basis = fap_table("arkit.tsv")
     names = tuple(row["shape"] for row in rows)
     # Left and right shapes would both rise for their common part. Half of their difference replaces
@@ -150,7 +150,7 @@ def _arkit() -> ShapeSet:
     return ShapeSet(names, basis, solved)
 
 
-def _oculus() -> ShapeSet:
+def _build_oculus() -> ShapeSet:
     def fill_silence(weights: Float32) -> None:
         weights[0] = max(0.0, 1.0 - float(weights.sum()))
 
@@ -158,7 +158,7 @@ def _oculus() -> ShapeSet:
     return ShapeSet(tuple(names), VISEMES, finish=fill_silence)
 
 
-def _vrm() -> ShapeSet:
+def _build_vrm() -> ShapeSet:
     vowels = {"aa": "aa", "ih": "ih", "ou": "ou", "ee": "E", "oh": "oh"}
     eyes = {
         "blink": ("eyeBlinkLeft", "eyeBlinkRight"),
@@ -192,9 +192,9 @@ def _vrm() -> ShapeSet:
     return ShapeSet((*vowels, *eyes), basis, solved, effect_mm, join_blinks)
 
 
-ARKIT = _arkit()  # 52
-OCULUS = _oculus()  # 15; "sil" is 1 minus the sum of the others
-VRM = _vrm()  # 12
+ARKIT = _build_arkit()  # 52
+OCULUS = _build_oculus()  # 15; "sil" is 1 minus the sum of the others
+VRM = _build_vrm()  # 12
 SHAPE_SETS: Mapping[str, ShapeSet] = {
     ShapeSetName.ARKIT: ARKIT,
     ShapeSetName.OCULUS: OCULUS,

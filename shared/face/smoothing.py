@@ -1,4 +1,4 @@
-"""Smoothing of values over time."""
+"""Smooths values over time."""
 
 import math
 from typing import Generic, TypeVar
@@ -10,7 +10,7 @@ Value = TypeVar("Value", float, NDArray[np.float32])
 
 
 def smoothing_gain(elapsed_s: float, time_constant_s: float) -> float:
-    """Return the fraction of a change that a one-pole low-pass filter makes in a time, 0 to 1."""
+    """Return the gain of a one-pole low-pass filter over a time step, 0 to 1."""
     return -math.expm1(-elapsed_s / time_constant_s)
 
 
@@ -21,14 +21,14 @@ def smooth_step(x: float) -> float:
 
 
 class TwoPoleFilter(Generic[Value]):
-    """Two one-pole low-pass filters in series: the output has no corners."""
+    """Two one-pole low-pass filters in series, so that the output has no corners."""
 
     def __init__(self, value: Value) -> None:
         self._halfway: Value = value
         self.value: Value = value
 
     def step(self, goal: Value, step_s: float, time_constant_s: float) -> Value:
-        """Move towards a goal for ``step_s`` seconds; return the new value."""
+        """Move toward a goal for ``step_s`` seconds; return the new value."""
         gain = smoothing_gain(step_s, time_constant_s)
         self._halfway = self._halfway + gain * (goal - self._halfway)
         self.value = self.value + gain * (self._halfway - self.value)

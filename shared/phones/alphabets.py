@@ -9,10 +9,10 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable, load_inventory
-from kouxing.shared.phones.universal.segments import ipa_of, nearest_phone
-from kouxing.shared.records import replace
-from kouxing.shared.tables import read_table
+from kouxing.shared.phones.universal.segments import nearest_phone, symbol_to_ipa
+from kouxing.shared.tsv_tables import read_table
 
 if TYPE_CHECKING:  # it needs NumPy, which commands import only if they need it
     from kouxing.shared.phones.events import Phone
@@ -34,9 +34,9 @@ def respell(
 ) -> Iterator[Phone]:
     """Convert spoken phones to another alphabet, in order.
 
-    Without an alphabet, universal phones are written in IPA, and others as they are. A phone of
-    Mandarin may be several IPA letters, which share its time equally. A diphthong of ARPABET is two
-    phones of the universal inventory, so its first one waits for the next.
+    Without an alphabet, universal phones are written in IPA, and other phones unchanged. A phone
+    of Mandarin may be several IPA letters, which share its time equally. A diphthong of ARPABET is
+    two phones of the universal inventory, so its first phone waits for the second.
 
     Raises ``UserError`` if the language does not list universal phones.
     """
@@ -51,7 +51,7 @@ def respell(
         return spoken
     universal = chain.from_iterable(_split(phone, inventory) for phone in spoken)
     if alphabet is Alphabet.IPA:
-        return (replace(phone, symbol=ipa_of(phone.symbol)) for phone in universal)
+        return (replace(phone, symbol=symbol_to_ipa(phone.symbol)) for phone in universal)
     return _in_arpabet(universal)
 
 

@@ -1,4 +1,4 @@
-"""A recognizer's live results: phones, lip frames, voice activity, level.
+"""The live results of a recognizer: phones, lip frames, voice activity and level.
 
 Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
 """
@@ -6,8 +6,8 @@ Times are media time: seconds from the session's first sample, whole samples at 
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.inventory import SILENCE
-from kouxing.shared.records import Record
 
 
 class Phone(Record, frozen=True, kw_only=True):
@@ -32,12 +32,12 @@ class Phone(Record, frozen=True, kw_only=True):
 
     @property
     def is_spoken(self) -> bool:
-        """Whether the phone counts, as ``kouxing_client.Phone.is_spoken``."""
+        """Whether the phone is final and audible, as in ``kouxing_client.Phone.is_spoken``."""
         return self.final and self.duration_s > 0.0 and self.symbol != SILENCE
 
 
 class LipPositions(Record, frozen=True, kw_only=True):
-    """The mouth as predicted from the audio."""
+    """The mouth at one time, predicted from the audio."""
 
     time_s: float  # seconds from the session's first sample
     delay_s: float  # audio was known up to time_s + delay_s; negative: a forecast
@@ -47,14 +47,14 @@ class LipPositions(Record, frozen=True, kw_only=True):
 
 
 class SpeechChange(Record, frozen=True, kw_only=True):
-    """Voice activity started or ended."""
+    """Start or end of voice activity."""
 
     active: bool
     time_s: float  # seconds from the session's first sample
 
 
 class Progress(Record, frozen=True, kw_only=True):
-    """Audio is processed up to ``time_s``; no later phone ends before that."""
+    """Audio is processed up to ``time_s``. No later phone ends before this time."""
 
     time_s: float
     level_db: float  # RMS of the newest 20 ms, full scale = 0
@@ -79,7 +79,7 @@ class EndOfSound(Record, frozen=True, kw_only=True):
 
 
 class Waveform(Record, frozen=True, kw_only=True):
-    """A stretch of the session's audio as the recognizer processes it."""
+    """A piece of the session's audio, as the recognizer processes it."""
 
     time_s: float  # time of the first sample
     samples: NDArray[np.float32]  # (n,) 16 kHz mono

@@ -1,12 +1,12 @@
-"""The time up to which a session's phones are final, from which another recognizer may continue."""
+"""Tracks the time up to which phones are final, where another recognizer can continue."""
 
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 
-QUIET_S = 0.5  # the start of speech is reported sooner after its first phone's onset than this
+QUIET_S = 0.5  # speech is reported within this time after the onset of its first phone
 
 
-class FinalTime:
-    """Follows a session's events; no later phone starts before ``time_s``."""
+class FinalTimeTracker:
+    """Tracks a session's events. No later phone starts before ``time_s``."""
 
     def __init__(self) -> None:
         # End of the last final phone, or last speech change; during silence, it follows the audio

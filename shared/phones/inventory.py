@@ -1,4 +1,4 @@
-"""The phones of a language, loaded from the language's package.
+"""Loads the phones of a language from the language's package.
 
 A language is a package of tables (``table_language``), if it has ``language.toml``. Its phones are
 phones of the universal inventory.
@@ -44,7 +44,7 @@ from typing import Any
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.table_language import SETTINGS, TableLanguage, load_table_language
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 TABLE_LANGUAGES = (
     "cantonese dutch english french german hindi indonesian italian japanese korean polish"

@@ -1,4 +1,4 @@
-"""Splits Japanese into words with their readings, by MeCab, which runs as a separate process.
+"""Splits Japanese into words with their readings, with MeCab as a separate process.
 
 wetext converts numbers to Chinese characters first.
 """

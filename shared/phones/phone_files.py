@@ -1,4 +1,4 @@
-"""Timed phones as text: a readable table, CSV, JSON, and TextGrid for Praat.
+"""Formats timed phones as a readable table, CSV, JSON, or TextGrid for Praat.
 
 The TextGrid layout is Praat's long text format (Boersma and Weenink, Praat manual, "TextGrid file
 formats"). Intervals cover the whole time without gaps, so pauses are intervals with empty text.
@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.transcript import TimedSyllable
-from kouxing.shared.records import replace
 
 _COLUMNS = ("index", "phone", "onset_s", "duration_s", "confidence")
 
@@ -43,7 +43,7 @@ def _cells(phone: Phone) -> tuple[int, str, float, float, float]:
     )
 
 
-def _table(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
+def _format_table(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
     lines = ["  onset_s  duration_s  phone  confidence"]
     for phone in phones:
         times = f"{phone.onset_s:9.3f}  {phone.duration_s:10.3f}"
@@ -51,7 +51,7 @@ def _table(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable])
     return "\n".join(lines) + "\n"
 
 
-def _csv(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
+def _format_csv(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)
@@ -59,7 +59,9 @@ def _csv(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -
     return text.getvalue()
 
 
-def _json(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]) -> str:
+def _format_json(
+    phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]
+) -> str:
     rows = [dict(zip(_COLUMNS, _cells(phone), strict=True)) for phone in phones]
     content: dict[str, object] = {"total_s": round(total_s, 4), "phones": rows}
     if syllables:
@@ -78,7 +80,9 @@ def _json(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyll
 _Interval: TypeAlias = tuple[float, float, str]  # start and end in seconds, text
 
 
-def _textgrid(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]) -> str:
+def _format_textgrid(
+    phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]
+) -> str:
     tiers = {"phones": [(p.onset_s, p.onset_s + p.duration_s, p.symbol) for p in phones]}
     if syllables:
         ends_s = [syllable.onset_s + syllable.duration_s for syllable in syllables]
@@ -100,11 +104,11 @@ def _textgrid(phones: Sequence[Phone], total_s: float, syllables: Sequence[Timed
         "item []:",
     ]
     for number, (name, intervals) in enumerate(tiers.items(), start=1):
-        lines += _tier(number, name, _without_gaps(intervals, total_s), total_s)
+        lines += _format_tier(number, name, _fill_gaps(intervals, total_s), total_s)
     return "\n".join(lines) + "\n"
 
 
-def _tier(number: int, name: str, intervals: list[_Interval], total_s: float) -> list[str]:
+def _format_tier(number: int, name: str, intervals: list[_Interval], total_s: float) -> list[str]:
     lines = [
         f"    item [{number}]:",
         '        class = "IntervalTier"',
@@ -124,8 +128,8 @@ def _tier(number: int, name: str, intervals: list[_Interval], total_s: float) ->
     return lines
 
 
-def _without_gaps(given: Sequence[_Interval], total_s: float) -> list[_Interval]:
-    """Return intervals that cover the whole time: empty intervals fill gaps, overlaps are cut."""
+def _fill_gaps(given: Sequence[_Interval], total_s: float) -> list[_Interval]:
+    """Fill gaps with empty intervals and cut overlaps, so that intervals cover the whole time."""
     intervals: list[_Interval] = []
     now_s = 0.0
     for number, (onset_s, offset_s, text) in enumerate(given):
@@ -146,8 +150,8 @@ def _without_gaps(given: Sequence[_Interval], total_s: float) -> list[_Interval]
 
 
 _STYLES: dict[str, Callable[[Sequence[Phone], float, Sequence[TimedSyllable]], str]] = {
-    "table": _table,
-    "csv": _csv,
-    "json": _json,
-    "textgrid": _textgrid,
+    "table": _format_table,
+    "csv": _format_csv,
+    "json": _format_json,
+    "textgrid": _format_textgrid,
 }

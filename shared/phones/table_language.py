@@ -37,12 +37,12 @@ from kouxing.shared.phones.espeak import transcribe_phrases
 from kouxing.shared.phones.mecab import has_mecab, read_numbers, split_words
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 from kouxing.shared.phones.universal.segments import (
-    ipa_of,
     nearest_phone,
     read_ipa,
     remove_language_flags,
+    symbol_to_ipa,
 )
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 SETTINGS = "language.toml"
 _SIGNS = "%&@#§€$£¥°+="  # espeak-ng speaks them as words
@@ -96,9 +96,9 @@ class TableLanguage:
         english = dict(zip(chain(*latin), transcribe_phrases(latin, _ENGLISH), strict=True))
         for phrase, sounds in zip(phrases, transcribe_phrases(spoken, self.voice), strict=True):
             for (word, sound), ipa in zip(phrase, sounds, strict=True):
-                phones = self._phones_of(*english.get(sound, [ipa]))
+                phones = self._ipa_to_phones(*english.get(sound, [ipa]))
                 if phones:
-                    words.append(SpokenSyllable(word, "".join(map(ipa_of, phones)), phones))
+                    words.append(SpokenSyllable(word, "".join(map(symbol_to_ipa, phones)), phones))
                 else:
                     dropped.append(word)
         return Transcript(tuple(words), tuple(dropped))
@@ -115,7 +115,7 @@ class TableLanguage:
         if _LATIN not in self.scripts:
             plain = _LATIN_EDGE.sub(" ", plain)
         tokens = list(self._tokens.finditer(plain))
-        numbers = iter(self._say_numbers([token for token in tokens if token["number"]]))
+        numbers = iter(self._spell_numbers([token for token in tokens if token["number"]]))
         readings = iter(self._split([token["word"] for token in tokens if self._is_split(token)]))
         for token in tokens:
             word = token[0]
@@ -141,19 +141,19 @@ class TableLanguage:
         endings = [unit for unit, spoken in self.units.items() if unit.isascii() and unit == spoken]
         units = {*self.units, *_UNITS} - {*endings}
         return re.compile(
-            rf"(?P<short>{_any_of([*self.short])})"
+            rf"(?P<short>{_match_any([*self.short])})"
             rf"|(?P<number>(?P<sign>(?<![A-Za-z0-9])-)?(?P<currency>[€$£¥])?(?P<digits>{_DIGITS})"
-            rf"(?P<unit>{_any_of(endings)}| ?{_any_of([*units])})?)|{_WORD}"
+            rf"(?P<unit>{_match_any(endings)}| ?{_match_any([*units])})?)|{_WORD}"
         )
 
-    def _say_numbers(self, tokens: Sequence[re.Match[str]]) -> list[str]:
+    def _spell_numbers(self, tokens: Sequence[re.Match[str]]) -> list[str]:
         """Return each number as text for espeak-ng."""
-        numbers = [*map(self._say_number, tokens)]
+        numbers = [*map(self._spell_number, tokens)]
         return (
             read_numbers(numbers) if numbers and self.words == _MECAB and has_mecab() else numbers
         )
 
-    def _say_number(self, token: re.Match[str]) -> str:
+    def _spell_number(self, token: re.Match[str]) -> str:
         """Return a number with its sign and unit in words: $5 is 5 dollars."""
         unit = (token["unit"] or "").strip()
         spoken = self.units.get(unit, unit)
@@ -174,7 +174,7 @@ class TableLanguage:
         return [[(piece, piece) for piece in some] for some in pieces]
 
     def _is_split(self, token: re.Match[str]) -> bool:
-        """Return whether a token is part of a phrase; other readable words are whole phrases."""
+        """Return whether a token is part of a phrase. Other readable words are whole phrases."""
         word = token["word"]
         return bool(word) and self._is_readable(word) and not _CAMEL_CASE.search(word)
 
@@ -188,7 +188,7 @@ class TableLanguage:
     def _has_letter(self, letter: str) -> bool:
         return unicodedata.name(letter, "").startswith(self.scripts)
 
-    def _phones_of(self, ipa: str) -> tuple[str, ...]:
+    def _ipa_to_phones(self, ipa: str) -> tuple[str, ...]:
         """Return a word in the language's phones; empty if it has unknown symbols."""
         ipa = remove_language_flags(ipa)
         for pattern, replacement in self.rules:
@@ -197,7 +197,7 @@ class TableLanguage:
         return () if unknown else tuple(nearest_phone(phone, self.phones) for phone in phones)
 
 
-def _any_of(forms: Sequence[str]) -> str:
+def _match_any(forms: Sequence[str]) -> str:
     """Return a pattern that finds any of the forms, except inside Latin words and numbers."""
     either = "|".join(map(re.escape, sorted(forms, key=len, reverse=True))) or "(?!)"
     after = r"(?<![A-Za-z](?=[A-Za-z]))(?<![0-9/.](?=[0-9]))"

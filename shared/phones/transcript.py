@@ -1,8 +1,8 @@
-"""A text as it is spoken: syllables with their spelling, and the parts that cannot be read."""
+"""The spoken form of a text: syllables with their spelling, and the parts that cannot be read."""
 
 from dataclasses import dataclass
 
-from kouxing.shared.records import Record
+from kouxing.shared.fast_record import Record
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,14 +36,14 @@ _DECODERS = {kind: msgspec.msgpack.Decoder(cls) for kind, cls in MESSAGES.items(
 _VERSION_DECODER = msgspec.msgpack.Decoder(_VersionOnly)
 
 
-def topic(kind: type[Message], session: str) -> bytes:
+def make_topic(kind: type[Message], session: str) -> bytes:
     """Return the topic of a message; it ends in a slash, so no topic is a prefix of another."""
     return f"{kind.kind}/{session}/".encode()
 
 
 def encode(message: Message) -> list[bytes]:
     """Return the two parts of a message."""
-    return [topic(type(message), message.session), _ENCODER.encode(message)]
+    return [make_topic(type(message), message.session), _ENCODER.encode(message)]
 
 
 def encoded_size(structure: object) -> int:
@@ -66,7 +66,7 @@ def decode(parts: Sequence[bytes]) -> Message:
         raise BadMessage("topic", "the topic is not '<kind>/<session>/'") from None
     decoder = _DECODERS.get(kind)
     if decoder is None or rest:
-        _check_version(kind, _version_of(body))
+        _check_version(kind, _read_version(body))
         raise BadMessage(
             "kind",
             f"unknown message kind {kind[:32]!r}; {DOCUMENT} lists the kinds of version {VERSION}",
@@ -74,7 +74,7 @@ def decode(parts: Sequence[bytes]) -> Message:
     try:
         message: Message = decoder.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        _check_version(kind, _version_of(body))
+        _check_version(kind, _read_version(body))
         raise BadMessage("body", f"{kind}: {error}") from None
     _check_version(kind, message.version)
     if message.session != session:
@@ -92,7 +92,7 @@ def _check_version(kind: str, version: int) -> None:
         )
 
 
-def _version_of(body: bytes) -> int:
+def _read_version(body: bytes) -> int:
     try:
         return _VERSION_DECODER.decode(body).version
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):

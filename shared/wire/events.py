@@ -1,4 +1,4 @@
-"""Converts a recognizer's events to messages, and back."""
+"""Converts a recognizer's events to messages and back."""
 
 from collections.abc import Sequence
 from operator import attrgetter
@@ -46,7 +46,7 @@ def split_batch(results: Results) -> list[SpeechMessage]:
     return sorted(messages, key=attrgetter("sequence"))
 
 
-def message_of(event: events.SoundEvent) -> SpeechMessage:
+def event_to_message(event: events.SoundEvent) -> SpeechMessage:
     """Return the message of an event; the sender sets session, epoch and sequence."""
     match event:
         case events.Phone():
@@ -85,8 +85,8 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
             return Progress(media_time=to_samples(event.time_s), state=AudioState.ENDED)
 
 
-def phone_of(message: Phone) -> events.Phone:
-    """Return the phone that a message carries."""
+def message_to_phone(message: Phone) -> events.Phone:
+    """Return the phone in a message."""
     return events.Phone(
         index=message.index,
         symbol=message.symbol,
@@ -97,12 +97,12 @@ def phone_of(message: Phone) -> events.Phone:
     )
 
 
-def event_of(message: SpeechMessage) -> events.SoundEvent:
-    """Return the event that a message carries."""
+def message_to_event(message: SpeechMessage) -> events.SoundEvent:
+    """Return the event in a message."""
     time_s = to_seconds(message.media_time)
     match message:
         case Phone():
-            return phone_of(message)
+            return message_to_phone(message)
         case LipPositions():
             return events.LipPositions(
                 time_s=time_s,

@@ -14,7 +14,7 @@ from kouxing.shared.face.expressions import (
     MIN_EXPRESSIVENESS,
 )
 from kouxing.shared.face.shape_names import MAX_SHAPES
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.message import (
     FapMask,
     FapValues,

@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar
 from msgspec import Meta, Struct
 
 from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.names import NAME_OR_EMPTY
+from kouxing.shared.name_rules import NAME_OR_EMPTY
 
 VERSION = 3
 DOCUMENT = "proto/PROTOCOL.md"

@@ -11,7 +11,7 @@ PAGE = ROOT / "services" / "gateway" / "page"
 PAGE_TEXTS = PAGE / "gateway-texts.js"
 SOURCES = (
     *("shared/audio_file.py", "shared/media_file.py", "shared/sound_formats.py"),
-    *("shared/channels.py", "shared/wav_parts.py", "services/gateway/sound_upload.py"),
+    *("shared/phase_cancellation.py", "shared/wav_parts.py", "services/gateway/sound_upload.py"),
     *("services/gateway/upload_handler.py", "services/gateway/mouth_learner.py"),
     *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),
     *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),

@@ -8,7 +8,7 @@ from kouxing_client import Client, Session
 
 from kouxing.services.cli.main import main
 from kouxing.shared.bus import Bus
-from kouxing.shared.keys import user_key
+from kouxing.shared.keys import load_user_key
 from tests.system import DEMO, System, samples_of_file, wait_until
 
 
@@ -41,7 +41,7 @@ def client(system: System) -> Iterator[Client]:
 @pytest.fixture
 def bus() -> Iterator[Bus]:
     """Sockets with the client's key, for messages that no client sends."""
-    with Bus(user_key()) as client_bus:
+    with Bus(load_user_key()) as client_bus:
         yield client_bus
 
 

@@ -25,7 +25,7 @@ from kouxing.shared.phones import events
 from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire import speech
-from kouxing.shared.wire.events import message_of
+from kouxing.shared.wire.events import event_to_message
 from tests.e2e.conftest import CommandRunner
 from tests.e2e.streaming import Stream, stream
 from tests.lips import LIPS
@@ -105,7 +105,7 @@ def test_services_send_the_frames_of_the_chain(
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
     assert sent.faps[:, MOUTH].any()
     assert lip_frames_of(sent) == [
-        message_of(event) for event in chain.events if isinstance(event, LipPositions)
+        event_to_message(event) for event in chain.events if isinstance(event, LipPositions)
     ]
     assert sent.lips
     recognized_phones = [event for event in chain.events if isinstance(event, events.Phone)]

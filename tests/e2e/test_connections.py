@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from kouxing.shared import connections, peer_quota, tarpit
+from kouxing.shared import connection_limits, peer_quota, tarpit
 from kouxing.shared.bus import Bus
-from kouxing.shared.connections import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
-from kouxing.shared.sockets import MAX_DROPPED, Poller, Received, Socket
+from kouxing.shared.connection_limits import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
+from kouxing.shared.sockets import MAX_DROPPED, Poller, ReceivedMessage, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.face import FapFrame
@@ -33,10 +33,10 @@ def port_of(bound: Socket) -> int:
 
 
 def receive_until(
-    bus: Bus, bound: Socket, is_enough: Callable[[list[Received]], bool]
-) -> list[Received]:
+    bus: Bus, bound: Socket, is_enough: Callable[[list[ReceivedMessage]], bool]
+) -> list[ReceivedMessage]:
     """Receive as a service's loop does, until it is enough."""
-    received: list[Received] = []
+    received: list[ReceivedMessage] = []
     poller = Poller()
     poller.add(bound)
 
@@ -88,7 +88,7 @@ def test_fast_senders_wait_while_nothing_is_received(
 def test_a_message_may_arrive_in_pieces(bus: Bus) -> None:
     audio = bus.bind_router(LOCAL, "audio")
     data = wire_bytes(chunk(1))
-    handled: list[Received] = []
+    handled: list[ReceivedMessage] = []
     with connect_raw(port_of(audio)) as slow:
         other = bus.connect_dealer(audio.endpoint)
         for begin in range(0, len(data), len(data) // 4):
@@ -127,7 +127,7 @@ def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:
 def test_disconnects_a_peer_with_too_many_subscriptions(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "PENALTY_S", 0.0)
+    monkeypatch.setattr(connection_limits, "PENALTY_S", 0.0)
     faps = bus.bind_publisher(LOCAL, "faps")
     honest = bus.connect_subscriber(faps.endpoint)
     honest.subscribe(FapFrame, "s")
@@ -147,7 +147,7 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
 
 def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peer_quota, "MAX_CONNECTIONS", 4)
-    monkeypatch.setattr(connections, "NEW_CHECKS", 10**6)
+    monkeypatch.setattr(connection_limits, "NEW_CHECKS", 10**6)
     monkeypatch.setattr(tarpit, "HOLD_S", 600.0)
     with contextlib.ExitStack() as stack:
         with Bus() as bus:
@@ -181,7 +181,7 @@ def has_ended(connection: socket.socket) -> bool:
 def test_a_message_of_very_many_parts_is_dropped_step_by_step(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "CHECK_INTERVAL_S", 600.0)  # the limiter acts too late
+    monkeypatch.setattr(connection_limits, "CHECK_INTERVAL_S", 600.0)  # the limiter acts too late
     bound = bus.bind_router(LOCAL, "bound")
     with connect_raw(port_of(bound)) as hostile:
         num_parts = 20 * MAX_DROPPED

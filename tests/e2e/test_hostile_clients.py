@@ -14,8 +14,8 @@ from kouxing.evaluation.system.attacks import MemoryUsage
 from kouxing.services.control.service_registry import MAX_SERVICES_PER_KEY
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
+from kouxing.shared.keys import add_key, key_folder, load_key, load_user_key, revoke_key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, SessionInput
@@ -86,7 +86,7 @@ def test_only_a_services_own_messages_become_events(
     system: System, client: Client, witness: Session
 ) -> None:
     events = witness.events()
-    with Bus(user_key()) as bus:
+    with Bus(load_user_key()) as bus:
         stranger = bus.connect_dealer(system.control)
         # until the subscription is in effect
         wait_until(lambda: events.get(0.05) is not None, step=witness.flush)
@@ -125,7 +125,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
         assert not output.has_ended, "a false end"
         assert max(frame.media_time for frame in frames) <= 16000
         assert not stranger.wait(0.1), "it gets no sequence number"
-    with Bus(user_key()) as bus:
+    with Bus(load_user_key()) as bus:
         assert bus.probe(endpoint) is ProbeResult.REFUSED, "a client does not even get in"
 
 

@@ -19,7 +19,7 @@ from kouxing_client import Client
 from kouxing_client.keys import Key
 
 from kouxing.evaluation.system.attackers import connect
-from kouxing.shared.keys import load_key, user_key
+from kouxing.shared.keys import load_key, load_user_key
 from tests.documents import code_blocks
 from tests.e2e.streaming import Stream
 from tests.system import (
@@ -43,7 +43,7 @@ class IndependentProgram:
         new_socket = self.context.socket(kind)
         new_socket.setsockopt(zmq.LINGER, 1000)
         new_socket.setsockopt(zmq.RCVTIMEO, 60000)
-        connect(new_socket, endpoint, key or user_key())
+        connect(new_socket, endpoint, key or load_user_key())
         return new_socket
 
     def close(self) -> None:

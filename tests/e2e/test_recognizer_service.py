@@ -15,8 +15,8 @@ from kouxing.services.recognizer.live_batch_decoder import MAX_BATCH_S
 from kouxing.services.recognizer.service import MAX_UNPACED_S, RecognizerService
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
-from kouxing.shared.records import replace
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace

@@ -26,7 +26,7 @@ from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.page_heads import page_heads_folder
 from tests.glb_writer import write_glb
 from tests.meshes import ORIGINAL, meshes

@@ -19,7 +19,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.config import variable
+from kouxing.shared.config import variable_name
 from tests.e2e.streaming import Stream, stream
 from tests.system import LIMIT_S, VOWELS_FILE, System, samples_of_file, wait_until
 
@@ -28,7 +28,7 @@ FACE = SynthesizerConfig(
 )
 SETTINGS = {
     **{
-        variable("synthesizer", key): str(getattr(FACE, key))
+        variable_name("synthesizer", key): str(getattr(FACE, key))
         for key in ("lips", "delay_ms", "frame_rate_hz", "idle_motion")
     },
     "KOUXING_CONTROL_MAX_LOAD": "0.1",  # less than one session needs

@@ -23,7 +23,7 @@ from kouxing_client import (
     find_key,
 )
 
-from kouxing.shared.keys import user_key
+from kouxing.shared.keys import load_user_key
 from kouxing.shared.wire import face, speech
 from kouxing.shared.wire.control import Event
 from kouxing.shared.wire.face import SetFace
@@ -61,7 +61,7 @@ END = face.EndOfFaps(session="s", epoch=1, sequence=9)
 def test_the_client_finds_the_key_that_commands_use(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key = user_key()
+    key = load_user_key()
     assert find_key() == type(find_key())(key.public, key.secret, key.control)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     with pytest.raises(KouxingError, match="kouxing keys add"):

@@ -10,8 +10,8 @@ import pytest
 import zmq
 
 from kouxing.shared.bus import Bus
-from kouxing.shared.keys import add_key, read_key, revoke_key, user_key
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
+from kouxing.shared.keys import add_key, load_user_key, read_key, revoke_key
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionInput
 from kouxing.shared.wire.face import FaceSettings, SetFace
@@ -28,7 +28,7 @@ def harness(request: pytest.FixtureRequest, new_keys: None) -> Iterator[ControlH
 
 
 def test_a_repeated_request_gets_the_same_answer(harness: ControlHarness) -> None:
-    client = harness.connect_client(harness.control.key and user_key())
+    client = harness.connect_client(harness.control.key and load_user_key())
     first = harness.open(client, "mine")
     assert isinstance(first, SessionOpened)
     assert harness.open(client, "mine") == first
@@ -39,7 +39,7 @@ def test_sessions_end_when_their_key_is_revoked(harness: ControlHarness, tmp_pat
     add_key("laptop", ["client"], tmp_path / "laptop.key")
     laptop = harness.connect_client(read_key(tmp_path / "laptop.key"))
     assert isinstance(harness.open(laptop, "revoked"), SessionOpened)
-    with Bus(user_key()) as bus:
+    with Bus(load_user_key()) as bus:
         client = bus.connect_dealer(harness.control.endpoints["commands"])
         client.send(OpenSession(request="2", session="kept"))
         harness.step_until(lambda: client.wait(0.0))
@@ -49,7 +49,7 @@ def test_sessions_end_when_their_key_is_revoked(harness: ControlHarness, tmp_pat
 
 
 def test_a_service_can_refuse_a_session(harness: ControlHarness) -> None:
-    client = harness.connect_client(harness.control.key and user_key())
+    client = harness.connect_client(harness.control.key and load_user_key())
     harness.refusal = Error(code="busy", text="too many videos", retry_after_s=5.0)
     refused = harness.open(client, "mine")
     assert isinstance(refused, Error)
@@ -118,7 +118,7 @@ def disconnect_before_the_answer(
 ) -> tuple[zmq.Socket[bytes], str]:
     """Return a client that misses the answer to its request, and the token in that answer."""
     address = f"tcp://127.0.0.1:{proxy.listener.getsockname()[1]}"
-    client = harness.connect_client(harness.control.key and user_key(), address)
+    client = harness.connect_client(harness.control.key and load_user_key(), address)
     client.send_multipart(encode(OpenSession(request="1", session="mine")))
     harness.step_until(lambda: harness.control._sessions.get("mine"))
     proxy.is_open.clear()
@@ -157,7 +157,7 @@ def test_a_session_with_audio_is_not_opened_again(
 
 
 def test_a_connection_with_a_stolen_routing_id_gets_no_old_answer(harness: ControlHarness) -> None:
-    key = harness.control.key and user_key()
+    key = harness.control.key and load_user_key()
     assert isinstance(harness.open(harness.connect_client(key), "mine"), SessionOpened)
     stolen = harness.open(harness.connect_client(key), "mine")
     assert getattr(stolen, "code", "") == "session-exists"
@@ -165,7 +165,7 @@ def test_a_connection_with_a_stolen_routing_id_gets_no_old_answer(harness: Contr
 
 @pytest.mark.parametrize("harness", [True], indirect=True)
 def test_a_face_learns_when_the_session_that_it_listens_to_speaks(harness: ControlHarness) -> None:
-    client = harness.connect_client(harness.control.key and user_key())
+    client = harness.connect_client(harness.control.key and load_user_key())
     harness.open(client, "speaker")
     harness.open(client, "listener", "2")
     client.send_multipart(

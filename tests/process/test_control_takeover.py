@@ -3,7 +3,7 @@
 import pytest
 
 from kouxing.services.control import restart_recovery, session_lifecycle
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings

@@ -10,8 +10,8 @@ from tests.system import LIMIT_S, ROOT, VOWELS_FILE, start_python
 
 PRESS = """
 import signal
-from kouxing.shared.interrupt import catch_interrupt, install_interrupt
-install_interrupt()
+from kouxing.shared.interrupt import catch_interrupt, install_interrupt_handler
+install_interrupt_handler()
 """
 DROPPED = """
 try:
@@ -81,7 +81,7 @@ for name in ("encoder", "universal", "blocks", "lips", "gmm", "ferguson", "visem
     importlib.import_module(f"kouxing.training.{name}.recipe")
 import kouxing.evaluation.commands, kouxing.evaluation.recognizer.error_rates
 import kouxing.services.cli.main
-from kouxing.shared.interrupt import install_interrupt
+from kouxing.shared.interrupt import install_interrupt_handler
 
 def interrupt(event, arguments):
     is_input = event == "open" and "/data/" in str(arguments[0])
@@ -95,7 +95,7 @@ results = {}
 for line in sys.argv[1:]:
     sys.argv[1:] = line.split()
     if not (child := os.fork()):
-        install_interrupt()
+        install_interrupt_handler()
         try:
             kouxing.services.cli.main.main()
         finally:

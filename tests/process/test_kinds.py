@@ -15,7 +15,7 @@ from kouxing.services.service_kinds import (
     kind_of,
     read_settings,
 )
-from kouxing.shared.errors import UserError, naming_option
+from kouxing.shared.errors import UserError, rename_key_in_errors
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "*"])
@@ -42,7 +42,7 @@ def test_reports_a_port_that_needs_privileges(monkeypatch: pytest.MonkeyPatch) -
     chosen = read_settings(assignments={"gateway.port": "80"})
     with (
         pytest.raises(UserError, match="--port: port 80 needs privileges"),
-        naming_option("--port", "gateway.port", is_given=True),
+        rename_key_in_errors("--port", "gateway.port", is_given=True),
     ):
         available_port_environment(chosen)
 

@@ -14,7 +14,7 @@ from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.config import variable
+from kouxing.shared.config import variable_name
 from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.prometheus import MAX_REQUESTS, MetricsServer
@@ -84,7 +84,7 @@ SUFFIXES = ("_total", "_bucket", "_count", "_sum")
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    settings = {variable(name, "metrics"): f"127.0.0.1:{free_port()}" for name in CHAIN}
+    settings = {variable_name(name, "metrics"): f"127.0.0.1:{free_port()}" for name in CHAIN}
     with System(CHAIN, tmp_path_factory.mktemp("system"), settings) as running:
         yield running
 
@@ -93,7 +93,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 def families(system: System) -> dict[str, list[Metric]]:
     """Metrics of each service while a session is open."""
     ports = [
-        int(system.environment[variable(name, "metrics")].rpartition(":")[2]) for name in CHAIN
+        int(system.environment[variable_name(name, "metrics")].rpartition(":")[2]) for name in CHAIN
     ]
     with Client(system.control) as client:
         samples, rate_hz = read_audio(VOWELS_FILE)

@@ -15,7 +15,7 @@ INTERRUPTED = """
 import os, signal, sys
 from kouxing.corpora import parallel
 from kouxing.services.cli import main
-from kouxing.shared.interrupt import install_interrupt
+from kouxing.shared.interrupt import install_interrupt_handler
 os.setsid()
 parallel._MIN_CORES = 1
 send, to = (os.killpg, os.getpgrp()) if sys.argv[1] == "all" else (os.kill, os.getpid())
@@ -26,7 +26,7 @@ def work(item):
     while item > 5:
         signal.pause()
 
-install_interrupt()
+install_interrupt_handler()
 main._run_command = lambda: list(parallel.process_in_order(work, range(100)))
 main.main()
 """

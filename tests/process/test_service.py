@@ -12,8 +12,8 @@ from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer, key_folder, revoke_key
-from kouxing.shared.records import replace
 from kouxing.shared.service import (
     EXIT_AFTER_S,
     HEARTBEAT_S,
@@ -96,7 +96,7 @@ def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: Slow
     slow.step(60.0)
     assert 20.0 < waits[-1] <= 30.0
     assert slow.num_ticks == 1, "nothing is due"
-    slow._ticked_s, slow.tick_due_s = 0.0, time.monotonic() + 20.0
+    slow._last_tick_s, slow.tick_due_s = 0.0, time.monotonic() + 20.0
     slow.waker.wake()
     slow.step(60.0)
     slow.step(60.0)

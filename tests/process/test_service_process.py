@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.shared.config import variable
+from kouxing.shared.config import variable_name
 from tests.system import (
     LIMIT_S,
     ROOT,
@@ -29,7 +29,7 @@ def run_to_end(*arguments: str, **environment: str) -> tuple[int, str]:
 
 def test_ctrl_c_during_startup_prints_no_traceback() -> None:
     addresses = own_addresses(["recognizer"])
-    port = int(addresses[variable("recognizer", "audio")].rpartition(":")[2])
+    port = int(addresses[variable_name("recognizer", "audio")].rpartition(":")[2])
     process = start_python(*SERVICE, "recognizer", **addresses)
     wait_until(lambda: can_connect(port))  # bound, but no model is loaded yet
     process.send_signal(signal.SIGINT)
@@ -58,7 +58,7 @@ def test_reports_a_port_in_use(service: str, key: str) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         value = str(port) if key.endswith("port") else f"tcp://127.0.0.1:{port}"
-        environment = {**own_addresses([service]), variable(service, key): value}
+        environment = {**own_addresses([service]), variable_name(service, key): value}
         status, log = run_to_end(*SERVICE, service, **environment)
     assert status == 2
     assert key in log

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.sound_devices import monitor, sound_devices
+from kouxing.shared.sound_devices import list_sound_devices, open_monitor
 
 SOURCES = [
     {"name": "mic0", "description": "A microphone", "properties": {"device.class": "sound"}},
@@ -35,21 +35,21 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_rejects_an_unknown_name_and_lists_the_devices(server: Path) -> None:
-    listed = [(device.kind, device.name) for device in sound_devices() if device.kind != "mic"]
+    listed = [(device.kind, device.name) for device in list_sound_devices() if device.kind != "mic"]
     assert listed == [("monitor", "HDMI"), ("program", "Firefox")]
     error = "no device is named 'vlc'; this machine has 'HDMI', 'Firefox'"
     with pytest.raises(UserError, match=error):
-        monitor("vlc")
+        open_monitor("vlc")
 
 
 def test_reports_a_missing_sound_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     for name in ("", "firefox"):
         with pytest.raises(UserError, match=r"PulseAudio or PipeWire.*BlackHole"):
-            monitor(name)
+            open_monitor(name)
 
 
 def test_reports_why_it_cannot_record(server: Path) -> None:
     (server / "parec").write_text("#!/bin/sh\necho Connection refused >&2; exit 1\n")
     with pytest.raises(UserError, match="cannot record: Connection refused"):
-        next(monitor().blocks)
+        next(open_monitor().blocks)

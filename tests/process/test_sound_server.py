@@ -7,7 +7,7 @@ from collections.abc import Generator, Iterator
 import numpy as np
 import pytest
 
-from kouxing.shared.sound_devices import monitor, sound_devices
+from kouxing.shared.sound_devices import list_sound_devices, open_monitor
 from tests.sound_server import sound_server
 from tests.system import wait_until
 
@@ -34,7 +34,7 @@ def _server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def programs() -> list[str]:
-    return [device.name for device in sound_devices() if device.kind == "program"]
+    return [device.name for device in list_sound_devices() if device.kind == "program"]
 
 
 def num_recordings() -> int:
@@ -43,7 +43,7 @@ def num_recordings() -> int:
 
 @pytest.mark.parametrize("name", ["", "player"])
 def test_a_recording_continues_until_the_reader_stops(name: str) -> None:
-    blocks = monitor(name).blocks
+    blocks = open_monitor(name).blocks
     assert num_recordings() == 0
     num_tones = 0
     for block in itertools.islice(blocks, MAX_BLOCKS):
@@ -58,7 +58,7 @@ def test_a_recording_continues_until_the_reader_stops(name: str) -> None:
 
 
 def test_lists_outputs_and_programs() -> None:
-    assert [device.name for device in sound_devices() if device.kind == "monitor"] == [
+    assert [device.name for device in list_sound_devices() if device.kind == "monitor"] == [
         "Monitor of Loudspeaker"
     ]
     assert programs() == ["Player"]

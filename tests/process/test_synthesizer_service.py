@@ -9,8 +9,8 @@ import pytest
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED_EVENTS, SynthesizerService
 from kouxing.shared.clock import to_samples
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
-from kouxing.shared.records import replace
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.speech import AudioState, Progress

@@ -15,8 +15,8 @@ from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange, Waveform
-from kouxing.shared.records import replace
 from tests.live_streams import recognize_live
 from tests.system import DEMO
 

@@ -18,10 +18,10 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import SynthesizerService
-from kouxing.shared import connections, sockets
+from kouxing.shared import connection_limits, sockets
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.service import Service
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
@@ -101,7 +101,7 @@ ACTIONS = st.lists(
 def _no_penalties() -> Iterator[None]:
     """Let disconnected peers connect again at once: the honest peer has the same address."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (connections, sockets):
+        for module in (connection_limits, sockets):
             patch.setattr(module, "PENALTY_S", 0.0)
             patch.setattr(module, "LONG_PENALTY_S", 0.0)
         yield

@@ -15,8 +15,8 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import CLOSURE_FAPS, VISEME_INDEX
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
-from kouxing.shared.records import replace
 from tests import lips
 from tests.lips import INVENTORY, LIPS, advance, make_face
 

@@ -12,8 +12,8 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.records import replace
 from tests.lips import INVENTORY, phone
 
 PARAMETERS = initial_parameters()  # independent of training

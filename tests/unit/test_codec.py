@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply
 from kouxing.shared.wire.message import Message

@@ -218,7 +218,9 @@ def test_the_file_for_all_hosts_in_the_docs_is_valid(tmp_path: Path) -> None:
     (text,) = code_blocks(ROOT / "docs" / "hosts.md", "toml")
     given = settings(write(tmp_path, text))
     control = given.load(ControlConfig)
-    assert control.reachable(control.bound_control) == given.load(RecognizerConfig).control
+    assert (
+        control.advertised_endpoint(control.bound_control) == given.load(RecognizerConfig).control
+    )
 
 
 @pytest.mark.parametrize(
@@ -231,17 +233,17 @@ def test_the_file_for_all_hosts_in_the_docs_is_valid(tmp_path: Path) -> None:
     ],
 )
 def test_other_hosts_receive_the_advertised_address(
-    advertise: str, bound: str, reachable: str
+    advertise: str, bound: str, advertised_endpoint: str
 ) -> None:
-    assert SynthesizerConfig(advertise=advertise).reachable(bound) == reachable
+    assert SynthesizerConfig(advertise=advertise).advertised_endpoint(bound) == advertised_endpoint
 
 
 @pytest.mark.parametrize("host", ["face.example", "10.0.0.1"])
 def test_control_binds_the_address_by_which_others_find_it(host: str) -> None:
     config = settings(environment={"KOUXING_CONTROL": f"tcp://{host}:5550"}).load(ControlConfig)
     assert config.bound_control == f"tcp://{host if host[0] == '1' else ANYWHERE}:5550"
-    assert config.reachable(config.bound_control) == f"tcp://{host}:5550"
-    assert config.reachable(f"tcp://{ANYWHERE}:5551") == f"tcp://{host}:5551"
+    assert config.advertised_endpoint(config.bound_control) == f"tcp://{host}:5550"
+    assert config.advertised_endpoint(f"tcp://{ANYWHERE}:5551") == f"tcp://{host}:5551"
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"

@@ -1,4 +1,4 @@
-"""Decisions about connections, without sockets: who is disconnected, and who never."""
+"""Decisions about connection_limits, without sockets: who is disconnected, and who never."""
 
 from types import SimpleNamespace
 from typing import cast
@@ -6,19 +6,19 @@ from unittest import mock
 
 import pytest
 
-from kouxing.shared import connections, kernel_sockets, peer_quota
-from kouxing.shared.budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, Budget
+from kouxing.shared import connection_limits, kernel_sockets, peer_quota
 from kouxing.shared.bus import AUDIO
-from kouxing.shared.connections import (
+from kouxing.shared.connection_limits import (
     MAX_QUEUED,
     NEW_CHECKS,
     NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
     TRIMS_S,
-    Connection,
     ConnectionLimiter,
+    PeerConnection,
 )
 from kouxing.shared.kernel_sockets import Traffic
+from kouxing.shared.peer_budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, PeerBudget
 from kouxing.shared.tarpit import GAP_S, HOLD_S
 
 
@@ -31,12 +31,14 @@ class SocketHarness:
         self.traffic: dict[int, Traffic] = {}
         self.ended: set[int] = set()
         self.held: dict[int, mock.Mock] = {}
-        patch.setattr(kernel_sockets, "inode_of", lambda d: None if d in self.ended else d)
+        patch.setattr(kernel_sockets, "get_inode", lambda d: None if d in self.ended else d)
         patch.setattr(kernel_sockets, "reset", lambda d, _inode: self.ended.add(d))
         patch.setattr(kernel_sockets, "hold", self.hold)
         patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 5560)
-        patch.setattr(kernel_sockets, "address_of", lambda d: self.addresses.get(d, "loopback"))
-        patch.setattr(kernel_sockets, "traffic_of", lambda d: self.traffic.get(d, Traffic()))
+        patch.setattr(
+            kernel_sockets, "get_peer_address", lambda d: self.addresses.get(d, "loopback")
+        )
+        patch.setattr(kernel_sockets, "get_traffic", lambda d: self.traffic.get(d, Traffic()))
         patch.setattr(peer_quota, "MAX_CONNECTIONS", 10)
         patch.setattr("threading.Thread.start", lambda _thread: None)
         self.limiter = ConnectionLimiter(is_service=lambda key: key == "service")
@@ -52,8 +54,8 @@ class SocketHarness:
         self.held[descriptor] = mock.Mock()
         return self.held[descriptor]
 
-    def deliver(self, descriptor: int, key: str = "") -> Connection:
-        return cast(Connection, self.socket.deliver(descriptor, key))
+    def deliver(self, descriptor: int, key: str = "") -> PeerConnection:
+        return cast(PeerConnection, self.socket.count_delivery(descriptor, key))
 
 
 @pytest.fixture
@@ -63,7 +65,7 @@ def harness(monkeypatch: pytest.MonkeyPatch) -> SocketHarness:
 
 def test_a_budget_recovers_and_a_blocked_one_recovers_later() -> None:
     now_s = 100.0
-    budget = Budget(clock=lambda: now_s)
+    budget = PeerBudget(clock=lambda: now_s)
     budget.spend(BUDGET + BUDGET_PER_S)
     now_s += 2.0
     assert budget.left == BUDGET_PER_S
@@ -104,7 +106,7 @@ def test_does_not_wake_the_loop_for_an_incomplete_message(harness: SocketHarness
 
 
 def test_sheds_the_owner_with_the_most_undelivered_bytes(harness: SocketHarness) -> None:
-    harness.patch.setattr(connections, "MAX_UNDELIVERED", 700_000)
+    harness.patch.setattr(connection_limits, "MAX_UNDELIVERED", 700_000)
     many = [harness.deliver(number, "many") for number in (1, 2, 3)]
     single = harness.deliver(4, "single")
     harness.enforce_limits(0.0)
@@ -116,7 +118,7 @@ def test_sheds_the_owner_with_the_most_undelivered_bytes(harness: SocketHarness)
 
 
 def test_peers_that_read_too_little_are_disconnected(harness: SocketHarness) -> None:
-    harness.patch.setattr(connections, "MAX_UNREAD", 3 * MAX_QUEUED)
+    harness.patch.setattr(connection_limits, "MAX_UNREAD", 3 * MAX_QUEUED)
     silent = [harness.deliver(number, "silent") for number in range(1, 5)]
     other = harness.deliver(5, "other")
     harness.enforce_limits(0.0)
@@ -220,7 +222,7 @@ def test_memory_is_freed_after_many_peers_left(
     harness: SocketHarness, number: int, trims: int
 ) -> None:
     trim = mock.Mock()
-    harness.patch.setattr(connections, "trim_heap", trim)
+    harness.patch.setattr(connection_limits, "trim_heap", trim)
     for descriptor in range(number):
         harness.deliver(descriptor, f"key {descriptor}")
         harness.ended.add(descriptor)
@@ -244,12 +246,12 @@ def test_blocks_a_disconnected_owner_but_keeps_its_other_connections(
 
 def test_a_reused_descriptor_is_another_connection(harness: SocketHarness) -> None:
     before = harness.deliver(1)
-    harness.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 77)
+    harness.patch.setattr(kernel_sockets, "get_inode", lambda _descriptor: 77)
     assert not harness.limiter.is_open(1)
     assert harness.deliver(1) is not before
     harness.patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 80)
-    harness.patch.setattr(kernel_sockets, "inode_of", lambda _descriptor: 78)
-    assert harness.socket.deliver(1, "") is None  # another socket of this process
+    harness.patch.setattr(kernel_sockets, "get_inode", lambda _descriptor: 78)
+    assert harness.socket.count_delivery(1, "") is None  # another socket of this process
 
 
 @pytest.mark.parametrize(
@@ -267,4 +269,4 @@ def test_a_reused_descriptor_is_another_connection(harness: SocketHarness) -> No
     ],
 )
 def test_the_addresses_of_one_host_count_as_one(first: str, second: str, is_one: bool) -> None:
-    assert (kernel_sockets.network_of(first) == kernel_sockets.network_of(second)) == is_one
+    assert (kernel_sockets.get_network(first) == kernel_sockets.get_network(second)) == is_one

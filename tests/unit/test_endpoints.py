@@ -36,6 +36,6 @@ def test_advertises_the_address_on_the_way_to_control(
     monkeypatch: pytest.MonkeyPatch, control: str, bound: str, advertised: str
 ) -> None:
     monkeypatch.setattr(socket, "socket", Probe)
-    assert SynthesizerConfig(control=control).reachable(bound) == advertised
+    assert SynthesizerConfig(control=control).advertised_endpoint(bound) == advertised
     monkeypatch.setattr(Probe, "routes", {})
     assert local_address("10.77.0.1") == "127.0.0.1", "a host without network reaches itself"

@@ -8,7 +8,7 @@ from scipy.signal import find_peaks
 from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.face.idle_motion import IdleMotion, State
+from kouxing.shared.face.idle_motion import ConversationState, IdleMotion
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, Progress, SpeechChange
 from tests.lips import DELAY_S, LIPS, advance, make_face, phone
 
@@ -150,7 +150,7 @@ def test_idle_motion_has_natural_statistics() -> None:
     motion, minutes, rate_hz = IdleMotion(7), 10, 50
     faps = np.zeros((minutes * 60 * rate_hz, 68), dtype=np.float32)
     for k, row in enumerate(faps):
-        motion.apply(row, k / rate_hz, State.SPEAKING)
+        motion.apply(row, k / rate_hz, ConversationState.SPEAKING)
     closed = faps[:, 18] > 500.0
     assert 12 < np.count_nonzero(closed[1:] & ~closed[:-1]) / minutes < 24  # blinks per minute
     np.testing.assert_array_equal(faps[:, 18], faps[:, 19])

@@ -25,9 +25,9 @@ from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.records import replace
 from kouxing.training.ferguson.recipe import fit_openings, measure_travel, relative_openings
 from tests.lips import clip_of, phone, utterance
 from tests.live_streams import LiveStream

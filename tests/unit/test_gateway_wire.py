@@ -21,7 +21,7 @@ from kouxing.services.gateway.viewer_queue import (
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
-from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings

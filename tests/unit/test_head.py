@@ -7,7 +7,7 @@ import pytest
 
 from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.high_level import expression_faps, viseme_faps
+from kouxing.shared.face.high_level_faps import expression_faps, viseme_faps
 from tests import heads
 from tests.heads import neutral_faps
 

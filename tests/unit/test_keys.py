@@ -18,12 +18,12 @@ from kouxing.shared.keys import (
     check_keys,
     key_folder,
     load_key,
-    may_follow,
+    load_user_key,
+    may_subscribe,
     read_grants,
     rejection_hint,
     revoke_key,
     save_grants,
-    user_key,
 )
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import AllowedKey, HeartbeatReply
@@ -43,7 +43,7 @@ def test_creates_private_keys_on_first_use() -> None:
 
 
 def test_concurrent_processes_create_one_key() -> None:
-    program = "from kouxing.shared.keys import user_key; print(user_key())"
+    program = "from kouxing.shared.keys import load_user_key; print(load_user_key())"
     started = [
         subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(4)
     ]
@@ -53,29 +53,29 @@ def test_concurrent_processes_create_one_key() -> None:
 
 @pytest.mark.parametrize("name", ["", "client.key", "allowed"])
 def test_rejects_files_that_others_can_read_or_own(name: str) -> None:
-    user_key()
+    load_user_key()
     path = key_folder() / name
     path.chmod(0o750)
     with pytest.raises(UserError, match=f"other users can read {path}; run 'chmod [67]00 "):
-        (user_key(), read_grants())
+        (load_user_key(), read_grants())
     path.chmod(0o700)
     os.chown(path, os.geteuid() + 1, -1)
     with pytest.raises(UserError, match=f"{path} belongs to another user"):
-        (user_key(), read_grants())
+        (load_user_key(), read_grants())
 
 
 def test_names_an_invalid_key_file_and_an_unusable_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    user_key()
+    load_user_key()
     for text in ("", '{"public": 1, "secret": 2, "control": 3}', "é"):
         (key_folder() / "client.key").write_text(text, encoding="utf-8")
         with pytest.raises(UserError, match=r"client\.key"):
-            user_key()
+            load_user_key()
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     with pytest.raises(UserError, match="XDG_STATE_HOME"):
-        user_key()
+        load_user_key()
 
 
 def test_adds_and_revokes_a_key(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_an_added_key_works_on_another_machine(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
     key_folder().mkdir(parents=True, mode=0o700)
     given.rename(key_folder() / "client.key")
-    assert (user_key().public, user_key().control) == (public, control.public)
+    assert (load_user_key().public, load_user_key().control) == (public, control.public)
     with pytest.raises(UserError, match="kouxing keys add NAME --role service:lamp"):
         load_key("lamp", ("service:lamp",))
     save_grants({public: Grant("laptop", ("client",))})
@@ -250,4 +250,4 @@ def test_rejects_too_many_keys_but_revokes_them(
 def test_a_subscriber_follows_the_sessions_of_its_roles(
     roles: tuple[str, ...], topic: bytes, may: bool
 ) -> None:
-    assert may_follow(Grant("name", roles), topic) == may
+    assert may_subscribe(Grant("name", roles), topic) == may

@@ -11,8 +11,8 @@ from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.services.synthesizer.lips.learned.resting_lips import CLOSE_S, HOLD_S
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange
-from kouxing.shared.records import replace
 from tests import lips
 from tests.lips import LIPS
 

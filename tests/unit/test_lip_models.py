@@ -10,7 +10,7 @@ from kouxing.services.lip_models import _packages, lip_models
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LIP_MODEL_NAME
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL, LIP_MODEL_NAME
 
 PACKAGE = """
 from kouxing.services.lip_models import LipModelInfo

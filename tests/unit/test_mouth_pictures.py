@@ -12,7 +12,7 @@ from kouxing.services.driver.render.scene import camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes import visemes
 from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
-from kouxing.shared.face import high_level
+from kouxing.shared.face import high_level_faps
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from tests import heads
 from tests.lips import viseme_faps
@@ -101,7 +101,7 @@ def test_u_is_rounded_and_protruded(head: Head, name: str) -> None:
     assert (rounded - rest)[2:, 2].min() > 1.4
 
 
-@pytest.mark.parametrize("faps", [VISEME_FAPS["f"], high_level.viseme_faps(2, 0, 63)])
+@pytest.mark.parametrize("faps", [VISEME_FAPS["f"], high_level_faps.viseme_faps(2, 0, 63)])
 def test_lower_lip_meets_the_upper_teeth_in_f(head: Head, faps: NDArray[np.float32]) -> None:
     upper_lip, lower_lip, edge = place_mm(head, faps, "2.2", "2.3", "9.10")[:, 1]
     assert -0.5 < lower_lip - edge < 2.0  # it covers the cutting edge,

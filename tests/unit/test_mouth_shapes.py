@@ -14,7 +14,7 @@ from kouxing.services.cli.cues import write_cues
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.face.high_level import VISEMES as MPEG4_VISEMES
+from kouxing.shared.face.high_level_faps import VISEMES as MPEG4_VISEMES
 from kouxing.shared.face.mouth_shapes import Cue, mouth_cues, mouth_shape, oculus_cues
 from kouxing.shared.face.shapes import OCULUS
 from tests.system import VOWELS_FILE

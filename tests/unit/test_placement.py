@@ -4,8 +4,8 @@ import pytest
 
 from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.worker_load import MIN_SESSIONS, RETRY_AFTER_S, WorkerLoad
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
-from kouxing.shared.records import replace
 from kouxing.shared.wire.session import OpenSession
 from tests.unit.test_sessions import System, worker
 

@@ -18,8 +18,8 @@ from kouxing.services.recognizer.session import (
     AudioRejected,
     RecognizerSession,
 )
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions
-from kouxing.shared.records import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import FaceSettings

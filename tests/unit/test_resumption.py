@@ -20,7 +20,7 @@ from kouxing.shared.phones.events import (
     SpeechChange,
     Waveform,
 )
-from kouxing.shared.phones.final_time import QUIET_S, FinalTime
+from kouxing.shared.phones.final_time import QUIET_S, FinalTimeTracker
 from tests import lips
 from tests.live_streams import LiveStream
 from tests.system import DEMO, samples_of_file
@@ -63,7 +63,7 @@ def state_at_loss(
 ) -> tuple[list[StreamOutput], float, int]:
     """Return the results until a loss, the final time, and the first sample to replay."""
     before = list(chain.from_iterable(whole[: round(lost_s * 10)]))
-    final = FinalTime()
+    final = FinalTimeTracker()
     for output in before:
         if not isinstance(output, Waveform):
             final.update(output)
@@ -149,7 +149,7 @@ EVENTS_AND_FINAL_TIMES_S: list[tuple[SoundEvent, float]] = [
 
 
 def test_audio_is_droppable_once_no_recognizer_would_replay_it() -> None:
-    window, final = ReplayWindow(), FinalTime()
+    window, final = ReplayWindow(), FinalTimeTracker()
     for sequence in range(1, 5):
         window.add(sequence, to_samples(sequence))
     for event, final_s in EVENTS_AND_FINAL_TIMES_S:

@@ -11,7 +11,7 @@ import pytest
 from kouxing.services.cli.clients import control_address
 from kouxing.services.cli.running_system import announce, find_control, reserve, starting
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import user_key
+from kouxing.shared.keys import load_user_key
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +41,7 @@ def test_finds_the_newest_running_system_even_if_others_were_killed(
 def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:
     with announce("tcp://127.0.0.1:1"):
         assert control_address("") == "tcp://127.0.0.1:1"
-        key = user_key().control
+        key = load_user_key().control
         assert control_address("tcp://127.0.0.1:4") == f"tcp://127.0.0.1:4 {key}"
         monkeypatch.setenv("KOUXING_CONTROL", "tcp://127.0.0.1:5")
         assert control_address("") == f"tcp://127.0.0.1:5 {key}"

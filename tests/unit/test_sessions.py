@@ -12,8 +12,8 @@ from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
-from kouxing.shared.records import replace
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import OpenSession, SessionFacts

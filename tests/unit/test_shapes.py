@@ -6,7 +6,7 @@ from scipy.optimize import lsq_linear
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
-from kouxing.shared.face.high_level import EXPRESSIONS, VISEMES
+from kouxing.shared.face.high_level_faps import EXPRESSIONS, VISEMES
 from kouxing.shared.face.idle_motion import LOWER_LID, UPPER_LID
 from kouxing.shared.face.shape_names import TABLE, choose_set, find_shapes
 from kouxing.shared.face.shapes import ARKIT, OCULUS, SHAPE_SETS, VRM, ShapeSet

@@ -24,7 +24,7 @@ from kouxing.shared.phones.events import (
     SpeechChange,
     Waveform,
 )
-from kouxing.shared.wire.events import message_of
+from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.message import Message
 from tests.live_streams import LiveStream, recognize_live, recognize_together
 from tests.system import DEMO, VOWELS_FILE, samples_of_file
@@ -42,7 +42,7 @@ def of_kind(kind: type[E], outputs: Sequence[StreamOutput]) -> list[E]:
 
 def messages_of(outputs: Sequence[StreamOutput]) -> list[Message]:
     """Return messages, which can be compared; events with arrays cannot."""
-    return [message_of(output) for output in outputs if not isinstance(output, Waveform)]
+    return [event_to_message(output) for output in outputs if not isinstance(output, Waveform)]
 
 
 @pytest.mark.parametrize(("rate_hz", "size"), [(16_000, 97), (44_100, 1021)])

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.phones.known_text import characters_of
-from kouxing.shared.phones.syllables import MAX_PHONES, Syllable, SyllableTrack
+from kouxing.shared.phones.syllable_captions import MAX_PHONES, CaptionSyllable, SyllableCaptions
+from kouxing.shared.phones.text_captions import split_characters
 from tests import lips
 
 MANDARIN = load_inventory("mandarin")
@@ -18,7 +18,7 @@ def phone(index: int, symbol: str, *, final: bool = True, duration_s: float = 0.
 
 
 def test_shows_an_initial_at_once_and_adds_its_vowel() -> None:
-    track = SyllableTrack(MANDARIN)
+    track = SyllableCaptions(MANDARIN)
     (first,) = track.update(phone(0, "sh", final=False))
     assert (first.index, first.text, first.final) == (0, "sh", False)
     (second,) = track.update(phone(1, "iii", final=False))
@@ -31,7 +31,7 @@ def test_shows_an_initial_at_once_and_adds_its_vowel() -> None:
 
 
 def test_an_initial_is_final_once_no_vowel_can_follow() -> None:
-    track = SyllableTrack(MANDARIN)
+    track = SyllableCaptions(MANDARIN)
     assert not track.update(phone(0, "d"))[0].final
     (pause,) = track.update(phone(1, "sil", final=False))  # a revision may make it a vowel
     assert pause.text == "sil"
@@ -40,8 +40,8 @@ def test_an_initial_is_final_once_no_vowel_can_follow() -> None:
 
 
 def test_shows_characters_of_a_known_text_despite_wrong_phones() -> None:
-    text = characters_of("四是四，十是十。十四是十四，四十是四十！" * 4, MANDARIN)
-    track = SyllableTrack(MANDARIN, text)
+    text = split_characters("四是四，十是十。十四是十四，四十是四十！" * 4, MANDARIN)
+    track = SyllableCaptions(MANDARIN, text)
     texts: dict[int, str] = {}
     index = 0
     for number, (_, phones) in enumerate(text):
@@ -74,8 +74,8 @@ def test_shows_characters_of_a_known_text_despite_wrong_phones() -> None:
     text=st.sampled_from(["", "你好欢迎来到"]),
 )
 def test_shows_exactly_the_phones_that_are_not_withdrawn(phones: list[Phone], text: str) -> None:
-    track = SyllableTrack(MANDARIN, characters_of(text, MANDARIN))
-    shown: dict[int, Syllable] = {}
+    track = SyllableCaptions(MANDARIN, split_characters(text, MANDARIN))
+    shown: dict[int, CaptionSyllable] = {}
     current: set[int] = set()
     for change in phones:
         current.add(change.index)

@@ -141,7 +141,7 @@ def test_the_error_names_words_that_cannot_be_read() -> None:
 
 def test_a_phone_of_another_language_becomes_the_nearest() -> None:
     tables = load_table_language(BUILT_IN["spanish"])
-    assert tables._phones_of("(en)ðˈɪz") == ("dh", "i", "s")  # no z in Spanish
+    assert tables._ipa_to_phones("(en)ðˈɪz") == ("dh", "i", "s")  # no z in Spanish
 
 
 def test_reads_mixed_sentences() -> None:

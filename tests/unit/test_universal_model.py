@@ -14,7 +14,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.universal import save_universal
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.shared import records
+from kouxing.shared import fast_record
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
@@ -144,7 +144,9 @@ def test_the_shipped_model_keeps_the_state_after_the_kept_positions() -> None:
     stream = model.create_stream()
     stream.append_frames(FRAMES[:100])
     block = stream.block()
-    first, second = (model.runner.run([records.replace(block, num_kept=num)])[1] for num in (2, 4))
+    first, second = (
+        model.runner.run([fast_record.replace(block, num_kept=num)])[1] for num in (2, 4)
+    )
     assert not np.array_equal(first, second)
 
 

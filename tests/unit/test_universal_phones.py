@@ -11,7 +11,12 @@ from kouxing.corpora.universal_phones import labeled_phones, universal_words
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import check_visemes
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.phones.universal.segments import features, ipa_of, nearest_phone, read_ipa
+from kouxing.shared.phones.universal.segments import (
+    features,
+    nearest_phone,
+    read_ipa,
+    symbol_to_ipa,
+)
 from tests.languages import MANDARIN
 from tests.unit.test_block_model import HELLO
 
@@ -57,7 +62,7 @@ def test_names_unknown_symbols() -> None:
 
 def test_written_ipa_is_read_back() -> None:
     for phone in {*UNIVERSAL.phones} - {"sil"}:
-        assert read_ipa(ipa_of(phone)) == ((phone,), ())
+        assert read_ipa(symbol_to_ipa(phone)) == ((phone,), ())
     assert UNIVERSAL.spell(("h", "a", "uh", "s")) == "haʊs"
 
 

@@ -53,7 +53,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     VISEMES,
 )
-from kouxing.shared import records
+from kouxing.shared import fast_record
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
@@ -113,7 +113,7 @@ def _padded(timeline: Timeline) -> Timeline:
     """Add distant visemes, so that even a short clip has ``_NEAR`` of them."""
     far_s = np.full(max(_NEAR - len(timeline.viseme), 0), np.append(timeline.apex_end_s, 0.0).max())
     far_s += _FAR_S
-    return records.replace(
+    return fast_record.replace(
         timeline,
         viseme=np.append(timeline.viseme, np.full(len(far_s), VISEME_INDEX[REST])),
         apex_start_s=np.append(timeline.apex_start_s, far_s),

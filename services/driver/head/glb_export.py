@@ -50,7 +50,7 @@ from kouxing.services.driver.render.renderer import BACKGROUND
 from kouxing.services.driver.render.scene import camera
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
+from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
 from kouxing.shared.face.shapes import ARKIT
 
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
+from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
 from kouxing.shared.face.shapes import ARKIT, VRM
 
 Float32 = NDArray[np.float32]

@@ -14,7 +14,7 @@ from kouxing.services.driver.video.writer import write_picture
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation
-from kouxing.shared.face.high_level import expression_faps, viseme_faps
+from kouxing.shared.face.high_level_faps import expression_faps, viseme_faps
 
 # media time in seconds, and FAPs (68,); for faces side by side (num_faces, 68)
 Frame = tuple[float, NDArray[np.float32]]

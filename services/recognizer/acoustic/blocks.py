@@ -67,7 +67,7 @@ from kouxing.services.recognizer.acoustic.network import (
     run_onnx_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
-from kouxing.shared.records import Record
+from kouxing.shared.fast_record import Record
 
 FORMAT = "blocks 2"
 

@@ -10,8 +10,8 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import SoundEvent
-from kouxing.shared.records import Record
 
 
 class Articulation(Protocol):

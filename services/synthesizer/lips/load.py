@@ -4,7 +4,7 @@ from functools import lru_cache
 
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.synthesizer.lips.lip_model import LipModel
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
-from kouxing.shared.records import Record
+from kouxing.shared.fast_record import Record
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.lip_model import Articulation
-from kouxing.shared.records import Record
+from kouxing.shared.fast_record import Record
 
 
 class FrameContext(Record, frozen=True, kw_only=True):

@@ -23,7 +23,7 @@ from kouxing.services.synthesizer.modifiers.prosody import pop_until
 from kouxing.shared.face.expression_motion import EXPRESSION_FAPS
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.high_level import VISEME_NAMES, VISEMES
+from kouxing.shared.face.high_level_faps import VISEME_NAMES, VISEMES
 
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
 _BREATH_OPENING = 0.3  # fraction of an open vowel's opening

@@ -34,7 +34,13 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.services.synthesizer.modifiers.prosody import Prosody, ProsodyTracker
 from kouxing.shared.face.faps import RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.face.idle_motion import EYES_PITCH, EYES_YAW, IdleMotion, State, fap_slice
+from kouxing.shared.face.idle_motion import (
+    EYES_PITCH,
+    EYES_YAW,
+    ConversationState,
+    IdleMotion,
+    fap_slice,
+)
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _NOD_STRESS, _BROW_STRESS = 2.2, 2.8  # minimum prominence of syllables with these movements
@@ -141,14 +147,20 @@ class SpeechMotionModifier:
         if starts:
             self._turn.start(_TURN_DEG * self._side(now_s), now_s + _TURN_HOLD_S)
 
-    def _state(self, silence_s: float, now_s: float) -> State:
+    def _state(self, silence_s: float, now_s: float) -> ConversationState:
         if silence_s < _ENDING_S:
-            return State.STARTING if now_s - self._start_s < _STARTING_S else State.SPEAKING
+            return (
+                ConversationState.STARTING
+                if now_s - self._start_s < _STARTING_S
+                else ConversationState.SPEAKING
+            )
         if silence_s < _THINKING_S:
-            return State.ENDING
+            return ConversationState.ENDING
         if self._is_listening:
-            return State.ATTENDING
-        return State.THINKING if silence_s < _LISTENING_S else State.LISTENING
+            return ConversationState.ATTENDING
+        return (
+            ConversationState.THINKING if silence_s < _LISTENING_S else ConversationState.LISTENING
+        )
 
     def _side(self, now_s: float) -> float:
         """Return the direction of a movement, 1 or -1; it depends only on seed and time."""

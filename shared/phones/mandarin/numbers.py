@@ -1,7 +1,7 @@
 """Converts the numbers, dates, times and units of Chinese texts to words.
 
-wetext converts most of them. But it reads every pair that may be a month and a day as a date, and
-other pairs as subtractions. Such pairs are therefore rewritten first:
+wetext converts most of them. However, it reads every pair that may be a month and a day as a date,
+and other pairs as subtractions. Such pairs are therefore rewritten first:
 
 - 12-25 is a range, 25-12 and 比分12-25 are scores. Dates have a year or a zero: 2024-12-25, 02-05.
 - 12.25 is a decimal.
@@ -37,7 +37,7 @@ _RANGE = (
 )
 
 
-def unambiguous_numbers(text: str) -> str:
+def rewrite_ambiguous_numbers(text: str) -> str:
     """Rewrite the numbers that wetext 0.1 reads wrongly."""
     text = _PHONE_NUMBER.sub(_join_phone_number, text.translate(_HALF_WIDTH))
     text = re.sub(r"(?<=\d)\s+(?=\d)", "、", text)  # different numbers
@@ -46,7 +46,7 @@ def unambiguous_numbers(text: str) -> str:
     return text
 
 
-def numbers_as_words(text: str) -> str:
+def spell_numbers(text: str) -> str:
     """Convert numbers, dates, times and units to words: 3.5% -> 百分之三点五."""
     return "".join(map(_read_sentence, _SENTENCE.findall(text)))
 

@@ -24,7 +24,7 @@ from functools import lru_cache
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.mandarin.bopomofo import WORDS_IN_BOPOMOFO, read_bopomofo
-from kouxing.shared.phones.mandarin.numbers import numbers_as_words, unambiguous_numbers
+from kouxing.shared.phones.mandarin.numbers import rewrite_ambiguous_numbers, spell_numbers
 from kouxing.shared.phones.mandarin.particles import readings_in_context
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
@@ -114,7 +114,7 @@ def phones_of_syllable(syllable: str) -> tuple[str, ...]:
     >>> phones_of_syllable("yuán")
     ('van',)
     """
-    plain = _plain(syllable)
+    plain = _normalize_syllable(syllable)
     phones = _syllable_phones(plain)
     if phones is None and plain.endswith("r"):  # er-hua: hua + r
         stem = _syllable_phones(plain[:-1])
@@ -169,11 +169,11 @@ def write(spelling: str) -> str:
     >>> write("lv4"), write("gui4"), write("er5"), write("uei")
     ('lǜ', 'guì', 'er', 'ui')
     """
-    plain = _plain(spelling)
+    plain = _normalize_syllable(spelling)
     if plain in _SPELLED_AFTER:
         return _SPELLED_AFTER[plain]
     letters = plain.replace("v", "u" if plain[0] in "jqxy" else "ü")
-    tone = _with_tone_digit(spelling)[-1]
+    tone = _to_tone_digit(spelling)[-1]
     mark = next((mark for mark, number in _TONES.items() if str(number) == tone), None)
     if mark is None:
         return letters
@@ -190,12 +190,12 @@ def write(spelling: str) -> str:
 def transcribe(text: str) -> Transcript:
     """Convert a text to syllables: characters with numbers and dates, or pinyin and bopomofo.
 
-    Among characters, bopomofo and pinyin with tones are read too. They give the reading of the
-    characters before or after them if they sound alike, or are in brackets after them.
+    Among characters, bopomofo and pinyin with tones are also read. They are the reading of the
+    characters before or after them if they sound alike, or if they follow in brackets.
     Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
     dropped: letters among characters, and unknown pinyin syllables. Joined syllables without tones
-    (``nihao``) are split only if most letters are pinyin, because words of other languages may look
-    the same.
+    (``nihao``) are split only if most letters are pinyin, because words of other languages may
+    look the same.
 
     Examples
     --------
@@ -220,7 +220,7 @@ def transcribe(text: str) -> Transcript:
     if num_readable > sum(map(len, words)) / 2:
         spellings = without_tones
     syllables = tuple(
-        SpokenSyllable(spelling, _with_tone_digit(spelling), phones_of_syllable(spelling))
+        SpokenSyllable(spelling, _to_tone_digit(spelling), phones_of_syllable(spelling))
         for split in spellings
         for spelling in split
     )
@@ -238,8 +238,12 @@ def _split_word(word: str) -> list[str]:
     if _is_syllable(word):
         return [word]
     for end in range(min(len(word) - 1, _MAX_LETTERS), 0, -1):
-        has_tone = re.search(r"\d$", _with_tone_digit(word[:end]))
-        if has_tone and _plain(word[end:])[:1] not in "aoeê" and _is_syllable(word[:end]):
+        has_tone = re.search(r"\d$", _to_tone_digit(word[:end]))
+        if (
+            has_tone
+            and _normalize_syllable(word[end:])[:1] not in "aoeê"
+            and _is_syllable(word[:end])
+        ):
             rest = _split_word(word[end:])
             if rest:
                 return [word[:end], *rest]
@@ -247,13 +251,13 @@ def _split_word(word: str) -> list[str]:
 
 
 def _split_toneless(word: str) -> list[str]:
-    """Split a pinyin word without tones (``nihao``, ``tiananmen``). Empty if this is impossible.
+    """Split a pinyin word without tones (``nihao``, ``tiananmen``); empty if this is impossible.
 
     Prefers a split in which only the first syllable may start with a, o or e.
     """
-    if re.search(r"\d", _with_tone_digit(word)):  # a typing error
+    if re.search(r"\d", _to_tone_digit(word)):  # a typing error
         return []
-    word = _plain(word)
+    word = _normalize_syllable(word)
     for later_starts in ("", "aoeê"):
         splits: dict[int, list[str]] = {len(word): []}  # by start: splits of the rest of the word
         for place in range(min(len(word), _MAX_WORD_LETTERS) - 1, -1, -1):
@@ -278,7 +282,9 @@ def _syllables_of_characters() -> frozenset[str]:
     from pypinyin.constants import PINYIN_DICT  # noqa: PLC0415 (few callers need it)
 
     readings = {reading for line in PINYIN_DICT.values() for reading in line.split(",")}
-    return frozenset(plain for plain in map(_plain, readings) if re.search("[aeêiouv]", plain))
+    return frozenset(
+        plain for plain in map(_normalize_syllable, readings) if re.search("[aeêiouv]", plain)
+    )
 
 
 def _is_syllable(word: str) -> bool:
@@ -343,12 +349,12 @@ def _annotate(
 
 
 def _read_characters(text: str) -> Transcript:
-    text = unambiguous_numbers(text)
+    text = rewrite_ambiguous_numbers(text)
     without_spaces = _SPACE_BESIDE_CHARACTER.sub("", " ".join(text.split()))
-    characters = numbers_as_words(without_spaces)
+    characters = spell_numbers(without_spaces)
     syllables = tuple(
         SpokenSyllable(character, spelling.replace("v", "ü"), phones_of_syllable(spelling))
-        for character, spelling in zip(characters, _pinyin_of(characters), strict=True)
+        for character, spelling in zip(characters, _convert_to_pinyin(characters), strict=True)
         if spelling
     )
     readable = {syllable.text for syllable in syllables}
@@ -358,7 +364,7 @@ def _read_characters(text: str) -> Transcript:
     return Transcript(syllables, tuple(dropped.split()))
 
 
-def _pinyin_of(characters: str) -> list[str]:
+def _convert_to_pinyin(characters: str) -> list[str]:
     """Return the pinyin of each character of a text; "" for other characters."""
     from pypinyin import Style, lazy_pinyin  # noqa: PLC0415 (takes 0.3 s, and few callers read text)
 
@@ -380,13 +386,13 @@ def _simplify(characters: str) -> str:
     for pattern, replacement in _READ_AS:
         characters = pattern.sub(replacement, characters)
     return "".join(
-        letter if letter.encode("gb2312", "ignore") else _simplified(letter)
+        letter if letter.encode("gb2312", "ignore") else _simplify_character(letter)
         for letter in characters
     )
 
 
 @lru_cache(maxsize=8192)
-def _simplified(character: str) -> str:
+def _simplify_character(character: str) -> str:
     from wetext import Normalizer  # noqa: PLC0415 (takes 0.3 s)
 
     simplified: str = Normalizer(lang="zh", operator="tn", traditional_to_simple=True).normalize(
@@ -396,11 +402,11 @@ def _simplified(character: str) -> str:
 
 
 def _is_spoken(letter: str) -> bool:
-    """Whether a character is neither punctuation, a separator, a mark nor a control character."""
+    """Return whether a character is not punctuation, a separator, a mark or a control character."""
     return unicodedata.category(letter)[0] not in "PZCM" and letter not in "~～"
 
 
-def _with_tone_digit(syllable: str) -> str:
+def _to_tone_digit(syllable: str) -> str:
     """Write a tone mark as a digit: pǎo -> pao3."""
     decomposed = unicodedata.normalize("NFD", syllable).translate(_LETTERS)
     digits = [str(_TONES[mark]) for mark in decomposed if mark in _TONES]
@@ -408,7 +414,7 @@ def _with_tone_digit(syllable: str) -> str:
     return unicodedata.normalize("NFC", letters) + "".join(digits[:1])
 
 
-def _plain(syllable: str) -> str:
+def _normalize_syllable(syllable: str) -> str:
     """Return a syllable in lower case, with v for ü, without its tone."""
     decomposed = unicodedata.normalize("NFD", syllable.strip().lower()).translate(_LETTERS)
     toneless = "".join(mark for mark in decomposed if mark not in _TONES)
@@ -424,11 +430,11 @@ def _syllable_phones(plain: str) -> tuple[str, ...] | None:
     initial = next((phone for phone in _INITIALS_BY_LENGTH if plain.startswith(phone)), None)
     if initial is None:
         return None
-    final = _final_of(initial, plain.removeprefix(initial))
+    final = _parse_final(initial, plain.removeprefix(initial))
     return (initial, final) if final else None
 
 
-def _final_of(initial: str, spelling: str) -> str | None:
+def _parse_final(initial: str, spelling: str) -> str | None:
     if spelling == "i" and initial in ("z", "c", "s"):
         return "ii"
     if spelling == "i" and initial in ("zh", "ch", "sh", "r"):

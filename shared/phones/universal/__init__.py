@@ -16,7 +16,7 @@ is left out, except for ɲ and ʎ. Texts may mix languages (``mixed_text``).
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.transcript import Transcript
-from kouxing.shared.phones.universal.segments import ipa_of, read_ipa
+from kouxing.shared.phones.universal.segments import read_ipa, symbol_to_ipa
 
 __all__ = ["pronounce", "read_ipa", "spell", "transcribe", "write"]
 
@@ -40,9 +40,9 @@ def transcribe(text: str) -> Transcript:
 
 def spell(phones: tuple[str, ...]) -> str:
     """Return the phones in IPA."""
-    return "".join(map(ipa_of, phones))
+    return "".join(map(symbol_to_ipa, phones))
 
 
 def write(spelling: str) -> str:
     """Return the IPA letter of a phone; a spelling stays as it is."""
-    return ipa_of(spelling)
+    return symbol_to_ipa(spelling)

@@ -1,6 +1,6 @@
-"""Texts of several languages: Mandarin with English words, as people speak.
+"""Reads texts that mix languages, such as Mandarin with English words.
 
-Each script is read in one language. For other languages, the user must choose one.
+        Each script is read in one language. For other languages, the user must choose a language.
 Numbers and their units are read in the language of the words before them. In a text with kana,
 Chinese characters are Japanese.
 """
@@ -30,7 +30,7 @@ def read_mixed_text(text: str) -> Transcript:
     """
     syllables: list[SpokenSyllable] = []
     dropped: list[str] = []
-    for language, part in _parts_of(unicodedata.normalize("NFKC", text)):
+    for language, part in _split_languages(unicodedata.normalize("NFKC", text)):
         inventory = load_inventory(language)
         transcript = inventory.read(part)
         dropped += transcript.dropped
@@ -43,7 +43,7 @@ def read_mixed_text(text: str) -> Transcript:
     return Transcript(tuple(syllables), tuple(dropped))
 
 
-def _parts_of(text: str) -> list[tuple[str, str]]:
+def _split_languages(text: str) -> list[tuple[str, str]]:
     """Split a text where its language changes. Returns the language and the text of each part."""
     parts: list[tuple[str, str]] = []
     scripts = [unicodedata.name(c, "").split(" ")[0] if c.isalpha() else "" for c in text]

@@ -1,10 +1,10 @@
-"""The segments of the universal inventory: IPA, features, and the phones of texts in IPA."""
+"""The segments of the universal inventory: IPA, features, and the parser of texts in IPA."""
 
 import re
 import unicodedata
 from functools import cache
 
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 _TIE = "\u0361"
 _OTHER_TIES = str.maketrans("\u035c\u200d", _TIE * 2)
@@ -45,7 +45,7 @@ def remove_language_flags(ipa: str) -> str:
     return _FLAG.sub("", ipa)
 
 
-def ipa_of(symbol: str) -> str:
+def symbol_to_ipa(symbol: str) -> str:
     """Return the IPA letter of a phone; other text stays as it is."""
     row = _rows().get(symbol)
     return row["ipa"] if row and row["ipa"] else symbol
@@ -81,7 +81,7 @@ def _spellings() -> dict[str, tuple[str, ...]]:
 
 @cache
 def nearest_phone(phone: str, phones: tuple[str, ...]) -> str:
-    """Return the listed phone that shares most features with a phone; itself if it is listed."""
+    """Return the phone in ``phones`` that shares most features with a phone."""
     if phone in phones:
         return phone
     known, own = features(), features()[phone]

@@ -22,7 +22,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 from kouxing.services.synthesizer.lips.trajectory import FapState
-from kouxing.shared.records import Record
+from kouxing.shared.fast_record import Record
 
 _STEP_S = 1e-3  # step of the numerical derivative
 

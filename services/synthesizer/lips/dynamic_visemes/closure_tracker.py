@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
-from kouxing.shared.records import replace
+from kouxing.shared.fast_record import replace
 
 _MAX_LATE_S = 0.1  # closures recognized later than this after their apex are not shown
 _CATCH_UP_S = 0.04  # time from the last frame to a postponed apex

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 Array = NDArray[np.float64]
 _OPENING = (3, 4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)  # jaw and lip heights

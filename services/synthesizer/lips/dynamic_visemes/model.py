@@ -46,9 +46,9 @@ from kouxing.services.synthesizer.lips.trajectory import (
     stationary_state,
 )
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
+from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.records import Record
 
 _REST_S = 0.3  # duration of the return to rest without sound
 _TRANSITION_S = 0.04  # duration of the change to a new target trajectory

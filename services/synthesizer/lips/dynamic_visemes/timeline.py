@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, visemes_of
+from kouxing.shared.fast_record import Record, replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.records import Record, replace
 
 EXPECTED = -1
 MAX_HOLD_S = 1.5  # limit for extending a phone beyond its estimated end if nothing follows

@@ -15,7 +15,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.derived_visemes import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, VisemeFractions
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 REST = "rest"
 TRAINED_VISEMES = (

@@ -45,9 +45,9 @@ from kouxing.services.synthesizer.lips.trajectory import (
     stationary_state,
 )
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.records import replace
 
 Array = NDArray[np.float64]
 

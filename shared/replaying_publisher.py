@@ -1,4 +1,4 @@
-"""Publishes a session's results, and repeats the first results for subscribers that join late.
+"""Publishes a session's results, and repeats the first results for late subscribers.
 
 When a session opens or moves, its subscribers need time to connect to the new worker. Results that
 are published in the meantime are repeated for each of them. Subscribers ignore repeated messages.
@@ -9,12 +9,12 @@ from collections import deque
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.message import Message
 
-REPLAY_S = 10.0  # from the start of a session; connecting is slow on a busy machine
+REPLAY_S = 10.0  # time after the start of a session; connecting is slow on a busy machine
 MAX_REPLAYED = 2000  # messages
 
 
-class Replay:
-    """The publisher of one session at one worker, which starts to serve it at ``now_s``."""
+class ReplayingPublisher:
+    """Publishes one session of a worker that starts to serve it at ``now_s``."""
 
     def __init__(self, publisher: Socket, now_s: float) -> None:
         self._publisher = publisher
@@ -30,7 +30,7 @@ class Replay:
             self._messages.clear()
 
     def repeat(self, now_s: float) -> None:
-        """Publish the messages again for a subscriber that has joined."""
+        """Publish the first messages again for a new subscriber."""
         if now_s < self._end_s:
             for message in self._messages:
                 self._publisher.send(message)

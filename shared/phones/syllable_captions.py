@@ -1,4 +1,4 @@
-"""Captions of live speech: combines phones and their revisions to syllables."""
+"""Captions of live speech: combines phones and their revisions into syllables."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.phones.known_text import Characters, match_syllables
+from kouxing.shared.phones.text_captions import Characters, match_syllables
 
 # phones, index of the character, first phone of the next syllable
 _Source: TypeAlias = tuple[list[Phone], int | None, list[Phone]]
@@ -16,8 +16,8 @@ MAX_PHONES = 40  # phones that may still be revised; older ones are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Syllable:
-    """One syllable, or a pause. As with phones, the same ``index`` again is a revision."""
+class CaptionSyllable:
+    """One syllable or pause. As with phones, another one with the same ``index`` is a revision."""
 
     index: int  # index of its first phone
     text: str  # "shi", or the character; the inventory's silence for a pause
@@ -26,10 +26,10 @@ class Syllable:
     final: bool
 
 
-class SyllableTrack:
-    """Combines phones to syllables: first the initial only, then with its vowel.
+class SyllableCaptions:
+    """Combines phones into syllables: first only the initial, then the initial with its vowel.
 
-    Syllables that match the spoken text, if it is known, are shown as its characters.
+    If the text is known, matching syllables are shown as its characters.
     """
 
     def __init__(self, inventory: PhoneInventory, characters: Characters = ()) -> None:
@@ -38,7 +38,7 @@ class SyllableTrack:
         self._num_dropped = 0  # characters before the first kept phone
         self._phones: dict[int, Phone] = {}
         # by index, with their phones
-        self._syllables: dict[int, tuple[_Source, Syllable]] = {}
+        self._syllables: dict[int, tuple[_Source, CaptionSyllable]] = {}
 
     def reset(self) -> None:
         """Drop all phones when a session restarts."""
@@ -46,7 +46,7 @@ class SyllableTrack:
         self._syllables.clear()
         self._num_dropped = 0
 
-    def update(self, phone: Phone) -> list[Syllable]:
+    def update(self, phone: Phone) -> list[CaptionSyllable]:
         """Add or revise a phone; return the syllables that change."""
         if phone.is_withdrawn:
             self._phones.pop(phone.index, None)
@@ -90,14 +90,16 @@ class SyllableTrack:
         places = (None if syllable == silence else next(indices) for syllable in symbols)
         return [None if place is None else place + self._num_dropped for place in places]
 
-    def _syllable(self, phones: list[Phone], place: int | None, following: list[Phone]) -> Syllable:
+    def _syllable(
+        self, phones: list[Phone], place: int | None, following: list[Phone]
+    ) -> CaptionSyllable:
         first, last = phones[0], phones[-1]
         # The vowel of an initial may still follow.
         is_complete = last.symbol not in self.inventory.initials or any(
             phone.final for phone in following
         )
         spelling = self.inventory.spell(tuple(phone.symbol for phone in phones))
-        return Syllable(
+        return CaptionSyllable(
             index=first.index,
             text=spelling if place is None else self._characters[place][0],
             onset_s=first.onset_s,

@@ -1,4 +1,4 @@
-"""Captions of a known text: which of its syllables has been spoken so far.
+"""Matches recognized syllables with a known text, for its captions.
 
 The recognized syllables contain errors, so they are aligned with the text by edit distance. Common
 phones lower the cost, syllables may be missing or inserted, and the text may continue.
@@ -25,7 +25,7 @@ def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) ->
             costs[i].append(min(both, GAP + costs[i - 1][j + 1], GAP + costs[i][j]))
     indices: list[int | None] = [None] * len(recognized)
     i = len(recognized)
-    j = min(range(len(text) + 1), key=costs[i].__getitem__)  # the rest is not spoken yet
+    j = min(range(len(text) + 1), key=costs[i].__getitem__)  # the remaining text is not spoken yet
     while i and j:
         if costs[i][j] == costs[i - 1][j - 1] + _syllable_distance(recognized[i - 1], text[j - 1]):
             i, j = i - 1, j - 1
@@ -42,7 +42,7 @@ def _syllable_distance(one: Syllable, other: Syllable) -> float:
     return 1.0 - len({*one} & {*other}) / max(len(one), len(other))
 
 
-def characters_of(text: str, inventory: PhoneInventory) -> Characters:
+def split_characters(text: str, inventory: PhoneInventory) -> Characters:
     """Return the spoken characters of a text, each with its phones.
 
     Raises ``UserError`` if the text cannot be read, or does not have one character per syllable.

@@ -1,4 +1,4 @@
-"""Waits until data arrives at connections that libzmq owns."""
+"""Waits for data on file descriptors that libzmq owns."""
 
 import contextlib
 import select
@@ -9,8 +9,8 @@ from kouxing.shared.waker import Waker
 _REPORTS_ARRIVALS = sys.platform == "linux"  # elsewhere, every wait returns immediately
 
 
-class Arrivals:
-    """Ends a wait when data arrives at one of the added descriptors.
+class DescriptorWaiter:
+    """Waits until data arrives at one of the added descriptors.
 
     Only new data ends a wait, whether or not libzmq has read it. The kernel removes closed
     descriptors.

@@ -1,4 +1,4 @@
-"""One or two channels of sound from any number, without losing a voice."""
+"""Mixes any number of audio channels to one or two, without losing a voice."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,11 @@ _LOST_FRACTION_OF_AVERAGE = 0.1  # the average of nine channels has 1/81 of one 
 _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 
 
-class CancellationGuard:
+class PhaseCancellationGuard:
     """Replaces the mix with the loudest channel while this channel is too weak in the mix.
 
-    There are three causes. A microphone cable inverts one of two channels. The mix of a film leaves
-    out a channel. Only one of nine channels contains a voice. Other mixes are returned unchanged.
+    This has three causes. A microphone cable inverts one of two channels. The mix of a film omits
+    a channel. Only one of nine channels contains a voice. Other mixes are returned unchanged.
     ``name`` is the name of the sound in the warning that is added to ``warnings``.
     """
 

@@ -1,4 +1,4 @@
-"""FAP 1 (viseme) and FAP 2 (expression) as sums of low-level FAPs.
+"""Converts FAP 1 (viseme) and FAP 2 (expression) to low-level FAPs.
 
 ISO/IEC 14496-2, annex C: FAP 1 blends two of 14 visemes, FAP 2 two of six expressions. The
 standard describes them only in words. The values in ``high_level.tsv`` are from Crystal TTVS
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.tables import read_table
+from kouxing.shared.tsv_tables import read_table
 
 Float32 = NDArray[np.float32]
 

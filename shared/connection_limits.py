@@ -1,13 +1,13 @@
-"""Limits on the connections to the sockets that a process binds.
+"""Limits the connections to the bound sockets of a process.
 
 libzmq limits the size of a message part and the length of a queue. It does not limit the number
 of connections, the number of parts of a message, or the rate of a peer. It keeps all parts of a
-message until the last one arrives. So a thread checks every connection within 50 ms after data
-arrives, and at least once a second. It compares the bytes that the kernel received (Linux only)
-with the delivered messages. Until it is clear which bytes belong to an incomplete message, it
-checks 20 times a second. It disconnects a peer that exceeds a limit. libzmq then frees the peer's
-memory. A well-behaved client is never disconnected, at any speed: its queue fills up, libzmq stops
-reading, and the client waits.
+message until the last part arrives. Therefore, a thread checks every connection within 50 ms after
+data arrives, and at least once a second. It compares the bytes that the kernel received (Linux
+only) with the delivered messages. Until it is clear which bytes belong to an incomplete message,
+it checks 20 times a second. It disconnects a peer that exceeds a limit, so that libzmq frees the
+peer's memory. A well-behaved client is never disconnected, at any speed: its queue fills up,
+libzmq stops reading, and the client waits.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from functools import partial
 import zmq
 
 from kouxing.shared import kernel_sockets
-from kouxing.shared.arrivals import Arrivals
-from kouxing.shared.budget import BUDGET, MIN_BUDGET, Budget
+from kouxing.shared.descriptor_waiter import DescriptorWaiter
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
+from kouxing.shared.peer_budget import BUDGET, MIN_BUDGET, PeerBudget
 from kouxing.shared.peer_quota import PeerQuota
 from kouxing.shared.tarpit import MAX_HELD, Tarpit
 from kouxing.shared.waker import Waker
@@ -42,8 +42,8 @@ RECEIVE_BUFFER = 256 * KIB  # in the kernel, which doubles it
 MAX_UNDELIVERED = 24 * MIB  # limit for all connections together
 MAX_INCOMPLETE = MIB  # limit for all connections together: 16 audio messages on slow links
 SMALL_INCOMPLETE = 4 * KIB  # additional limit for each connection
-MAX_UNREAD = 200_000  # messages that wait for all peers; about 100 bytes of memory each
-MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops more
+MAX_UNREAD = 200_000  # messages queued for all peers; about 100 bytes of memory each
+MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops later ones
 STALLED_S = 1.0  # a live subscriber that reads nothing for this time is disconnected
 NEW_CHECKS = 20  # checks in which a connection is new; a flood is disconnected earlier
 MAX_ENDED = 1024  # ended connections that a service has not handled yet
@@ -51,8 +51,8 @@ MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # all connections together; libzmq takes up to 120 times as much memory
 PENALTY_S = 1.0  # a disconnected peer cannot connect again for this time
-LONG_PENALTY_S = 3.0  # after behavior that no well-behaved peer shows
-TRIMS_S = (0.2, 1.0, 3.0)  # after a disconnect: libzmq frees memory a little later
+LONG_PENALTY_S = 3.0  # after behavior that only hostile peers show
+TRIMS_S = (0.2, 1.0, 3.0)  # delays after a disconnect, because libzmq frees memory later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
 _READABLE = int(zmq.POLLIN)
@@ -61,15 +61,15 @@ _WARNINGS = RateLimit()
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class SocketLimits:
     """Limits of a bound socket."""
 
     part_bytes: int
     """size of the largest message part"""
     queue_length: int
-    """messages of one connection that wait for delivery; its peer then waits"""
+    """messages of one connection that wait for delivery; above this, its peer waits"""
     num_answers: int = MAX_QUEUED
-    """messages that wait for one peer; more are dropped"""
+    """messages queued for one peer; later messages are dropped"""
     cost: float = 0.0
     """part of the sender's budget that each message uses"""
 
@@ -84,26 +84,26 @@ class Limits:
         return self.part_bytes + 16 * KIB
 
 
-class Connection:
+class PeerConnection:
     """One connection to a bound socket."""
 
     def __init__(self, descriptor: int, inode: int, socket: LimitedSocket) -> None:
         self.descriptor = descriptor
         self.inode = inode  # identifies the connection; the kernel reuses descriptors
         self.socket = socket
-        self.address = kernel_sockets.address_of(descriptor)
+        self.address = kernel_sockets.get_peer_address(descriptor)
         self.key = ""  # the peer's key; known when its first message is delivered
-        self.budget = Budget()
+        self.budget = PeerBudget()
         self.num_delivered = 0  # messages
         self.num_checks = 0
         self.topics: set[bytes] = set()
         self.is_disconnected = False
         self.undelivered = 0  # bytes since the last delivered message
         self.incomplete = 0  # minimum number of these bytes that belong to an incomplete message
-        self.unread = 0  # messages that may wait for the peer, at most
+        self.unread = 0  # maximum number of messages that may wait for the peer
         self._delivered_before = 0
         self._read_before = 0  # bytes, when num_delivered last changed
-        self._mark = (0, 0)  # undelivered bytes and number of polls at an earlier look
+        self._mark = (0, 0)  # undelivered bytes and number of polls at an earlier check
         self._sent_before = socket.num_sent  # when nothing waited for the peer
         self._acknowledged = 0
         self._stalled_since_s = 0.0
@@ -120,7 +120,7 @@ class Connection:
         return sum(map(len, self.topics))
 
     def spend(self, cost: float) -> None:
-        """Charge the peer for work that it caused; disconnect it when its budget is used up."""
+        """Charge the peer for work; disconnect it when its budget is used up."""
         if not self.is_disconnected:
             self.budget.spend(cost)
             if self.budget.left < 0:
@@ -149,7 +149,7 @@ class Connection:
             self.disconnect("it sent an endless message", LONG_PENALTY_S)
 
     def is_stalled(self, now_s: float) -> bool:
-        """Return whether the peer has read nothing for a while, though data waits for it."""
+        """Return whether the peer has read nothing for a while, although data is queued for it."""
         return self.unread > 0 and now_s - self._stalled_since_s > STALLED_S
 
     def disconnect(
@@ -175,7 +175,7 @@ class LimitedSocket:
     """The connections to one bound socket."""
 
     def __init__(
-        self, limiter: ConnectionLimiter, limits: Limits, monitor: zmq.Socket[bytes]
+        self, limiter: ConnectionLimiter, limits: SocketLimits, monitor: zmq.Socket[bytes]
     ) -> None:
         self.limits = limits
         self.port = 0  # 0 until it is bound
@@ -185,8 +185,8 @@ class LimitedSocket:
         self.limiter = limiter
         self._monitor = monitor
 
-    def deliver(self, descriptor: int, key: str) -> Connection | None:
-        """Count a delivered message; return its connection, None if that has ended.
+    def count_delivery(self, descriptor: int, key: str) -> PeerConnection | None:
+        """Count a delivered message; return its connection, or None if the connection has ended.
 
         ``key`` is the public key of the sender, empty without encryption.
         """
@@ -201,8 +201,8 @@ class LimitedSocket:
             connection.spend(self.limits.cost)
         return connection
 
-    def subscribe(self, connection: Connection, topic: bytes) -> None:
-        """Add a subscription; disconnect a peer that subscribes to too much."""
+    def subscribe(self, connection: PeerConnection, topic: bytes) -> None:
+        """Add a subscription; disconnect a peer with too many or too long subscriptions."""
         if len(topic) > MAX_TOPIC:
             connection.disconnect("a subscription is too long", PENALTY_S)
             return
@@ -221,7 +221,7 @@ class LimitedSocket:
                 connection.disconnect("it stopped reading live frames")
 
     def is_open(self, inode: int) -> bool:
-        """Return whether a connection has not ended."""
+        """Return whether a connection is still open."""
         return self.limiter.is_open(inode)
 
     def accepted(self) -> Iterator[int]:
@@ -246,64 +246,64 @@ class ConnectionLimiter:
     def __init__(self, is_service: Callable[[str], bool], extra_connections: int = 0) -> None:
         self._quota = PeerQuota(extra_connections, is_service)
         self._tarpit = Tarpit(min(MAX_HELD, 4 * self._quota.max_clients))
-        self._connections: dict[int, Connection] = {}  # by inode; both threads add
-        self._budgets: dict[str, Budget] = {}  # budgets of owners whose connections ended
+        self._connections: dict[int, PeerConnection] = {}  # by inode; both threads add
+        self._budgets: dict[str, PeerBudget] = {}  # budgets of owners whose connections ended
         self._sockets: list[LimitedSocket] = []
         self._has_undelivered = False  # bytes that may belong to a complete message
         self._topic_bytes = 0  # at most; the socket's thread only
         self._trims_s: list[float] = []  # when to give memory back
         self._num_ended = 0  # connections that ended since memory was last freed
-        self._arrivals = Arrivals()
+        self._descriptor_waiter = DescriptorWaiter()
         self.waker: Waker | None = None  # wakes the loop that receives the messages
-        self._runs = threading.Lock()  # held until the thread stops; faster than an event
-        self._runs.acquire()
+        self._running_lock = threading.Lock()  # held until the thread stops; faster than an event
+        self._running_lock.acquire()
         self._thread = threading.Thread(target=self._run, name="connections", daemon=True)
 
     def __len__(self) -> int:
         return len(self._connections)
 
-    def limit(self, raw: zmq.Socket[bytes], limits: Limits) -> LimitedSocket:
+    def limit(self, raw: zmq.Socket[bytes], limits: SocketLimits) -> LimitedSocket:
         """Set the limits of a socket that is not bound yet, and watch its connections."""
         raw.setsockopt(zmq.MAXMSGSIZE, limits.part_bytes)
         raw.setsockopt(zmq.RCVHWM, limits.queue_length)
         raw.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
         monitor = raw.get_monitor_socket(_EVENTS)
-        self._arrivals.add(int(monitor.getsockopt(zmq.FD)))
+        self._descriptor_waiter.add(int(monitor.getsockopt(zmq.FD)))
         socket = LimitedSocket(self, limits, monitor)
         self._sockets.append(socket)
         if not self._thread.is_alive():
             self._thread.start()
         return socket
 
-    def find(self, descriptor: int, socket: LimitedSocket) -> Connection | None:
+    def find(self, descriptor: int, socket: LimitedSocket) -> PeerConnection | None:
         """Return the connection of a descriptor, None if it is closed or reused."""
-        inode = kernel_sockets.inode_of(descriptor)
+        inode = kernel_sockets.get_inode(descriptor)
         known = None if inode is None else self._connections.get(inode)
         if known is not None or inode is None:
             return known
-        if kernel_sockets.port_of(descriptor) != socket.port:
+        if kernel_sockets.get_local_port(descriptor) != socket.port:
             return None
-        connection = self._connections.setdefault(inode, Connection(descriptor, inode, socket))
-        self._arrivals.add(descriptor)
+        connection = self._connections.setdefault(inode, PeerConnection(descriptor, inode, socket))
+        self._descriptor_waiter.add(descriptor)
         return connection
 
     def is_open(self, inode: int) -> bool:
-        """Return whether a connection has not ended."""
+        """Return whether a connection is still open."""
         connection = self._connections.get(inode)
         return connection is not None and _exists(connection)
 
-    def connections_to(self, socket: LimitedSocket) -> list[Connection]:
+    def connections_to(self, socket: LimitedSocket) -> list[PeerConnection]:
         """Return the connections to one socket."""
         connections = list(self._connections.values())
         return [c for c in connections if c.socket is socket and not c.is_disconnected]
 
-    def restore_budget(self, connection: Connection) -> None:
-        """Start a connection with the rest of its owner's budget."""
+    def restore_budget(self, connection: PeerConnection) -> None:
+        """Give a new connection the remaining budget of its owner."""
         if (kept := self._budgets.get(connection.owner)) is not None:
-            connection.budget = Budget(max(MIN_BUDGET, kept.left))
+            connection.budget = PeerBudget(max(MIN_BUDGET, kept.left))
 
-    def save_budget(self, connection: Connection) -> None:
-        """Save the rest of a connection's budget for its owner's next connections."""
+    def save_budget(self, connection: PeerConnection) -> None:
+        """Save the remaining budget of a connection for the owner's next connections."""
         saved = self._budgets.get(connection.owner)
         if connection.budget.left < (BUDGET if saved is None else saved.left):
             self._budgets[connection.owner] = connection.budget
@@ -326,27 +326,27 @@ class ConnectionLimiter:
                 connection.disconnect("its key was revoked or has other roles now")
 
     def is_blocked(self, owner: str) -> bool:
-        """Return whether a key or an address cannot connect for now."""
+        """Return whether a key or an address is temporarily blocked."""
         saved = self._budgets.get(owner)
         return saved is not None and saved.left < 0
 
     def close(self) -> None:
         """Stop watching."""
         if self._thread.is_alive():
-            self._runs.release()
-            self._arrivals.close()
+            self._running_lock.release()
+            self._descriptor_waiter.close()
             self._thread.join()
         self._tarpit.close()
         for socket in self._sockets:
             socket.close()
 
     def _run(self) -> None:
-        while not self._runs.acquire(timeout=CHECK_INTERVAL_S):
+        while not self._running_lock.acquire(timeout=CHECK_INTERVAL_S):
             now_s = time.monotonic()
             self.enforce_limits(now_s)
             if not self._has_undelivered:
                 due_s = self._trims_s[0] if self._trims_s else math.inf
-                self._arrivals.wait(min(due_s - now_s, MAX_INTERVAL_S))
+                self._descriptor_waiter.wait(min(due_s - now_s, MAX_INTERVAL_S))
 
     def enforce_limits(self, now_s: float) -> None:
         """Enforce all limits."""
@@ -366,7 +366,7 @@ class ConnectionLimiter:
             # An older peer may be idle. If it does not reconnect now, its next messages are lost.
             connection.disconnect(reason, end=hold if connection.num_checks < NEW_CHECKS else None)
         for connection in connections:
-            connection.update(kernel_sockets.traffic_of(connection.descriptor), now_s)
+            connection.update(kernel_sockets.get_traffic(connection.descriptor), now_s)
         _disconnect_heaviest(
             connections, lambda c: c.undelivered, MAX_UNDELIVERED, "too much undelivered data"
         )
@@ -402,16 +402,19 @@ class ConnectionLimiter:
         return bool(ended)
 
 
-def _exists(connection: Connection) -> bool:
-    return kernel_sockets.inode_of(connection.descriptor) == connection.inode
+def _exists(connection: PeerConnection) -> bool:
+    return kernel_sockets.get_inode(connection.descriptor) == connection.inode
 
 
 def _disconnect_heaviest(
-    connections: Iterable[Connection], measure: Callable[[Connection], int], limit: int, reason: str
+    connections: Iterable[PeerConnection],
+    measure: Callable[[PeerConnection], int],
+    limit: int,
+    reason: str,
 ) -> int:
     """Disconnect peers until the sum of a measure is within its limit; return the sum.
 
-    The owner with the largest sum loses its largest connection first.
+    The largest connection of the owner with the largest sum ends first.
     """
     sizes = {c: size for c in connections if not c.is_disconnected and (size := measure(c)) > 0}
     if sum(sizes.values()) <= limit:

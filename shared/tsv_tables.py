@@ -1,4 +1,4 @@
-"""Reads tab-separated tables of packages; they may contain comments."""
+"""Reads the tab-separated tables of packages, which may contain comments."""
 
 import csv
 from importlib import resources

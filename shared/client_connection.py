@@ -1,4 +1,4 @@
-"""Connects a command to a running system."""
+"""Connects a command to control of a running system."""
 
 import contextlib
 from collections.abc import Iterator
@@ -10,11 +10,13 @@ from kouxing.shared.errors import UserError
 
 
 @contextlib.contextmanager
-def connect(control: str, *, key: Key | None = None, timeout_s: float = 10.0) -> Iterator[Client]:
+def connect_client(
+    control: str, *, key: Key | None = None, timeout_s: float = 10.0
+) -> Iterator[Client]:
     """Connect to control; on leaving, raise a ``KouxingError`` as a ``UserError``.
 
-    ``control`` is the address and, unless nothing is encrypted, control's public key, as
-    ``control_endpoint`` returns it. If ``key`` is None, it is the user's own key.
+    ``control`` is the address and, with encryption, control's public key, as ``control_endpoint``
+    returns it. If ``key`` is None, the user's key is used.
     """
     try:
         insecure = " " not in control

@@ -1,15 +1,15 @@
-"""The budget that limits the work that a peer causes."""
+"""Limits the work that a peer can cause."""
 
 import time
 from collections.abc import Callable
 
 BUDGET = 5000.0  # per connection
 BUDGET_PER_S = 500.0
-MIN_BUDGET = 100.0  # for a new connection, enough for a good client that shares a misused key
+MIN_BUDGET = 100.0  # for a new connection: enough for a good client whose key is misused
 
 
-class Budget:
-    """The work that a peer may still cause. The budget recovers with time."""
+class PeerBudget:
+    """The amount of work that a peer may still cause; recovers over time."""
 
     def __init__(self, left: float = BUDGET, clock: Callable[[], float] = time.monotonic) -> None:
         self._left, self._clock, self._since_s = left, clock, clock()

@@ -1,4 +1,4 @@
-"""Immutable records that are created hundreds of times a second.
+"""Immutable records, for data that is created hundreds of times a second.
 
 Creating a record takes a twentieth of the time of a frozen dataclass, because no Python code runs.
 """
@@ -8,4 +8,4 @@ from msgspec.structs import replace as replace  # noqa: PLC0414 - the public nam
 
 
 class Record(Struct, frozen=True):
-    """Base class of records; ``replace`` returns a changed copy, of messages too."""
+    """Base class of records. ``replace`` returns a changed copy of a record or a message."""

@@ -1,4 +1,4 @@
-"""The form of the names of sessions and keys."""
+"""The rules for names of sessions and keys."""
 
 import re
 
