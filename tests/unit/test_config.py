@@ -224,7 +224,7 @@ def test_the_file_for_all_hosts_in_the_docs_is_valid(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("advertise", "bound", "reachable"),
+    ("advertise", "bound", "advertised_endpoint"),
     [
         ("face-host", "tcp://0.0.0.0:5571", "tcp://face-host:5571"),
         ("203.0.113.7", "tcp://10.0.0.2:5571", "tcp://203.0.113.7:5571"),  # behind NAT

@@ -34,7 +34,7 @@ class SocketHarness:
         patch.setattr(kernel_sockets, "get_inode", lambda d: None if d in self.ended else d)
         patch.setattr(kernel_sockets, "reset", lambda d, _inode: self.ended.add(d))
         patch.setattr(kernel_sockets, "hold", self.hold)
-        patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 5560)
+        patch.setattr(kernel_sockets, "get_local_port", lambda _descriptor: 5560)
         patch.setattr(
             kernel_sockets, "get_peer_address", lambda d: self.addresses.get(d, "loopback")
         )
@@ -249,7 +249,7 @@ def test_a_reused_descriptor_is_another_connection(harness: SocketHarness) -> No
     harness.patch.setattr(kernel_sockets, "get_inode", lambda _descriptor: 77)
     assert not harness.limiter.is_open(1)
     assert harness.deliver(1) is not before
-    harness.patch.setattr(kernel_sockets, "port_of", lambda _descriptor: 80)
+    harness.patch.setattr(kernel_sockets, "get_local_port", lambda _descriptor: 80)
     harness.patch.setattr(kernel_sockets, "get_inode", lambda _descriptor: 78)
     assert harness.socket.count_delivery(1, "") is None  # another socket of this process
 
