@@ -50,6 +50,9 @@ def samples_of_file(path: Path) -> NDArray[np.float32]:
     return samples[:, 0]
 
 
+HELLO = samples_of_file(DEMO / "hello-female.wav")[:24_000]  # 1.5 s
+
+
 def free_port() -> int:
     """Return a port that no other program is given before a test binds it."""
     return _keep("127.0.0.1", 0)

@@ -64,11 +64,9 @@ def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
 
 def test_the_page_fits_on_a_phone(browser: Browser, site: Path) -> None:
     with serve_folder(site) as origin:
-        open_demo(browser, origin)
         browser.resize(*SIZE_PX, mobile=True)
         try:
-            browser.command("Page.reload")
-            browser.wait_for(f"{FACE}?.set != null")
+            open_demo(browser, origin)
             assert browser.evaluate("[innerWidth, innerHeight]") == [*SIZE_PX]
         finally:
             browser.resize(*SIZE_PX)
@@ -84,22 +82,21 @@ def test_the_page_works_offline_after_the_first_visit(browser: Browser, site: Pa
     browser.wait_for("window.opened > 200")
 
 
-@pytest.mark.parametrize("phones", [True, "final"])
 def test_frames_in_the_browser_equal_those_of_node(
-    browser: Browser, site: Path, tmp_path: Path, phones: bool | str
+    browser: Browser, site: Path, tmp_path: Path
 ) -> None:
-    samples = samples_of_file(DEMO / "lake-male.wav")
+    samples = samples_of_file(DEMO / "lake-male.wav")[:24_000]  # the block network is slow here
     for name, content in web_model().items():
         (tmp_path / name).write_bytes(content)
     with serve_folder(site) as origin:
         open_demo(browser, origin)
-        if phones == "final":
-            browser.click("final")
-            browser.wait_for("document.getElementById('final').ariaPressed === 'true'")
-            browser.evaluate(f"{FACE}.lips.then((lips) => {{ window.lips = lips; return 1; }})")
-        faps = frames_of(browser, samples)
-    expected = faps_of(tmp_path, samples, phones=phones)
-    np.testing.assert_allclose(faps, expected, atol=1e-3)
+        first = frames_of(browser, samples)
+        browser.click("final")
+        browser.wait_for("document.getElementById('final').ariaPressed === 'true'")
+        browser.evaluate(f"{FACE}.lips.then((lips) => {{ window.lips = lips; return 1; }})")
+        final = frames_of(browser, samples)
+    np.testing.assert_allclose(first, faps_of(tmp_path, samples, phones=True), atol=1e-3)
+    np.testing.assert_allclose(final, faps_of(tmp_path, samples, phones="final"), atol=1e-3)
 
 
 def test_an_avatar_speaks(browser: Browser, site: Path) -> None:

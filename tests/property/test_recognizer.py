@@ -14,11 +14,8 @@ from kouxing.services.recognizer.search.decoder import Decoder, LastPhone
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import FrameScores
 from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone
-from tests.system import DEMO
 
-HELLO = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
 NOISE = np.random.default_rng(0).normal(0, 0.1, 12_000).astype(np.float32)
 CUTS = st.lists(st.integers(0, 32_000), max_size=60)
 

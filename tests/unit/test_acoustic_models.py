@@ -14,12 +14,9 @@ from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.config import MODEL_NAMES
 from kouxing.services.recognizer.front_end.features import NUM_FEATURES, NUM_STATIC
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from tests.languages import MANDARIN, NUM_PHONES, SIL, Table, random_topology
-from tests.system import DEMO
-
-HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
+from tests.system import HELLO
 
 
 @pytest.fixture(scope="module", params=MODEL_NAMES)

@@ -13,16 +13,14 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
 from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import export_onnx
 from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout, block_layout
 from kouxing.training.networks.network import EncoderShape
-from tests.system import DEMO
+from tests.system import HELLO
 
 pytestmark = [pytest.mark.usefixtures("one_thread")]
 
-HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 FRAMES = np.resize(WhisperMel().accept_waveform(HELLO), (330, 80))  # more than a past
 FRAMES[40, 7] = FRAMES[:40].max() - 3.0  # below the floor
 SMALL = partial(EncoderShape, width=32, heads=2, layers=4, inner=48)

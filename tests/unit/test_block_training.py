@@ -12,7 +12,8 @@ from kouxing.training.blocks import batches, recipe
 from kouxing.training.blocks.recipe import train_blocks
 from kouxing.training.networks import optimizer, teacher
 from kouxing.training.networks.network import ReadoutShape
-from tests.unit.test_block_model import HELLO, SMALL
+from tests.system import HELLO
+from tests.unit.test_block_model import SMALL
 from tests.unit.test_encoder_training import write_sounds
 from tests.unit.test_whisper_weights import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper

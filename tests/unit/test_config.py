@@ -18,8 +18,8 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.config import KnownNames, ServiceConfig, Settings
 from kouxing.shared.errors import UserError
 from tests.documents import code_blocks
+from tests.system import ROOT
 
-ROOT = Path(__file__).parents[2]
 ANYWHERE = "0.0.0.0"  # noqa: S104
 
 

@@ -12,7 +12,6 @@ from kouxing.corpora.feature_cache import as_integers
 from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.services.recognizer.onnx_session import create_inference_session
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, targets
 from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
@@ -24,14 +23,13 @@ from kouxing.training.encoder.teachers import POSITION_SAMPLES
 from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import EncoderShape
-from tests.system import DEMO
+from tests.system import HELLO
 from tests.unit.test_lips_training import name_for, write_clip
 from tests.unit.test_whisper_weights import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
-HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
 NUM_PHONES = 3
 COLUMNS = TargetColumns(NUM_PHONES)
 

@@ -12,9 +12,7 @@ from kouxing.evaluation.lips.four_schemes import delay_by_one_phone, without_cor
 from kouxing.shared.audio_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import phone
-
-DEMO = Path(__file__).parents[2] / "shared" / "demo"
-
+from tests.system import DEMO
 
 # The rule emits b, then a, then t instead of a, then i; the search makes d of t, and puts an h
 # between. At the end of speech i is withdrawn.

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
+import soundfile
 from rich.console import Console
 
 from kouxing.corpora.speech_corpus import LANGUAGES, RowErrors, read_corpus
@@ -18,15 +19,16 @@ from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import find_language, load_inventory
 from kouxing.shared.phones.universal.segments import read_ipa
-from tests.system import ROOT
+from tests.system import HELLO
 
-SOUND = ROOT / "shared" / "demo" / "hello-female.wav"
 RULE = OutputRuleConfig(2, 0.95)
 
 
 def write_manifest(folder: Path) -> Path:
+    """Write three recordings of the same short sound."""
+    soundfile.write(folder / "a.wav", HELLO, 16_000)
     rows = [("a", "en-native", "nixaʊ"), ("b", "zh", "ni xaʊ"), ("c", "en-native", "nixaʊ")]
-    lines = [f"{name}\t{SOUND}\t{language}\t{name}\ttest\t-\t{ipa}" for name, language, ipa in rows]
+    lines = [f"{name}\ta.wav\t{language}\t{name}\ttest\t-\t{ipa}" for name, language, ipa in rows]
     path = folder / "manifest.tsv"
     columns = "utt_id\tpath\tlanguage\tspeaker\tsplit\ttext\tipa"
     path.write_text("\n".join([columns, *lines]) + "\n", encoding="utf-8")

@@ -1,7 +1,5 @@
 """Recordings: everything is known before the first frame is made."""
 
-from pathlib import Path
-
 import numpy as np
 
 from kouxing.evaluation.lips.offline_visemes import synthesize
@@ -15,9 +13,8 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
-from tests.system import VOWELS_FILE
+from tests.system import DEMO, VOWELS_FILE
 
-DEMO = Path(__file__).parents[2] / "shared" / "demo"
 STILL = SynthesizerConfig(idle_motion=False, expressiveness=1.0, feeling=0.0)
 
 

@@ -14,7 +14,6 @@ from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.search import frame_search, path_records
 from kouxing.services.recognizer.stream import MAX_JITTER
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import (
     AudioSkipped,
     EndOfSound,
@@ -27,7 +26,7 @@ from kouxing.shared.phones.events import (
 from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.message import Message
 from tests.live_streams import LiveStream, recognize_live, recognize_together
-from tests.system import DEMO, VOWELS_FILE, samples_of_file
+from tests.system import HELLO, VOWELS_FILE, samples_of_file
 
 MODEL = load_model()
 SAMPLES = samples_of_file(VOWELS_FILE)
@@ -260,9 +259,6 @@ def test_a_longer_hop_changes_only_the_phones() -> None:
         for results in (outputs, expected)
     ]
     assert symbols[0] == symbols[1]
-
-
-HELLO = read_audio(DEMO / "hello-female.wav")[0][:, 0]
 
 
 def hello_phones() -> list[Phone]:

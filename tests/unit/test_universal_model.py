@@ -23,10 +23,10 @@ from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.universal.encoder import BLOCK_LENGTH, RIGHT_CONTEXT, FeatureEncoder
 from kouxing.training.universal.export import export_extension
 from tests.live_streams import LiveStream
+from tests.system import HELLO
 from tests.unit.test_block_model import (
     BLOCK,
     FRAMES,
-    HELLO,
     LENGTH,
     SCALE,
     blocks,

@@ -18,7 +18,7 @@ from kouxing.shared.phones.universal.segments import (
     symbol_to_ipa,
 )
 from tests.languages import MANDARIN
-from tests.unit.test_block_model import HELLO
+from tests.system import HELLO
 
 UNIVERSAL = load_inventory("universal")
 

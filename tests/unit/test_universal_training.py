@@ -12,7 +12,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.networks import optimizer
 from kouxing.training.universal import alignment, recipe, trainer
 from kouxing.training.universal.recipe import train_universal
-from tests.unit.test_block_model import HELLO
+from tests.system import HELLO
 from tests.unit.test_block_training import interrupt
 
 pytestmark = pytest.mark.usefixtures("one_thread")
