@@ -16,7 +16,7 @@ IS_CURRENT = "window.kouxing?.state.drawing?.isCurrent ?? true"
 AFTER_TWO_FRAMES = (
     "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
 )
-READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
+PAGE_IS_READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
 
 
 class Browser(Chromium):
@@ -34,7 +34,7 @@ class Browser(Chromium):
     def open(self, address: str) -> None:
         """Load the gateway's page."""
         self.command("Page.navigate", url=address)
-        self.wait_for(READY)
+        self.wait_for(PAGE_IS_READY)
 
     def restart(self, address: str) -> None:
         """Load a page of another origin, without the errors of the previous page."""

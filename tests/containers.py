@@ -17,14 +17,14 @@ from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.shared.errors import UserError
 from tests.system import ROOT
 
-USER = 10001
-READ = "+dac_read_search"
+USER_ID = 10001
+READ_CAP = "+dac_read_search"
 BECOME_USER = f"""
-exec setpriv --reuid={USER} --regid={USER} --clear-groups --no-new-privs \
-    --bounding-set=-all,{READ} --inh-caps=-all,{READ} --ambient-caps=-all,{READ} "$@"
+exec setpriv --reuid={USER_ID} --regid={USER_ID} --clear-groups --no-new-privs \
+    --bounding-set=-all,{READ_CAP} --inh-caps=-all,{READ_CAP} --ambient-caps=-all,{READ_CAP} "$@"
 """
 # Arguments: folder of secrets, file of hosts, where the folder is mounted if it is, the command.
-ENTER = f"""
+ENTER_CONTAINER = f"""
 mount --make-rprivate /
 mount -t tmpfs tmpfs /run
 cp "$2" /run/hosts
@@ -35,7 +35,7 @@ if test "$3"; then
 else
     mkdir /run/secrets
     cp "$1"/* /run/secrets
-    chown {USER} /run/secrets/*
+    chown {USER_ID} /run/secrets/*
     chmod 400 /run/secrets/*
 fi
 shift 3
@@ -104,7 +104,7 @@ class Containers:
         for name, path in secrets.items():
             (folder / name).write_bytes(path.read_bytes())
         program = [sys.executable, "-m", "kouxing", *arguments]
-        enter = ["unshare", "--mount", "sh", "-ec", ENTER]
+        enter = ["unshare", "--mount", "sh", "-ec", ENTER_CONTAINER]
         enter += ["sh", str(folder), str(self._hosts), target]
         own = {
             "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",

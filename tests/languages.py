@@ -21,7 +21,7 @@ NUM_PHONES = len(MANDARIN)
 SIL = MANDARIN.index[MANDARIN.silence]
 START = 1 + SIL  # the context after a pause, among the graph's
 
-Gram = tuple[int, ...]
+NGram = tuple[int, ...]
 
 
 def install_language(folder: Path, name: str, package: str) -> None:
@@ -38,16 +38,16 @@ def install_language(folder: Path, name: str, package: str) -> None:
 class Table:
     """Log-probabilities of n-grams, and log back-off weights of contexts."""
 
-    log_prob: dict[Gram, float]
-    log_backoff: dict[Gram, float]
+    log_prob: dict[NGram, float]
+    log_backoff: dict[NGram, float]
 
     @classmethod
     def draw(
         cls, rng: np.random.Generator, phones: Sequence[int], *, order: int, kept: float = 1.0
     ) -> Table:
         """Draw values for all single phones, and for some longer n-grams of ``phones``."""
-        grams: list[Gram] = [(phone,) for phone in range(NUM_PHONES)]
-        level: list[Gram] = [(phone,) for phone in phones]
+        grams: list[NGram] = [(phone,) for phone in range(NUM_PHONES)]
+        level: list[NGram] = [(phone,) for phone in phones]
         for _ in range(order - 1):
             level = [
                 (*gram, phone)
@@ -64,7 +64,7 @@ class Table:
     @classmethod
     def of(cls, language: PhoneLanguageModel) -> Table:
         """Read a tree."""
-        grams: list[Gram] = [()]
+        grams: list[NGram] = [()]
         for node, num_children in enumerate(language.num_children.tolist()):
             first = len(grams)
             phones = language.phone[first : first + num_children].tolist()
@@ -83,20 +83,20 @@ class Table:
         """Phones in the longest n-gram."""
         return max(map(len, self.log_prob))
 
-    def after(self, before: Gram, phone: int) -> float:
+    def after(self, before: NGram, phone: int) -> float:
         """Return the log-probability of a phone after all phones before it, by the formula."""
         if SIL in before:
             before = before[len(before) - 1 - before[::-1].index(SIL) :]
         return self._after(before[max(0, len(before) - self.order + 1) :], phone)
 
-    def _after(self, context: Gram, phone: int) -> float:
+    def _after(self, context: NGram, phone: int) -> float:
         if (*context, phone) in self.log_prob:
             return self.log_prob[*context, phone]
         return self.log_backoff.get(context, 0.0) + self._after(context[1:], phone)
 
     def tree(self, inventory: PhoneInventory = MANDARIN) -> PhoneLanguageModel:
         """Convert the table to a tree."""
-        grams: list[Gram] = [(), *sorted(self.log_prob, key=lambda gram: (len(gram), gram))]
+        grams: list[NGram] = [(), *sorted(self.log_prob, key=lambda gram: (len(gram), gram))]
         num_children = Counter(gram[:-1] for gram in grams[1:])
         return PhoneLanguageModel(
             inventory=inventory,
@@ -110,7 +110,7 @@ class Table:
 def flat_language(inventory: PhoneInventory = MANDARIN) -> PhoneLanguageModel:
     """Make all phones equally likely in every context."""
     num_phones = len(inventory)
-    log_probs: dict[Gram, float] = {(phone,): -math.log(num_phones) for phone in range(num_phones)}
+    log_probs: dict[NGram, float] = {(phone,): -math.log(num_phones) for phone in range(num_phones)}
     return Table(log_probs, {}).tree(inventory)
 
 

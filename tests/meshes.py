@@ -12,12 +12,12 @@ from tests import heads
 from tests.glb_writer import Mesh
 
 ORIGINAL = heads.load("woman", "coarse")
-STIFF = ("brows", "lashes")  # transparent parts that move, which these meshes omit
+OMITTED_PARTS = ("brows", "lashes")  # transparent parts that move, which these meshes omit
 
 
 def meshes(shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
     """Return the parts with morph targets, given as FAPs (68,) by name."""
-    shown = [part for part in ORIGINAL.parts if not part.name.startswith(STIFF)]
+    shown = [part for part in ORIGINAL.parts if not part.name.startswith(OMITTED_PARTS)]
     shape_faps = {
         part.name: Mesh(
             part.name,

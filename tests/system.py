@@ -31,16 +31,16 @@ CHAIN = ("control", "recognizer", "synthesizer")
 SERVICE = ("-m", "kouxing.services.process")
 NODE = Path(sys.executable).with_name("node")
 LIMIT_S = 60.0  # for anything that takes no time on an idle machine
-NOTHING_SKIPPED = {  # on a busy machine
+SKIP_NO_AUDIO = {  # on a busy machine
     "KOUXING_MAX_LAG_S": "3600",
 }
-PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
-ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
-CHEAP = {"KOUXING_RECOGNIZER_ACOUSTIC": "light"}
+LONG_TIMEOUTS = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
+ADMIT_ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
+LIGHT_MODEL = {"KOUXING_RECOGNIZER_ACOUSTIC": "light"}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
-MAX_KEPT = 200
+MAX_RESERVED_PORTS = 200
 
-_kept: deque[socket.socket] = deque()
+_reserved: deque[socket.socket] = deque()
 
 
 def samples_of_file(path: Path) -> NDArray[np.float32]:
@@ -55,7 +55,7 @@ HELLO = samples_of_file(DEMO / "hello-female.wav")[:24_000]  # 1.5 s
 
 def free_port() -> int:
     """Return a port that no other program is given before a test binds it."""
-    return _keep("127.0.0.1", 0)
+    return _reserve_port("127.0.0.1", 0)
 
 
 def own_addresses(
@@ -65,29 +65,36 @@ def own_addresses(
     addresses = free_port_environment(names, hosts)
     for address in set(addresses.values()):
         host, _, port = address.removeprefix("tcp://").rpartition(":")
-        _keep(host or "127.0.0.1", int(port))
+        _reserve_port(host or "127.0.0.1", int(port))
     return addresses
 
 
-def _keep(host: str, port: int) -> int:
+def _reserve_port(host: str, port: int) -> int:
     # The socket is bound but does not listen. Only a program that sets SO_REUSEADDR and names
     # this port can bind it, as servers do.
-    kept = socket.socket()
-    kept.bind((host, port))
-    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    _kept.append(kept)
-    if len(_kept) > MAX_KEPT:
-        _kept.popleft().close()
-    return int(kept.getsockname()[1])
+    reserved = socket.socket()
+    reserved.bind((host, port))
+    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    _reserved.append(reserved)
+    if len(_reserved) > MAX_RESERVED_PORTS:
+        _reserved.popleft().close()
+    return int(reserved.getsockname()[1])
 
 
 def own_environment(folder: Path) -> dict[str, str]:
     """Return an environment in which ``kouxing run`` uses free ports and has no window."""
-    own = {"XDG_RUNTIME_DIR": str(folder), **NOTHING_SKIPPED}  # commands find the system there
-    return {**os.environ, **ONE_THREAD, **headless(folder), **ANY_LOAD, **own_addresses(), **own}
+    own = {"XDG_RUNTIME_DIR": str(folder), **SKIP_NO_AUDIO}  # commands find the system there
+    return {
+        **os.environ,
+        **ONE_THREAD,
+        **headless_settings(folder),
+        **ADMIT_ANY_LOAD,
+        **own_addresses(),
+        **own,
+    }
 
 
-def headless(folder: Path) -> dict[str, str]:
+def headless_settings(folder: Path) -> dict[str, str]:
     """Return the settings of a driver that has no window and writes small videos."""
     return {
         "KOUXING_DRIVER_VIEW": "none",
@@ -175,10 +182,10 @@ class System(LocalSystem):
             Console(file=self.console, width=200),
             services=services,
             settings={
-                **headless(folder),
-                **PATIENT,
-                **NOTHING_SKIPPED,
-                **ANY_LOAD,
+                **headless_settings(folder),
+                **LONG_TIMEOUTS,
+                **SKIP_NO_AUDIO,
+                **ADMIT_ANY_LOAD,
                 **addresses,
                 **{variable_name(name, "instance"): name for name in named},
                 **(settings or {}),

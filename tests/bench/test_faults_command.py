@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.system.faults import Timing
-from tests.system import NOTHING_SKIPPED
+from tests.system import SKIP_NO_AUDIO
 
 
 def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,7 +18,7 @@ def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(
         "kouxing.evaluation.system.live.END_LIMIT_S", 60.0
     )  # a busy machine starts slowly
-    for name, value in NOTHING_SKIPPED.items():
+    for name, value in SKIP_NO_AUDIO.items():
         monkeypatch.setenv(name, value)
     fault, figures, logs = f"{service} killed", tmp_path / "faults.json", tmp_path / "logs"
     result = CliRunner().invoke(

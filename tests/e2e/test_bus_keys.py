@@ -69,7 +69,7 @@ def hide_in_request(message: Message, shift: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("required", "roles", "gets_in"),
+    ("required", "roles", "is_accepted"),
     [
         ("", ("subscriber:*",), True),
         ("client", ("client",), True),
@@ -79,16 +79,16 @@ def hide_in_request(message: Message, shift: int) -> bytes:
     ],
 )
 def test_a_socket_accepts_only_keys_of_its_role(
-    server: Server, required: str, roles: tuple[str, ...], gets_in: bool
+    server: Server, required: str, roles: tuple[str, ...], is_accepted: bool
 ) -> None:
     router, endpoint = server.router("some.setting", role=required)
     key = load_key("grant", roles)
     with Bus(key) as bus:
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
-        assert router.wait(LIMIT_S if gets_in else 0.5) == gets_in
-        assert [item.sender.key for item in router.receive()] == gets_in * [key.public]
-        assert (bus.probe(endpoint) is ProbeResult.ACCEPTED) == gets_in
+        assert router.wait(LIMIT_S if is_accepted else 0.5) == is_accepted
+        assert [item.sender.key for item in router.receive()] == is_accepted * [key.public]
+        assert (bus.probe(endpoint) is ProbeResult.ACCEPTED) == is_accepted
 
 
 def test_rejects_a_key_of_another_system(

@@ -31,7 +31,7 @@ JAVASCRIPT_CLIENT = ROOT / "clients" / "javascript"
 PYTHON_CLIENT = ROOT / "clients" / "python"
 
 
-def run(*command: object, cwd: Path | None = None, **environment: str) -> list[str]:
+def run_program(*command: object, cwd: Path | None = None, **environment: str) -> list[str]:
     """Run a program that must succeed; return the lines that it prints."""
     result = subprocess.run(
         list(map(str, command)),
@@ -65,7 +65,7 @@ def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path
     for number, example in enumerate(code_blocks(PYTHON_CLIENT / "README.md", "python")):
         program = tmp_path / f"example{number}.py"
         program.write_text(example, encoding="utf-8")
-        outputs.append(run(python, "-I", program, SPEECH, KOUXING_CONTROL=control))
+        outputs.append(run_program(python, "-I", program, SPEECH, KOUXING_CONTROL=control))
     jaw, phones = outputs
     assert max(float(line.split()[-1]) for line in jaw) > 200
     assert [line.split()[-1] for line in phones[:4]] == ["n", "i", "h", "ao"]
@@ -99,13 +99,13 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pip(*arguments: object) -> None:
-    run(sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *arguments)
+    run_program(sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *arguments)
 
 
 def npm(folder: Path, *arguments: object) -> None:
     quietly = ("--no-audit", "--no-fund", "--loglevel=error")
     path = f"{NODE.parent}:{os.environ['PATH']}"
-    run(NODE.with_name("npm"), *quietly, *arguments, cwd=folder, PATH=path)
+    run_program(NODE.with_name("npm"), *quietly, *arguments, cwd=folder, PATH=path)
 
 
 @pytest.fixture(scope="module")
@@ -124,12 +124,14 @@ def gateway(system: System, site: str) -> Iterator[Gateway]:
 
 def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -> None:
     shutil.copy(JAVASCRIPT_CLIENT / "tests" / "client.test.js", project / "client.test.mjs")
-    run(NODE, "--test", project / "client.test.mjs", GATEWAY=gateway.page, SPEECH=str(SPEECH))
+    run_program(
+        NODE, "--test", project / "client.test.mjs", GATEWAY=gateway.page, SPEECH=str(SPEECH)
+    )
     (example,) = code_blocks(JAVASCRIPT_CLIENT / "README.md", "js")
     (project / "example.mjs").write_text(example, encoding="utf-8")
     wav = project / "one-second.wav"  # the gateway drops what a busy viewer does not read in time
     soundfile.write(wav, samples_of_file(SPEECH)[:16000], 16000)
-    lines = run(NODE, project / "example.mjs", wav, GATEWAY=gateway.page)
+    lines = run_program(NODE, project / "example.mjs", wav, GATEWAY=gateway.page)
     assert max(float(line.split()[-1]) for line in lines if "jaw" in line) > 200
     assert [line.split()[-1] for line in lines if "phone" in line][:4] == ["n", "i", "h", "ao"]
 
@@ -138,13 +140,13 @@ def test_the_javascript_package_has_the_types_of_its_api(project: Path) -> None:
     shutil.copy(JAVASCRIPT_CLIENT / "tests" / "types.ts", project / "types.mts")
     compiler = JAVASCRIPT_CLIENT / "node_modules" / "typescript" / "bin" / "tsc"
     options = "--noEmit --strict --module nodenext --target es2023 --lib es2023,dom".split()
-    run(NODE, compiler, *options, "types.mts", cwd=project)
+    run_program(NODE, compiler, *options, "types.mts", cwd=project)
 
 
-LIPS = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
+LIP_VERTICES = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 DOWN = np.array([[0.0, -0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, 0.0]])
-TOWARDS = np.array([[0.0, 0.0, 1.0]] * 3)
-TURNED = np.array([-1.0, 1.0, -1.0])  # VRM 0 looks along -z
+FORWARD = np.array([[0.0, 0.0, 1.0]] * 3)
+TURN_AROUND = np.array([-1.0, 1.0, -1.0])  # VRM 0 looks along -z
 TRIANGLE = np.array([[0, 1, 2]])
 BONES = (
     *("hips", "spine", "head", "leftEye", "rightEye"),
@@ -181,9 +183,9 @@ def write_face(
     path: Path, shapes: list[str], *nodes: dict[str, Any], turned: bool = False, **rest: Any
 ) -> None:
     """Write a mouth of one triangle that each shape opens; it comes behind other nodes."""
-    turn = TURNED if turned else 1.0
+    turn = TURN_AROUND if turned else 1.0
     targets = dict.fromkeys(shapes, DOWN * turn)
-    mouth = Mesh("mouth", LIPS * turn, TRIANGLE, targets, normals=TOWARDS * turn)
+    mouth = Mesh("mouth", LIP_VERTICES * turn, TRIANGLE, targets, normals=FORWARD * turn)
     scenes = [{"nodes": list(range(len(nodes) + 1))}]
     write_glb(path, [mouth], nodes=list(nodes), scenes=scenes, **rest)
 

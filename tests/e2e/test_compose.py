@@ -16,7 +16,7 @@ from kouxing_client import Client
 
 from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.shared.keys import control_endpoint
-from tests.containers import READ, USER, Containers, network_or_skip
+from tests.containers import READ_CAP, USER_ID, Containers, network_or_skip
 from tests.system import ROOT, VOWELS_FILE
 
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))
@@ -41,7 +41,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("keys")
     run_keys_service(folder, *COMPOSE["services"]["keys"]["command"])
     key_files = folder / "kouxing"
-    assert (key_files / "control.key").stat().st_uid == USER
+    assert (key_files / "control.key").stat().st_uid == USER_ID
     own = tmp_path_factory.mktemp("own-keys") / "kouxing"
     shutil.copytree(key_files, own)  # owned by this user
     with pytest.MonkeyPatch.context() as patch:
@@ -58,7 +58,8 @@ def run_keys_service(folder: Path, *command: str) -> None:
     (programs / "kouxing").chmod(0o755)
     script = script.replace("$$", "$").replace("/keys", str(folder))
     script = script.replace(
-        "setpriv ", f"setpriv --inh-caps=-all,{READ} --ambient-caps=-all,{READ} "
+        "setpriv ",
+        f"setpriv --inh-caps=-all,{READ_CAP} --ambient-caps=-all,{READ_CAP} ",
     )
     subprocess.run(
         [shell, option, script, name, *command],
@@ -162,7 +163,7 @@ def test_every_container_is_isolated() -> None:
         assert advertised == ("127.0.0.1" if name == "gateway" else None), name
         assert (service.get("user") == "root") == (name == "keys"), name
     dockerfile = (ROOT / "deploy" / "Dockerfile").read_text("utf-8")
-    assert f"\nUSER {USER}:{USER}\n" in dockerfile
+    assert f"\nUSER {USER_ID}:{USER_ID}\n" in dockerfile
 
 
 def test_the_image_has_all_packages() -> None:

@@ -25,14 +25,14 @@ from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress,
 from tests.e2e.streaming import Stream
 from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until
 
-M = TypeVar("M", bound=Message)
+MessageType = TypeVar("MessageType", bound=Message)
 HEARTBEAT = Heartbeat(
     service="driver", instance="a-false-one", role="observer", state="ready", sent_ns=0
 )
 ENDPOINTS = {"audio": "tcp://127.0.0.1:1", "phones": "tcp://127.0.0.1:1"}
 
 
-def answers(socket: Socket, kind: type[M]) -> Iterator[M]:
+def answers(socket: Socket, kind: type[MessageType]) -> Iterator[MessageType]:
     """Yield the messages of a kind that arrive at a socket."""
     while socket.wait(LIMIT_S):
         for received in socket.receive():

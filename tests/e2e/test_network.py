@@ -16,7 +16,7 @@ from kouxing.evaluation.system.network import NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
 from kouxing.shared.keys import CLIENT
 from tests.containers import network_or_skip
-from tests.system import DEMO, NOTHING_SKIPPED, samples_of_file
+from tests.system import DEMO, SKIP_NO_AUDIO, samples_of_file
 
 CUT_AT_S = 1.0
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
@@ -26,7 +26,7 @@ SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 def _complete() -> Iterator[None]:
     """Let services process everything on a busy machine, with the block network."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in NOTHING_SKIPPED.items():
+        for name, value in SKIP_NO_AUDIO.items():
             patch.setenv(name, value)
         yield
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.browser import READY, Browser
+from tests.browser import PAGE_IS_READY, Browser
 from tests.fake_control import FakeControl
 from tests.system import DEMO, Gateway
 
@@ -46,7 +46,7 @@ def test_the_token_is_used_and_removed_from_the_url(browser: Browser, gateway: G
     visit(browser, gateway.page)
     browser.wait_for("document.getElementById('notice')?.textContent.includes('#token=')")
     visit(browser, gateway.page + TOKEN)
-    browser.wait_for(READY)
+    browser.wait_for(PAGE_IS_READY)
     assert browser.evaluate("location.href") == gateway.page
     browser.click("microphone")  # https gives access to the microphone
     browser.wait_for("window.kouxing.state.microphone")
@@ -67,7 +67,7 @@ def test_the_keyboard_reaches_all_controls_with_a_visible_focus(
     browser: Browser, gateway: Gateway
 ) -> None:
     visit(browser, gateway.page + TOKEN)
-    browser.wait_for(READY)
+    browser.wait_for(PAGE_IS_READY)
     reached = []
     for _ in CONTROLS:
         press(browser, "Tab")
@@ -87,7 +87,7 @@ def test_the_keyboard_reaches_all_controls_with_a_visible_focus(
 
 def test_a_screen_reader_finds_names(browser: Browser, gateway: Gateway) -> None:
     visit(browser, gateway.page + TOKEN)
-    browser.wait_for(READY)
+    browser.wait_for(PAGE_IS_READY)
     browser.evaluate("document.getElementById('settings').showPopover()")
     browser.command("Accessibility.enable")
     nodes = browser.command("Accessibility.getFullAXTree")["nodes"]
@@ -119,7 +119,7 @@ def test_the_bare_view_shows_only_the_face_on_a_transparent_background(
 ) -> None:
     browser.resize(160, 120)
     visit(browser, f"{gateway.page}?view=bare&background=transparent{TOKEN}")
-    browser.wait_for(READY)
+    browser.wait_for(PAGE_IS_READY)
     clear = {"r": 0, "g": 0, "b": 0, "a": 0}
     browser.command("Emulation.setDefaultBackgroundColorOverride", color=clear)
     browser.wait_for("window.kouxing.state.drawing.numImages > 0")

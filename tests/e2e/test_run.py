@@ -16,7 +16,7 @@ import pytest
 
 from tests.e2e.conftest import CommandRunner
 from tests.system import (
-    CHEAP,
+    LIGHT_MODEL,
     LIMIT_S,
     ONE_THREAD,
     ROOT,
@@ -63,7 +63,7 @@ def test_the_demo_writes_a_video_and_stops(tmp_path: Path) -> None:
 def test_runs_on_free_ports_until_it_is_interrupted(
     command: CommandRunner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    environment = {"XDG_RUNTIME_DIR": str(tmp_path), **CHEAP}
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path), **LIGHT_MODEL}
     options = ["--set", "driver.view=none", "--set", f"driver.out={tmp_path}", "--no-browser"]
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # another program uses it, which has the same effect
@@ -122,7 +122,12 @@ def test_reports_a_mistake_before_anything_starts(
 
 
 def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
-    environment = {**ONE_THREAD, **CHEAP, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(tmp_path)}
+    environment = {
+        **ONE_THREAD,
+        **LIGHT_MODEL,
+        "PYTHONPATH": str(ROOT),
+        "XDG_RUNTIME_DIR": str(tmp_path),
+    }
     control = tmp_path / "out" / "logs" / "control.log"
     with subprocess.Popen(
         [sys.executable, "-c", COMMAND, "run", "--no-browser", "--port", "0"],

@@ -24,8 +24,10 @@ ROTATIONS: dict[str, dict[str, list[float]]] = {
     "turned": {"rotation": [0, 1, 0, 0]},
 }
 DAMAGED = "it is not a GLB or VRM file, or it is damaged; export it again"
-CANNOT = "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit; use an avatar"
-LOOK = """
+CANNOT_SPEAK = (
+    "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit; use an avatar"
+)
+LOOK_SCRIPT = """
 import { readFileSync } from "node:fs";
 globalThis.self = globalThis;
 globalThis.ProgressEvent = Event;
@@ -206,7 +208,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any
     (folder / "package.json").write_text('{"type": "module"}', encoding="utf-8")
     (folder / "node_modules").symlink_to(CLIENT / "node_modules")
     (folder / "page").symlink_to(ROOT / "services" / "gateway" / "page")
-    (folder / "look.js").write_text(LOOK, encoding="utf-8")
+    (folder / "look.js").write_text(LOOK_SCRIPT, encoding="utf-8")
     paths = []
     for name, (meshes, kind) in FILES.items():
         paths.append(write_glb(folder / f"{name}.glb", meshes))
@@ -279,10 +281,10 @@ def test_a_vrm_speaks_by_morph_targets_if_its_expressions_move_nothing(
 @pytest.mark.parametrize(
     ("name", "error_text"),
     [
-        ("unnamed", CANNOT),
-        ("no face", CANNOT),
-        ("blink", CANNOT),
-        ("no effect", CANNOT),
+        ("unnamed", CANNOT_SPEAK),
+        ("no face", CANNOT_SPEAK),
+        ("blink", CANNOT_SPEAK),
+        ("no effect", CANNOT_SPEAK),
         ("cut off", DAMAGED),
         ("texture", "it needs KHR_texture_basisu, which kouxing does not support"),
         ("twice", "it has several faces; export only one avatar"),

@@ -8,12 +8,12 @@ import pytest
 
 from tests.system import LIMIT_S, ROOT, VOWELS_FILE, start_python
 
-PRESS = """
+INSTALL = """
 import signal
 from kouxing.shared.interrupt import catch_interrupt, install_interrupt_handler
 install_interrupt_handler()
 """
-DROPPED = """
+LIBRARY_DROPS_INTERRUPT = """
 try:
     try:
         signal.raise_signal(signal.SIGINT)
@@ -24,7 +24,7 @@ try:
 except KeyboardInterrupt:
     print("raised again")
 """
-CLEANED_UP = """
+INTERRUPT_DURING_CLEANUP = """
 try:
     try:
         signal.raise_signal(signal.SIGINT)
@@ -38,13 +38,13 @@ try:
 except KeyboardInterrupt:
     print("raised once")
 """
-CAUGHT = """
+CAUGHT_INTERRUPT = """
 with catch_interrupt():
     signal.raise_signal(signal.SIGINT)
 print(signal.getitimer(signal.ITIMER_REAL))
 """
 # `COMMAND` runs as the command line, with Ctrl-C in a function that FFmpeg calls.
-IN_FFMPEG = """
+INTERRUPT_IN_FFMPEG = """
 import signal
 from kouxing.shared import media_file
 call = media_file._GuardedFile._call
@@ -57,16 +57,16 @@ def interrupt(*arguments):
 
 media_file._GuardedFile._call = interrupt
 """
-IN_OPTIONS = """
+INTERRUPT_IN_OPTIONS = """
 import signal
 import typer.main
 typer.main.get_group = lambda _: signal.raise_signal(signal.SIGINT)
 """
-IN_SHUTDOWN = """
+HANG_IN_SHUTDOWN = """
 import atexit, threading
 atexit.register(threading.Event().wait)
 """
-IN_IMPORT = """
+INTERRUPT_IN_IMPORT = """
 import signal
 try:
     signal.raise_signal(signal.SIGINT)
@@ -75,7 +75,7 @@ except KeyboardInterrupt:
 """
 # Each command runs in a process of its own, with Ctrl-C when it opens a file in the folder `data`
 # or starts a program.
-IN_INPUT = """
+INTERRUPT_EACH_COMMAND = """
 import importlib, json, os, signal, sys
 for name in ("encoder", "universal", "blocks", "lips", "gmm", "ferguson", "visemes", "heads"):
     importlib.import_module(f"kouxing.training.{name}.recipe")
@@ -129,13 +129,13 @@ main()
 @pytest.mark.parametrize(
     ("program", "printed"),
     [
-        (DROPPED, "raised again\n"),
-        (CLEANED_UP, "cleaned up\nraised once\n"),
-        (CAUGHT, "(0.0, 0.0)\n"),
+        (LIBRARY_DROPS_INTERRUPT, "raised again\n"),
+        (INTERRUPT_DURING_CLEANUP, "cleaned up\nraised once\n"),
+        (CAUGHT_INTERRUPT, "(0.0, 0.0)\n"),
     ],
 )
 def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) -> None:
-    process = start_python("-c", PRESS + program, PYTHONPATH=str(ROOT))
+    process = start_python("-c", INSTALL + program, PYTHONPATH=str(ROOT))
     assert process.communicate(timeout=LIMIT_S) == (printed, "")
 
 
@@ -143,13 +143,13 @@ def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) 
 def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) -> None:
     program, path = COMMAND, str(ROOT)
     if place == "FFmpeg":
-        program = IN_FFMPEG + COMMAND
+        program = INTERRUPT_IN_FFMPEG + COMMAND
     elif place == "shutdown":
-        program = IN_SHUTDOWN + IN_FFMPEG + COMMAND
+        program = HANG_IN_SHUTDOWN + INTERRUPT_IN_FFMPEG + COMMAND
     elif place == "options":
-        program = IN_OPTIONS + COMMAND
+        program = INTERRUPT_IN_OPTIONS + COMMAND
     else:
-        (tmp_path / "onnxruntime.py").write_text(IN_IMPORT)
+        (tmp_path / "onnxruntime.py").write_text(INTERRUPT_IN_IMPORT)
         path = f"{tmp_path}{os.pathsep}{ROOT}"
     process = start_python("-c", program, "phones", str(VOWELS_FILE), PYTHONPATH=path)
     printed, log = process.communicate(timeout=LIMIT_S)
@@ -165,7 +165,7 @@ def test_ctrl_c_ends_every_recipe_and_leaves_no_output(tmp_path: Path) -> None:
     for name in ("manifest.tsv", "model.bin", "a.flac", "a.csv", "a.json"):
         (data / name).touch()
     lines = [line.format(data=data, out=out) for line in RECIPES]
-    process = start_python("-c", IN_INPUT, *lines, PYTHONPATH=str(ROOT))
+    process = start_python("-c", INTERRUPT_EACH_COMMAND, *lines, PYTHONPATH=str(ROOT))
     printed, log = process.communicate(timeout=4 * LIMIT_S)
     assert json.loads(printed) == dict.fromkeys(lines, 130), log
     assert log == ""

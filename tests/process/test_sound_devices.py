@@ -14,7 +14,7 @@ SOURCES = [
     {"name": "mic0", "description": "A microphone", "properties": {"device.class": "sound"}},
     {"name": "hdmi.monitor", "description": "HDMI", "properties": {"device.class": "monitor"}},
 ]
-PLAYING = [{"index": 7, "properties": {"application.name": "Firefox"}}]
+PLAYING_PROGRAMS = [{"index": 7, "properties": {"application.name": "Firefox"}}]
 PCM = np.full(1000, 1 << 14, "<i2").tobytes()
 
 
@@ -22,7 +22,7 @@ PCM = np.full(1000, 1 << 14, "<i2").tobytes()
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Install programs that replace a sound server's and record their arguments."""
     (tmp_path / "sources").write_text(json.dumps(SOURCES))
-    (tmp_path / "sink-inputs").write_text(json.dumps(PLAYING))
+    (tmp_path / "sink-inputs").write_text(json.dumps(PLAYING_PROGRAMS))
     (tmp_path / "pcm").write_bytes(PCM)
     for name, line in (
         ("pactl", f'cat "{tmp_path}/$3"'),

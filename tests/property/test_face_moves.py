@@ -20,9 +20,9 @@ from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChan
 from tests.live_streams import recognize_live
 from tests.system import DEMO
 
-KEPT_S = 3.0  # events repeated for a new synthesizer
+REPEATED_S = 3.0  # events repeated for a new synthesizer
 LARGEST_STEP = 1.2  # relative to the largest undisturbed step
-UNSEEN = 1.0  # FAP units; smaller steps are invisible
+INVISIBLE_STEP = 1.0  # FAP units; smaller steps are invisible
 CLOSED, NEARLY_CLOSED = 12.0, 35.0  # FAP units between inner lips
 RATE_HZ = 50.0
 JAW, EYELID, HEAD_PITCH, LOWER_LIP = 3, 19, 48, 5  # FAPs
@@ -66,13 +66,13 @@ def move_to_another_synthesizer(lips: str, cut: int) -> list[Frame]:
     """Resume on a new face: last frame, recent events, then new events."""
     before, after = events()[:cut], events()[cut:]
     frames = process_all(make_face(lips), before)
-    kept_from_s = time_of(before[-1]) - KEPT_S
+    kept_from_s = time_of(before[-1]) - REPEATED_S
     changes = [event for event in before if isinstance(event, SpeechChange)]
     older = [event for event in changes if event.time_s < kept_from_s][-1:]
     face = make_face(lips)
     face.resume(frames[-1][0], len(frames), frames[-1][1])
-    kept = [event for event in before if time_of(event) >= kept_from_s]
-    return frames + process_all(face, [*older, *kept, *after])
+    repeated = [event for event in before if time_of(event) >= kept_from_s]
+    return frames + process_all(face, [*older, *repeated, *after])
 
 
 def move_to_another_recognizer(lips: str, cut: int) -> list[Frame]:
@@ -81,14 +81,14 @@ def move_to_another_recognizer(lips: str, cut: int) -> list[Frame]:
     face = make_face(lips)
     frames = process_all(face, before)
     final_s = max(map(final_until, before))
-    again = [event for event in events() if middle_of(event) > final_s]
-    first = min((event.index for event in again if isinstance(event, Phone)), default=0)
+    repeated_events = [event for event in events() if middle_of(event) > final_s]
+    first = min((event.index for event in repeated_events if isinstance(event, Phone)), default=0)
     face.change_recognizer()
     return frames + process_all(
         face,
         [
             replace(event, index=event.index - first) if isinstance(event, Phone) else event
-            for event in again
+            for event in repeated_events
         ],
     )
 
@@ -115,11 +115,11 @@ def steps(frames: Sequence[Frame]) -> NDArray[np.float32]:
     return np.abs(np.diff(values(frames), axis=0))
 
 
-def assert_unseen(frames: Sequence[Frame], lips: str) -> None:
+def assert_no_visible_step(frames: Sequence[Frame], lips: str) -> None:
     """Check that every media time occurs once, and that steps are not larger than before."""
     plain = uninterrupted(lips)
     assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in plain]
-    largest = steps(frames).max(axis=0) / np.maximum(steps(plain).max(axis=0), UNSEEN)
+    largest = steps(frames).max(axis=0) / np.maximum(steps(plain).max(axis=0), INVISIBLE_STEP)
     too_large = {fap + 1: float(largest[fap]) for fap in np.flatnonzero(largest > LARGEST_STEP)}
     assert not too_large
 
@@ -149,12 +149,12 @@ def test_another_process_continues_anywhere(
     move: Callable[[str, int], list[Frame]], lips: str, cut: int
 ) -> None:
     frames = move(lips, cut)
-    assert_unseen(frames, lips)
+    assert_no_visible_step(frames, lips)
     assert_closed_in_time(frames, lips)
 
 
 def test_stress_before_a_move_causes_no_brow_movement_after_it() -> None:
-    assert_unseen(move_to_another_synthesizer("learned", 143), "learned")
+    assert_no_visible_step(move_to_another_synthesizer("learned", 143), "learned")
 
 
 @pytest.mark.parametrize("fap", [JAW, LOWER_LIP, EYELID, HEAD_PITCH])
@@ -171,5 +171,5 @@ def test_continues_during_the_largest_movement(
         if isinstance(event, Progress) and event.time_s > known_s + 0.001
     )
     frames = move("learned", cut)
-    assert_unseen(frames, "learned")
+    assert_no_visible_step(frames, "learned")
     assert_closed_in_time(frames, "learned")

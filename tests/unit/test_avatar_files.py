@@ -303,7 +303,7 @@ def test_eye_bones_of_a_vrm_turn_the_eyes(tmp_path: Path, version: int, fap: str
 
 
 @pytest.mark.parametrize(
-    ("kept", "shift", "said"),
+    ("kept", "shift", "error_text"),
     [
         (["eyeBlinkLeft", "mouthPucker"], 0, "cannot speak: it has no shape jawOpen of ARKit"),
         ([], 0, "cannot speak: it has no shape jawOpen, mouthPucker of ARKit"),
@@ -312,7 +312,7 @@ def test_eye_bones_of_a_vrm_turn_the_eyes(tmp_path: Path, version: int, fap: str
     ids=["no mouth", "no shapes", "two avatars"],
 )
 def test_the_error_says_why_an_avatar_cannot_speak(
-    tmp_path: Path, kept: list[str], shift: float, said: str
+    tmp_path: Path, kept: list[str], shift: float, error_text: str
 ) -> None:
     parts = meshes({name: SHAPES[name] for name in kept})
     path = write_glb(tmp_path / "my.glb", parts)
@@ -322,5 +322,5 @@ def test_the_error_says_why_an_avatar_cannot_speak(
         document["nodes"] += [node | {"translation": [shift, 0, 0]} for node in document["nodes"]]
         document["scenes"][0]["nodes"] += [count + i for i in range(count)]
 
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=error_text):
         read_glb(edit(path, double) if shift else path)

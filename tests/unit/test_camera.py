@@ -22,7 +22,7 @@ def connection_to(url: str) -> DatagramConnection:
     return connection
 
 
-SPOKEN = frame_of(jawOpen=0.6)
+MOUTH_FRAME = frame_of(jawOpen=0.6)
 VMC = connection_to("vmc://?shapes=arkit&camera=39541")
 LIVE_LINK = LiveLinkConnection(parse_target("livelink://?camera=11112"))
 
@@ -40,7 +40,7 @@ def test_vmc_keeps_everything_but_the_mouth() -> None:
         encode_message("/VMC/Ext/OK", 1),
     ]
     for packets in (list(bundle_messages(sent)), sent):  # in bundles, or one by one
-        answers = [VMC.with_mouth(packet, SPOKEN) for packet in packets]
+        answers = [VMC.with_mouth(packet, MOUTH_FRAME) for packet in packets]
         messages = [parsed for passed, _ in answers for parsed in read_osc(list(passed)) if passed]
         assert any(has_mouth for _, has_mouth in answers)
         values = {args[0]: args[1] for address, args in messages if address.endswith("/Val")}
@@ -57,7 +57,7 @@ def test_a_tracker_without_shapes_does_not_replace_the_session() -> None:
     (packet,) = bundle_messages(
         [encode_message("/VMC/Ext/Bone/Pos", "Hips", 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)]
     )
-    packets, has_mouth = VMC.with_mouth(packet, SPOKEN)
+    packets, has_mouth = VMC.with_mouth(packet, MOUTH_FRAME)
     assert list(packets) == [packet]
     assert not has_mouth
 
@@ -66,11 +66,11 @@ def test_live_link_keeps_everything_but_the_mouth() -> None:
     tracked = frame_of(jawOpen=0.1, eyeBlinkLeft=0.4, mouthSmileLeft=0.8)
     tracked.faps[48] = 0.2e5  # the head's yaw
     packet = LiveLinkConnection(parse_target("livelink://?name=Phone")).encode_at(tracked, 12.0)
-    (changed,), has_mouth = LIVE_LINK.with_mouth(packet, SPOKEN)
+    (changed,), has_mouth = LIVE_LINK.with_mouth(packet, MOUTH_FRAME)
     before, after = read_live_link(packet), read_live_link(changed)
     assert has_mouth
     assert {**before, "values": ()} == {**after, "values": ()}
-    spoken = SPOKEN.weights("arkit")
+    spoken = MOUTH_FRAME.weights("arkit")
     for name, old, new in zip(LIVE_LINK_ORDER, before["values"], after["values"], strict=False):
         is_mouth = name.startswith(("jaw", "mouth", "tongue", "cheekPuff"))
         assert new == pytest.approx(spoken[name] if is_mouth else old)
@@ -83,7 +83,7 @@ PACKETS = (
             [encode_message("/VMC/Ext/Blend/Val", "A", 0.5), encode_message("/VMC/Ext/Blend/Apply")]
         )
     ),
-    LIVE_LINK.encode_at(SPOKEN, 0.0),
+    LIVE_LINK.encode_at(MOUTH_FRAME, 0.0),
 )
 
 
@@ -96,7 +96,7 @@ PACKETS = (
 def test_malformed_packets_are_dropped(packet: bytes) -> None:
     for connection in (VMC, LIVE_LINK):
         try:
-            packets, _ = connection.with_mouth(packet, SPOKEN)
+            packets, _ = connection.with_mouth(packet, MOUTH_FRAME)
         except ValueError:
             continue
         assert sum(map(len, packets)) < len(packet) + 20_000
@@ -106,12 +106,12 @@ def test_packets_that_cost_too_much_are_dropped() -> None:
     element = struct.pack(">i", 8) + b"/a\0\0,\0\0\0"
     header = b"#bundle\0" + bytes(8)
     with pytest.raises(ValueError, match="too many messages"):
-        VMC.with_mouth(header + 5000 * element, SPOKEN)
+        VMC.with_mouth(header + 5000 * element, MOUTH_FRAME)
     nested = b"/a\0\0,\0\0\0"
     for _ in range(1000):
         nested = header + struct.pack(">i", len(nested)) + nested
     with pytest.raises(ValueError, match="nested too deeply"):
-        VMC.with_mouth(nested, SPOKEN)
+        VMC.with_mouth(nested, MOUTH_FRAME)
 
 
 def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:

@@ -22,7 +22,7 @@ from tests.meshes import ORIGINAL, meshes, shape_error
 
 SHAPES = {name: ARKIT.basis[row] for row, name in enumerate(ARKIT.names)}
 VISEME_SHAPES = dict(zip(OCULUS.names, OCULUS.basis, strict=True))
-ORDER = np.random.default_rng(3).permutation(52)
+SHUFFLED = np.random.default_rng(3).permutation(52)
 
 
 def test_reads_an_exported_head_unchanged(tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_reads_an_exported_head_unchanged(tmp_path: Path) -> None:
 def test_reads_arkit_shapes_in_any_order_unit_and_position(
     tmp_path: Path, rename: Callable[[str], str], unit: tuple[int, int, int]
 ) -> None:
-    shapes = {rename(ARKIT.names[row]): ARKIT.basis[row] for row in ORDER}
+    shapes = {rename(ARKIT.names[row]): ARKIT.basis[row] for row in SHUFFLED}
     parts = meshes(shapes | {"somethingElse": ARKIT.basis[0]})
     for part in parts:
         part.vertices = (part.vertices + np.array([0.01, 6, -0.2])) * unit
@@ -149,7 +149,7 @@ def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
     return lambda document: document["meshes"][0]["primitives"][0].update(values)
 
 
-MANY = [{"attributes": {"POSITION": 0}}] * 2001
+TOO_MANY = [{"attributes": {"POSITION": 0}}] * 2001
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ MANY = [{"attributes": {"POSITION": 0}}] * 2001
         (change("accessors", 0, count=10**9), "more than 300000 vertices"),
         (change("accessors", 1, count=10**9), "an accessor has 1000000000 elements"),
         (change("accessors", 0, count=-1), "an accessor has -1"),
-        (change("meshes", 0, primitives=MANY), "more than 2000 meshes"),
+        (change("meshes", 0, primitives=TOO_MANY), "more than 2000 meshes"),
         (change("nodes", 0, translation=[1e300, 0, 0]), "not finite or very large"),
         (change("nodes", 0, translation=[float("nan"), 0, 0]), "NaN is not valid JSON"),
         (change("nodes", 0, scale=[0, 0, 0]), "cannot speak: it has no shape jawOpen"),

@@ -27,7 +27,7 @@ def levels(*parts: tuple[float, float]) -> list[float]:
     return [level_db for duration_s, level_db in parts for _ in range(round(duration_s / FRAME_S))]
 
 
-def show(
+def animate(
     face: FaceAnimator,
     levels_db: Sequence[float],
     step: int = 1,
@@ -46,10 +46,12 @@ def show(
     return np.array([faps for _, faps in frames])
 
 
-def lively(levels_db: Sequence[float], seed: int = 3) -> NDArray[np.float32]:
+def added_motion(levels_db: Sequence[float], seed: int = 3) -> NDArray[np.float32]:
     """Return the difference from the motion with an even voice."""
     even = [QUIET_DB] * len(levels_db)
-    spoken, plain = (show(make_face(idle_motion_seed=seed), curve) for curve in (levels_db, even))
+    spoken, plain = (
+        animate(make_face(idle_motion_seed=seed), curve) for curve in (levels_db, even)
+    )
     return spoken - plain
 
 
@@ -59,8 +61,8 @@ STRESSED, STRONG = (
 
 
 def test_the_head_nods_on_stressed_syllables_and_brows_rise_on_the_strongest() -> None:
-    stressed, strong = lively(STRESSED), lively(STRONG)
-    np.testing.assert_array_equal(strong, lively(STRONG))
+    stressed, strong = added_motion(STRESSED), added_motion(STRONG)
+    np.testing.assert_array_equal(strong, added_motion(STRONG))
     assert not stressed[:, BROW].any()
     assert 20.0 < strong[:, BROW].max() < 60.0
     assert DEGREE / 2 < stressed[:, PITCH].max() < strong[:, PITCH].max() < 2.5 * DEGREE
@@ -74,32 +76,36 @@ def test_the_head_nods_at_the_end_of_a_phrase_and_tilts_after_a_question() -> No
     flat = [200.0] * 100 + [0.0] * 30
     rising = [200.0] * 85 + [200.0 * 2 ** (k / 15) for k in range(1, 16)] + [0.0] * 30
     statement, question = (
-        show(make_face(idle_motion_seed=3), sound, pitches_hz=pitches) for pitches in (flat, rising)
+        animate(make_face(idle_motion_seed=3), sound, pitches_hz=pitches)
+        for pitches in (flat, rising)
     )
     difference = question - statement
     assert np.abs(difference[:105, ROLL]).max() < 1.0
     assert np.abs(difference[105:, ROLL]).max() > 1.5 * DEGREE
     assert difference[105:, BROW].max() > 30.0
-    even = show(make_face(idle_motion_seed=3), [QUIET_DB] * len(sound))
+    even = animate(make_face(idle_motion_seed=3), [QUIET_DB] * len(sound))
     assert (statement - even)[100:, PITCH].max() > DEGREE / 2
 
 
 def test_the_head_holds_still_in_pauses() -> None:
     pause = levels((1.0, QUIET_DB), (1.4, SILENT_DB), (10.0, SILENT_DB))
     faps = np.mean(
-        [np.abs(np.diff(show(make_face(idle_motion_seed=seed), pause)[:, ROLL])) for seed in SEEDS],
+        [
+            np.abs(np.diff(animate(make_face(idle_motion_seed=seed), pause)[:, ROLL]))
+            for seed in SEEDS
+        ],
         axis=0,
     )
     assert faps[110:170].mean() < 0.5 * faps[300:].mean()  # less than while listening later
 
 
-def test_does_not_move_lips_and_is_independent_of_chunks() -> None:
+def test_idle_motion_moves_no_lips_and_does_not_depend_on_chunks() -> None:
     sound = STRESSED + levels((0.5, SILENT_DB)) + STRESSED
-    one, other = (show(make_face(idle_motion_seed=5), sound, step) for step in (1, 17))
-    np.testing.assert_array_equal(one, other)
-    assert one[:, BROW].any() or one[:, PITCH].any()
-    assert not one[:, np.array(MOUTH_FAPS) - 1].any()
-    assert not show(make_face(), sound).any()  # seed 0: off
+    by_slice, in_chunks = (animate(make_face(idle_motion_seed=5), sound, step) for step in (1, 17))
+    np.testing.assert_array_equal(by_slice, in_chunks)
+    assert by_slice[:, BROW].any() or by_slice[:, PITCH].any()
+    assert not by_slice[:, np.array(MOUTH_FAPS) - 1].any()
+    assert not animate(make_face(), sound).any()  # seed 0: off
 
 
 def gaze_deg(faps: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -111,7 +117,10 @@ def gaze_deg(faps: NDArray[np.float32]) -> NDArray[np.float32]:
 def test_the_gaze_leaves_the_viewer_when_speech_starts_and_returns_at_its_end() -> None:
     speech = levels((3.0, QUIET_DB), (0.8, SILENT_DB))
     away = np.mean(
-        [np.abs(gaze_deg(show(make_face(idle_motion_seed=s), speech))) > 1.5 for s in range(1, 31)],
+        [
+            np.abs(gaze_deg(animate(make_face(idle_motion_seed=s), speech))) > 1.5
+            for s in range(1, 31)
+        ],
         axis=0,
     )
     start, end = away[20:45].mean(), away[165:185].mean()
@@ -137,7 +146,7 @@ def test_a_listener_looks_at_the_viewer_and_nods_and_blinks_slowly_in_pauses() -
 def test_a_still_face_with_eye_contact_only_breathes_and_blinks() -> None:
     face = make_face(idle_motion_seed=3)
     face.set_idle_motion(IdleMotionSettings(still=True, eye_contact=True))
-    faps = show(face, STRONG * 5)[150:]
+    faps = animate(face, STRONG * 5)[150:]
     assert not faps[:, BROW].any()
     assert np.abs(faps[:, [YAW, ROLL]]).max() < 0.15 * DEGREE
     assert 0.2 * DEGREE < np.ptp(faps[:, PITCH]) < DEGREE  # breath

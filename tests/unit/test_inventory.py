@@ -9,7 +9,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from tests.languages import MANDARIN, install_language
 
-MANY = tuple(chr(97 + n // 26) + chr(97 + n % 26) for n in range(256))
+TOO_MANY_PHONES = tuple(chr(97 + n // 26) + chr(97 + n % 26) for n in range(256))
 
 
 def small(**changes: object) -> PhoneInventory:
@@ -39,7 +39,7 @@ def test_mandarin_has_the_phones_of_the_paper() -> None:
     [
         ({"phones": ("m", "m", "sil")}, "phones must be distinct"),
         ({"phones": ("m", "A", "sil")}, "1 to 4 letters a-z"),
-        ({"phones": MANY}, "more than 255 phones"),
+        ({"phones": TOO_MANY_PHONES}, "more than 255 phones"),
         ({"kinds": ("initial", "vowel", "vowel")}, "exactly one phone must be silence"),
         ({"kinds": ("initial", "silence", "vowel")}, "exactly one phone must be silence: sil"),
         ({"kinds": ("initial", "final", "silence")}, "one of initial, vowel, silence"),

@@ -21,12 +21,12 @@ JAW, LOWER_LIP = 2, 4  # columns of FAPs 3 and 5
 HEIGHTS = np.array([4, 5, 8, 9, 10, 11]) - 1  # of the inner lips
 DELAY_S = 0.1
 LIPS_DELAY_S = 0.085
-OPEN = {3: 300.0} | dict.fromkeys((4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58), -200.0)
+OPEN_MOUTH = {3: 300.0} | dict.fromkeys((4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58), -200.0)
 
 
 def lip_frame(time_s: float, opening: float = 1.0, closure: float = 0.0) -> LipPositions:
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
-    for fap, value in OPEN.items():
+    for fap, value in OPEN_MOUTH.items():
         faps[MOUTH_FAPS.index(fap)] = opening * value
     return LipPositions(
         time_s=time_s, delay_s=LIPS_DELAY_S, faps=faps, closure=closure, lip_to_teeth=0.0
@@ -48,7 +48,7 @@ def run(
     face: FaceAnimator,
     begin_s: float,
     end_s: float,
-    make: Callable[[float], LipPositions | None],
+    lip_frame_at: Callable[[float], LipPositions | None],
     phones: Sequence[tuple[float, Phone]] = (),
 ) -> list[Frame]:
     """Process sound with lip frames 5 ms before its slices, like a recognizer's output."""
@@ -58,7 +58,7 @@ def run(
         for due_s, known in phones:
             if now_s - 0.02 < due_s <= now_s:
                 face.process(known)
-        lips = make(now_s - 0.005 - LIPS_DELAY_S)
+        lips = lip_frame_at(now_s - 0.005 - LIPS_DELAY_S)
         if lips is not None:
             frames += face.process(lips)
         frames += face.process(Progress(time_s=now_s, level_db=-20.0))
@@ -73,24 +73,24 @@ def at(frames: Sequence[Frame], time_s: float) -> NDArray[np.float32]:
     return min(frames, key=lambda frame: abs(frame[0] - time_s))[1]
 
 
-def wave(time_s: float) -> LipPositions:
+def opening_wave(time_s: float) -> LipPositions:
     return lip_frame(time_s, opening=0.5 - 0.5 * np.cos(2.0 * np.pi * 4.0 * time_s))
 
 
-def closing(
+def closing_lips(
     closure: float, begin_s: float = 0.46, end_s: float = 0.54
 ) -> Callable[[float], LipPositions]:
     """Return open lips whose predicted closure is high for some time."""
     return lambda time_s: lip_frame(time_s, closure=closure if begin_s < time_s < end_s else 0.01)
 
 
-def nothing(_time_s: float) -> None:
+def no_lip_frame(_time_s: float) -> None:
     return None
 
 
 def test_follows_the_lip_frames() -> None:
     face = speaking_face()
-    frames = [frame for frame in run(face, 0.0, 2.0, wave) if frame[0] > 0.2]
+    frames = [frame for frame in run(face, 0.0, 2.0, opening_wave) if frame[0] > 0.2]
     expected = [150.0 - 150.0 * np.cos(2.0 * np.pi * 4.0 * time_s) for time_s, _ in frames]
     assert np.abs(values(frames, JAW) - expected).max() < 0.04 * 300.0
     assert np.corrcoef(values(frames, LOWER_LIP), expected)[0, 1] < -0.999
@@ -100,7 +100,7 @@ def test_lips_stay_ajar_after_speech_and_then_close() -> None:
     face = speaking_face()
     frames = run(face, 0.0, 1.1, lip_frame)
     face.process(SpeechChange(active=False, time_s=1.0))
-    frames += run(face, 1.1, 3.0, nothing)
+    frames += run(face, 1.1, 3.0, no_lip_frame)
     opening = {time_s: -float(faps[3] + faps[4]) for time_s, faps in frames}
     assert all(120.0 <= opening[time_s] <= 400.0 for time_s in opening if 0.2 < time_s < 1.8)
     assert all(opening[time_s] <= 250.0 for time_s in opening if time_s > 1.15)
@@ -119,7 +119,7 @@ def test_prediction_and_phone_decide_a_closure_together(
     closure: float, confidence: float, shuts: bool
 ) -> None:
     face = speaking_face()
-    frames = run(face, 0.0, 1.0, closing(closure), [(0.52, phone("p", 0.46, confidence))])
+    frames = run(face, 0.0, 1.0, closing_lips(closure), [(0.52, phone("p", 0.46, confidence))])
     height = np.abs(at(frames, 0.5)[HEIGHTS]).max()
     assert height < 10.0 if shuts else height > 190.0
 
@@ -127,7 +127,7 @@ def test_prediction_and_phone_decide_a_closure_together(
 def test_dynamic_visemes_move_the_mouth_without_lip_frames() -> None:
     phones = [(0.4, phone("d", 0.35, index=0)), (0.5, phone("a", 0.42, index=1))]
     learned, visemes = (
-        run(speaking_face(lips), 0.0, 0.6, nothing, phones) for lips in (None, LIPS)
+        run(speaking_face(lips), 0.0, 0.6, no_lip_frame, phones) for lips in (None, LIPS)
     )
     assert values(learned, JAW).max() > 50.0
     assert np.corrcoef(values(learned, JAW), values(visemes, JAW))[0, 1] > 0.99
@@ -145,11 +145,11 @@ def test_changing_the_lip_model_is_continuous(to_learned: bool) -> None:
             (0.02 + 0.1 * index, phone(symbol, 0.1 * index, index=index))
             for index, symbol in enumerate(["d", "a", "sh", "i", "g", "u", "d", "a", "g", "u"])
         ]
-        shown = run(face, 0.0, 0.6, wave, phones[:6])
+        shown = run(face, 0.0, 0.6, opening_wave, phones[:6])
         if changes:
             face.set_lip_model(second)
             face.set_lip_model(second)
-        frames.append(shown + run(face, 0.6, 1.2, wave, phones[6:]))
+        frames.append(shown + run(face, 0.6, 1.2, opening_wave, phones[6:]))
     changed = values(frames[0], JAW)
     steps = np.diff(changed)
     here = round((0.6 - DELAY_S) * 240)

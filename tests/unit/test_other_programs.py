@@ -31,7 +31,7 @@ def clip_named(name: str) -> LipClip:
     return LipClip(name=name, speaker="ann", time_s=TIME_S, faps=faps, samples=samples)
 
 
-HELD, TRAINING = clip_named("held_1"), clip_named("train_1")
+HELD_OUT, TRAINING = clip_named("held_1"), clip_named("train_1")
 
 
 def write_table(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
@@ -43,22 +43,22 @@ def write_table(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
 def late_opening() -> dict[str, NDArray[np.float64]]:
     """Return the opening in a unit of its own, made 0.1 s after its audio."""
     known_s = np.arange(900) / 100.0
-    mouth = real_mouth(HELD.time_s, real_faps(HELD))
+    mouth = real_mouth(HELD_OUT.time_s, real_faps(HELD_OUT))
     return {"t": known_s, "opening": 0.02 * mouth.at("opening", known_s - LATE_S) + 0.5}
 
 
 def test_an_opening_is_scored_at_its_own_delay(tmp_path: Path) -> None:
     folder = tmp_path / "mine"
     folder.mkdir()
-    for clip in (HELD, TRAINING):
+    for clip in (HELD_OUT, TRAINING):
         write_table(folder / f"{clip.name}.csv", late_opening())
-    programs = load_programs([folder], [HELD], [TRAINING])
+    programs = load_programs([folder], [HELD_OUT], [TRAINING])
     shipped, fitted = programs
     assert shipped == "mine, 100 ms"
     assert fitted.startswith("mine, fitted, ")
-    real = real_mouth(HELD.time_s, real_faps(HELD))
+    real = real_mouth(HELD_OUT.time_s, real_faps(HELD_OUT))
     for mouth_of in programs.values():
-        mouth = mouth_of(HELD)
+        mouth = mouth_of(HELD_OUT)
         correlation = moments([(mouth, real)], "opening").correlation
         assert correlation is not None
         assert correlation > 0.99
@@ -67,26 +67,26 @@ def test_an_opening_is_scored_at_its_own_delay(tmp_path: Path) -> None:
 
 def test_the_faps_of_a_program_are_at_its_best_delay(tmp_path: Path) -> None:
     write_table(tmp_path / "held_1.csv", late_opening())
-    real = real_mouth(HELD.time_s, real_faps(HELD))
+    real = real_mouth(HELD_OUT.time_s, real_faps(HELD_OUT))
     mouth = predicted_mouth(
-        load_program_faps(tmp_path, [HELD])(HELD, np.arange(430) / FRAME_RATE_HZ)
+        load_program_faps(tmp_path, [HELD_OUT])(HELD_OUT, np.arange(430) / FRAME_RATE_HZ)
     )
     correlation = moments([(mouth, real)], "opening").correlation
     assert correlation is not None
     assert correlation > 0.99
     with pytest.raises(UserError, match=r"add train_1\.csv"):
-        load_program_faps(tmp_path, [HELD, TRAINING])
+        load_program_faps(tmp_path, [HELD_OUT, TRAINING])
 
 
 def test_without_training_clips_the_curves_count_as_they_are(tmp_path: Path) -> None:
     write_table(tmp_path / "held_1.csv", late_opening())
-    assert [*load_programs([tmp_path], [HELD], [TRAINING])] == [f"{tmp_path.name}, 0 ms"]
+    assert [*load_programs([tmp_path], [HELD_OUT], [TRAINING])] == [f"{tmp_path.name}, 0 ms"]
 
 
 @pytest.mark.parametrize("jaw", ["jawOpen", "viseme_aa", "aa"])
 def test_shapes_open_the_mouth(tmp_path: Path, jaw: str) -> None:
     write_table(tmp_path / "held_1.csv", {jaw: np.array([0.0, 1.0]), "t": np.array([0.0, 0.01])})
-    table = read_tables(tmp_path, [HELD], [])["held_1"]
+    table = read_tables(tmp_path, [HELD_OUT], [])["held_1"]
     faps = fap_conversion(tmp_path, [table]).faps(table.values)
     assert not faps[0].any()
     assert -faps[1, 3] - faps[1, 4] > 200.0
@@ -113,11 +113,11 @@ def test_a_damaged_table_is_an_error(tmp_path: Path, text: str, fault: str) -> N
 
 def test_missing_and_unusable_tables_are_errors(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"1 of 1 held-out clips have no table; add held_1.csv"):
-        read_tables(tmp_path, [HELD], [])
+        read_tables(tmp_path, [HELD_OUT], [])
     write_table(tmp_path / "held_1.csv", late_opening())
     write_table(tmp_path / "train_1.csv", {"t": np.zeros(1), "jawOpen": np.zeros(1)})
     with pytest.raises(UserError, match=r"train_1.csv: its columns differ"):
-        read_tables(tmp_path, [HELD], [TRAINING])
+        read_tables(tmp_path, [HELD_OUT], [TRAINING])
     write_table(tmp_path / "held_1.csv", {"t": np.zeros(1), "energy": np.zeros(1)})
     with pytest.raises(UserError, match="no column is a curve of a mouth"):
-        load_programs([tmp_path], [HELD], [])
+        load_programs([tmp_path], [HELD_OUT], [])

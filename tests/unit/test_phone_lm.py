@@ -55,8 +55,8 @@ def with_values(array: NDArray[Any], values: dict[int, int]) -> NDArray[Any]:
     return array
 
 
-LEAVES = [0] * NUM_PHONES
-Change = Callable[[NDArray[Any]], NDArray[Any]]
+NO_CHILDREN = [0] * NUM_PHONES
+ArrayChange = Callable[[NDArray[Any]], NDArray[Any]]
 
 
 @pytest.mark.parametrize(
@@ -64,11 +64,11 @@ Change = Callable[[NDArray[Any]], NDArray[Any]]
     [
         ("lm_children", lambda c: with_values(c, {0: c[0] - 1, 1: c[1] + 1}), "not form a tree"),
         # the sum is right, but a child is before its parent
-        ("lm_children", lambda _: np.array([NUM_PHONES, *LEAVES, 0, 3, 0]), "not form a tree"),
+        ("lm_children", lambda _: np.array([NUM_PHONES, *NO_CHILDREN, 0, 3, 0]), "not form a tree"),
         # a sum that overflows to the right one
         (
             "lm_children",
-            lambda _: np.array([NUM_PHONES, *[2**62] * 4, *LEAVES[4:]]),
+            lambda _: np.array([NUM_PHONES, *[2**62] * 4, *NO_CHILDREN[4:]]),
             "not form a tree",
         ),
         ("lm_phone", lambda p: with_values(p, {3: p[4], 4: p[3]}), "not in order"),
@@ -77,7 +77,7 @@ Change = Callable[[NDArray[Any]], NDArray[Any]]
         ("lm_log_backoff", lambda values: values[:-1], "lm_log_backoff has shape"),
     ],
 )
-def test_rejects_damaged_arrays(name: str, change: Change, message: str) -> None:
+def test_rejects_damaged_arrays(name: str, change: ArrayChange, message: str) -> None:
     arrays = phone_lm_arrays(table(0, 3, 0.5).tree())
     with pytest.raises(ValueError, match=message):
         parse_phone_lm(Archive({**arrays, name: change(arrays[name])}))

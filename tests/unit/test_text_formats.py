@@ -13,7 +13,7 @@ from kouxing.shared.phones.inventory import load_inventory
 from tests.languages import MANDARIN
 
 ONE, TWO = "大家好，我是人。", "请看我的嘴唇。"
-SAID = "大家好我是人请看我的嘴唇"
+SPOKEN_TEXT = "大家好我是人请看我的嘴唇"
 
 TEXTS = {
     "": f"{ONE}{TWO}",
@@ -141,14 +141,14 @@ def test_extracts_the_spoken_text(form: str) -> None:
     spoken = extract_text(TEXTS[form])
     assert spoken.form == form
     transcript = MANDARIN.read(spoken.text)
-    assert "".join(syllable.text for syllable in transcript.syllables) == SAID
+    assert "".join(syllable.text for syllable in transcript.syllables) == SPOKEN_TEXT
     assert transcript.dropped == ()
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "spoken_text"),
     [
-        (SHORT_TEXT_GRID, SAID),
+        (SHORT_TEXT_GRID, SPOKEN_TEXT),
         (
             '[{"from": 0.4, "content": "大家好"}, {"from": 3.2, "content": "我是人"}]',
             "大家好我是人",
@@ -199,9 +199,9 @@ def test_extracts_the_spoken_text(form: str) -> None:
         ("１２：３０，２个", "十二点三十分两个"),
     ],
 )
-def test_reads_times_only_where_they_are_spoken(text: str, said: str) -> None:
+def test_reads_times_only_where_they_are_spoken(text: str, spoken_text: str) -> None:
     transcript = MANDARIN.read(extract_text(text).text)
-    assert "".join(syllable.text for syllable in transcript.syllables) == said
+    assert "".join(syllable.text for syllable in transcript.syllables) == spoken_text
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,7 @@ def test_reads_a_subtitle_file_and_names_its_format(
 ) -> None:
     path = tmp_path / "said.srt"
     path.write_bytes(TEXTS["SubRip (SRT)"].encode("gb18030", "ignore"))
-    assert len(read_text(str(path), MANDARIN).syllables) == len(SAID)
+    assert len(read_text(str(path), MANDARIN).syllables) == len(SPOKEN_TEXT)
     assert "said.srt was read as SubRip (SRT) in GB18030" in capsys.readouterr().err
 
 
