@@ -57,8 +57,8 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_PAUSE_PROB", 0.0)
     monkeypatch.setattr(batches, "_ONLY_BACKGROUND_PROB", 0.0)
     monkeypatch.setattr(batches, "change_speed", lambda samples, _: (samples, 1.0))
-    material = BatchSource([piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS)
-    _, rows = draw_batch(material, 0, 1)
+    batch_source = BatchSource([piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS)
+    _, rows = draw_batch(batch_source, 0, 1)
     lips = rows[0, 100, COLUMNS.lips].reshape(-1, NUM_OUTPUTS)[:, 0] - rows[0, 100, PITCH]
     # A position's audio ends 45 ms after its start, and the target of row 0 is at 20 ms.
     np.testing.assert_allclose(lips, (0.045 - np.array(LIP_DELAYS_S)) / 0.02 - 1, atol=0.51)

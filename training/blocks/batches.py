@@ -80,18 +80,18 @@ class BlockBatch:
     start: int  # row of the first position
 
 
-def draw_block_batch(material: BatchSource, seed: int, number: int) -> BlockBatch:
+def draw_block_batch(batch_source: BatchSource, seed: int, number: int) -> BlockBatch:
     """Draw the batch with this number; the batches of a step have the same shape."""
     of_step = np.random.default_rng([seed, number // BATCHES_PER_STEP])
     length = int(of_step.choice(_LENGTHS))
     block = _BLOCKS[int(of_step.choice(len(_BLOCKS), p=_BLOCK_PROBS))]
     start = 0 if of_step.random() < _FIRST_ROW_PROB else int(of_step.integers(_MAX_START))
     rng = np.random.default_rng([seed, 1, number])
-    probs = np.cumsum(sampling_probs(material.recordings))
+    probs = np.cumsum(sampling_probs(batch_source.recordings))
     num_frames = 2 * (length + _BEYOND) + 1
     disturbed, clean, states, target_probs = [], [], [], []
     for _ in range(_POSITIONS_PER_S * BATCH_S // length):
-        both, targets = _excerpt(material, probs, num_frames, rng)
+        both, targets = _draw_excerpt(batch_source, probs, num_frames, rng)
         bands = both[:, :NUM_MELS]
         clean.append(np.maximum(bands, bands.max() - FLOOR_BANDS).T)
         disturbed.append(both[: 2 * length + 1, NUM_MELS:])
@@ -108,8 +108,8 @@ def draw_block_batch(material: BatchSource, seed: int, number: int) -> BlockBatc
     )
 
 
-def _excerpt(
-    material: BatchSource, probs: NDArray[np.float64], num_frames: int, rng: np.random.Generator
+def _draw_excerpt(
+    batch_source: BatchSource, probs: NDArray[np.float64], num_frames: int, rng: np.random.Generator
 ) -> tuple[Floats, FrameTargets]:
     """Draw an excerpt: frames, clean and disturbed, (num_frames, 160), and their targets."""
     tempo, shortening = 1.0, 0.0
@@ -121,13 +121,13 @@ def _excerpt(
         shortening = rng.uniform(0, _MAX_SHORTENING)
     stretch = tempo / (1 - _MEAN_STEADINESS * shortening)
     num_source = math.ceil(_MAX_SPEED * stretch * num_frames) + 2
-    samples, targets = _speech(material.recordings, probs, num_source, rng)
+    samples, targets = _draw_speech(batch_source.recordings, probs, num_source, rng)
     sound, speed = change_speed(samples, rng)
     sound = sound[: HOP_SAMPLES * (math.ceil(stretch * num_frames) + 3)]
     sound = (sound * (_TEACHER_PEAK / (np.abs(sound).max() + _TINY))).astype(np.float32)
     disturbed = sound
     if rng.random() < _DISTURB_PROB:
-        disturbed = _distort(disturb(_add_background(sound, material, rng), rng), rng)
+        disturbed = _distort(disturb(_add_background(sound, batch_source, rng), rng), rng)
     frames = np.hstack(
         [WhisperMel().accept_waveform(version) for version in (sound, scale_level(disturbed, rng))]
     )
@@ -136,7 +136,7 @@ def _excerpt(
     return frames[kept], targets.select(source[kept])
 
 
-def _speech(
+def _draw_speech(
     recordings: Sequence[LabeledRecording],
     probs: NDArray[np.float64],
     num_frames: int,
@@ -180,14 +180,16 @@ def _shorten(frames: Floats, tempo: float, shortening: float, num_frames: int) -
     return np.minimum(source_frames, len(frames) - 1)
 
 
-def _add_background(sound: Samples, material: BatchSource, rng: np.random.Generator) -> Samples:
+def _add_background(sound: Samples, batch_source: BatchSource, rng: np.random.Generator) -> Samples:
     """Add music, noise or other voices of random levels, or nothing."""
     draw = rng.random()
     if draw < _BABBLE_PROB:
-        numbers = rng.integers(len(material.recordings), size=int(rng.integers(1, _MAX_VOICES + 1)))
-        others: list[Integers] = [material.recordings[number].samples for number in numbers]
-    elif draw < _BABBLE_PROB + _MUSIC_PROB and material.backgrounds:
-        others = [material.backgrounds[int(rng.integers(len(material.backgrounds)))]]
+        numbers = rng.integers(
+            len(batch_source.recordings), size=int(rng.integers(1, _MAX_VOICES + 1))
+        )
+        others: list[Integers] = [batch_source.recordings[number].samples for number in numbers]
+    elif draw < _BABBLE_PROB + _MUSIC_PROB and batch_source.backgrounds:
+        others = [batch_source.backgrounds[int(rng.integers(len(batch_source.backgrounds)))]]
     else:
         return sound
     mixed = add_sounds(sound, others, rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB), rng)

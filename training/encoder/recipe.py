@@ -111,8 +111,8 @@ def train_encoder(
     folder.mkdir(parents=True, exist_ok=True)
     lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", filmed, teachers, seed)
     store = TargetStore(folder, recordings, teachers, lip_teacher, errors, seed)
-    material = BatchSource(store.pieces(), backgrounds, TargetColumns(len(inventory)))
-    trained = _train_network(material, num_steps, seed, output)
+    batch_source = BatchSource(store.pieces(), backgrounds, TargetColumns(len(inventory)))
+    trained = _train_network(batch_source, num_steps, seed, output)
     trained.rescale_lips(store.lips_mean, store.lips_deviation)
     save_encoder(output, trained)
     write_card(
@@ -172,16 +172,18 @@ def _load_lip_teacher(
     return LipTeacher.load(path)
 
 
-def _train_network(material: BatchSource, num_steps: int, seed: int, output: Path) -> AudioEncoder:
+def _train_network(
+    batch_source: BatchSource, num_steps: int, seed: int, output: Path
+) -> AudioEncoder:
     torch.manual_seed(seed)
-    encoder = AudioEncoder(material.columns.num_phones).to(DEVICE)
+    encoder = AudioEncoder(batch_source.columns.num_phones).to(DEVICE)
     batches: Iterator[Batch] | None = None
 
     def loss(step: int) -> Tensor:
         nonlocal batches
         if batches is None:
             numbers = range(step, num_steps)
-            batches = process_in_order(partial(draw_batch, material, seed), numbers)
+            batches = process_in_order(partial(draw_batch, batch_source, seed), numbers)
         with mixed_precision():
             return encoder.loss(
                 *(torch.from_numpy(part).to(DEVICE).float() for part in next(batches))

@@ -83,10 +83,12 @@ def draw_phones(
     for step in track(range(_CONTEXT_WORDS, drawn.shape[1]), description="words"):
         context = drawn[:, step - _CONTEXT_WORDS : step]
         drawn[:, step] = _next_words(levels, context, rng)
-    return _stream(drawn.ravel(), words, inventory)  # word 0, before each chain, is a pause
+    return _phones_of_words(
+        drawn.ravel(), words, inventory
+    )  # word 0, before each chain, is a pause
 
 
-def _stream(
+def _phones_of_words(
     drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory
 ) -> PhoneStream:
     silence = inventory.index[inventory.silence]
