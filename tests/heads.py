@@ -26,12 +26,12 @@ def neutral_faps(**values: float) -> NDArray[np.float32]:
     return faps
 
 
-OPEN = neutral_faps(
+OPEN_MOUTH = neutral_faps(
     open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
     lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, raise_b_midlip_o=-510,
     raise_b_lip_lm_o=-520, raise_b_lip_rm_o=-520,
 )  # fmt: skip
-DISPLACING = [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"]
+DISPLACING_FAPS = [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"]
 
 
 @functools.cache

@@ -25,7 +25,7 @@ class LipPositions(Result, frozen=True, kw_only=True):
     lip_to_teeth: float
 
 
-class Stream:
+class StreamedSession:
     """A session and everything that it has published."""
 
     def __init__(self, session: Session) -> None:
@@ -94,7 +94,7 @@ class Stream:
         return [last[index] for index in sorted(last)]
 
 
-def stream(
+def stream_audio(
     control: str,
     samples: NDArray[Any],
     *,
@@ -102,12 +102,12 @@ def stream(
     sample_rate_hz: int = RATE_HZ,
     paced: bool = False,
     **options: Any,
-) -> Stream:
+) -> StreamedSession:
     """Stream samples, paced or as fast as possible, and wait for the last frame."""
     options = {"encoding": "f32le", **options}
     options |= {"sample_rate_hz": sample_rate_hz, "paced": paced}
     with Client(control) as client, client.open_session(**options) as session:
-        sent = Stream(session)
-        sent.send(samples, chunk=chunk, rate_hz=sample_rate_hz, paced=paced)
-        sent.finish()
-    return sent
+        streamed = StreamedSession(session)
+        streamed.send(samples, chunk=chunk, rate_hz=sample_rate_hz, paced=paced)
+        streamed.finish()
+    return streamed

@@ -17,7 +17,7 @@ from aiortc.rtcdtlstransport import RTCDtlsTransport
 from kouxing.services.gateway.browser_messages import FAP_TYPE, SHAPES_TYPE
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.inventory import load_inventory
-from tests.e2e.streaming import stream
+from tests.e2e.streaming import stream_audio
 from tests.system import DEMO, LIMIT_S, System, samples_of_file
 
 SDP = "application/sdp"
@@ -29,7 +29,7 @@ Send = Callable[[RTCDtlsTransport, bytes], Coroutine[None, None, None]]
 @pytest.fixture(scope="module")
 def expected_phones(system: System) -> list[str]:
     """The phones of the recording, without pauses."""
-    return without_silence(stream(system.control, samples_of_file(SPEECH)).symbols)
+    return without_silence(stream_audio(system.control, samples_of_file(SPEECH)).symbols)
 
 
 def without_silence(symbols: list[str]) -> list[str]:

@@ -27,7 +27,7 @@ from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.events import event_to_message
 from tests.e2e.conftest import CommandRunner
-from tests.e2e.streaming import Stream, stream
+from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.lips import LIPS
 from tests.system import DEMO, LIMIT_S, VOWELS_FILE, System, samples_of_file, start_python
 
@@ -44,21 +44,21 @@ def opening(frame: FapFrame) -> float:
 
 
 @pytest.fixture(scope="module")
-def sent(system: System) -> Stream:
-    return stream(system.control, SENTENCE)
+def streamed(system: System) -> StreamedSession:
+    return stream_audio(system.control, SENTENCE)
 
 
-def test_phones_become_final_and_speech_starts_and_ends(sent: Stream) -> None:
-    assert len(sent.symbols) > 20
-    assert {*sent.symbols} <= {*load_inventory().phones}
-    assert all({phone.index: phone.final for phone in sent.phones}.values())
-    states = [speech.active for speech in sent.speech]
+def test_phones_become_final_and_speech_starts_and_ends(streamed: StreamedSession) -> None:
+    assert len(streamed.symbols) > 20
+    assert {*streamed.symbols} <= {*load_inventory().phones}
+    assert all({phone.index: phone.final for phone in streamed.phones}.values())
+    states = [speech.active for speech in streamed.speech]
     assert (states[0], states[-1]) == (True, False)
     assert all(before != after for before, after in itertools.pairwise(states))
 
 
-def test_the_sound_is_the_audio_that_was_sent(sent: Stream) -> None:
-    sound = np.concatenate([np.frombuffer(sound.pcm, "<i2") for sound in sent.sounds])
+def test_the_sound_is_the_audio_that_was_sent(streamed: StreamedSession) -> None:
+    sound = np.concatenate([np.frombuffer(sound.pcm, "<i2") for sound in streamed.sounds])
     np.testing.assert_allclose(sound / 32768, SENTENCE, atol=1e-4)
 
 
@@ -67,16 +67,16 @@ def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
         Client(system.control) as client,
         client.open_session(encoding="f32le", paced=False) as session,
     ):
-        sent = Stream(session)
-        sent.send(SENTENCE[:24000], chunk=8000)
-        sent.collect_until(lambda: sent.times[-1:] >= [24000 - DELAY])
-        assert opening(sent.frames[-1]) > 50, "the mouth is open in mid-sentence"
-        num_before = len(sent.frames)
+        streamed = StreamedSession(session)
+        streamed.send(SENTENCE[:24000], chunk=8000)
+        streamed.collect_until(lambda: streamed.times[-1:] >= [24000 - DELAY])
+        assert opening(streamed.frames[-1]) > 50, "the mouth is open in mid-sentence"
+        num_before = len(streamed.frames)
         session.flush()
         client.open_session().close()  # every service has processed control's messages
         session.push(np.zeros(8000, np.float32))
-        sent.collect_until(lambda: sent.times[-1] >= 32000 - 3200)
-    after = sent.frames[num_before:]
+        streamed.collect_until(lambda: streamed.times[-1] >= 32000 - 3200)
+    after = streamed.frames[num_before:]
     assert max(map(opening, after[8:])) < 1, "150 ms are 7.5 frames"
 
 
@@ -97,21 +97,21 @@ def test_services_send_the_frames_of_the_chain(
 ) -> None:
     samples = at_rate(samples_of_file(DEMO / f"{name}.wav")[:48000], rate_hz)
     samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
-    sent = stream(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
+    streamed = stream_audio(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
     chain = LivePipeline(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
-    assert sent.times == [to_samples(time_s) for time_s, _ in frames]
-    np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
-    assert sent.faps[:, MOUTH].any()
-    assert lip_frames_of(sent) == [
+    assert streamed.times == [to_samples(time_s) for time_s, _ in frames]
+    np.testing.assert_array_equal(streamed.faps, np.array([faps for _, faps in frames]))
+    assert streamed.faps[:, MOUTH].any()
+    assert lip_frames_of(streamed) == [
         event_to_message(event) for event in chain.events if isinstance(event, LipPositions)
     ]
-    assert sent.lips
+    assert streamed.lips
     recognized_phones = [event for event in chain.events if isinstance(event, events.Phone)]
     assert [
         (phone.index, phone.symbol, phone.media_time, phone.duration, phone.confidence, phone.final)
-        for phone in sent.phones
+        for phone in streamed.phones
     ] == [
         (
             phone.index,
@@ -125,7 +125,7 @@ def test_services_send_the_frames_of_the_chain(
     ]
 
 
-def lip_frames_of(sent: Stream) -> list[speech.LipPositions]:
+def lip_frames_of(streamed: StreamedSession) -> list[speech.LipPositions]:
     """Lip frames without session, epoch and sequence."""
     return [
         speech.LipPositions(
@@ -135,7 +135,7 @@ def lip_frames_of(sent: Stream) -> list[speech.LipPositions]:
             closure=lips.closure,
             lip_to_teeth=lips.lip_to_teeth,
         )
-        for lips in sent.lips
+        for lips in streamed.lips
     ]
 
 

@@ -7,7 +7,7 @@ import pytest
 from kouxing_client import Client, Status
 from ray.cluster_utils import Cluster
 
-from tests.e2e.streaming import stream
+from tests.e2e.streaming import stream_audio
 from tests.system import VOWELS_FILE, System, kouxing, samples_of_file
 
 NODE = {"object_store_memory": 80 << 20, "include_dashboard": False}
@@ -55,7 +55,7 @@ def test_workers_are_placed_restarted_elsewhere_and_stopped(
     with Client(control.control) as client:
         first = workers(client.status())
     samples = samples_of_file(VOWELS_FILE)
-    assert stream(control.control, samples).frames
+    assert stream_audio(control.control, samples).frames
 
     nodes.remove_node(nodes.worker_nodes.copy().pop())  # Ray put one of the workers there
     control.wait_until(
@@ -64,7 +64,7 @@ def test_workers_are_placed_restarted_elsewhere_and_stopped(
             and workers(report) != first
         )
     )
-    assert stream(control.control, samples).frames
+    assert stream_audio(control.control, samples).frames
 
     assert "waits for a free core" in scale(recognizers=2)
     assert "no workers are running" in scale(recognizers=0, synthesizers=0)

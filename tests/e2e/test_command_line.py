@@ -21,7 +21,7 @@ from kouxing.services.service_kinds import KINDS
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from tests.e2e.conftest import CommandRunner
-from tests.e2e.streaming import Stream
+from tests.e2e.streaming import StreamedSession
 from tests.receivers import read_osc
 from tests.system import (
     LIMIT_S,
@@ -90,13 +90,13 @@ def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_
         for listener in (recorder, printer):
             assert listener.stderr is not None
             assert listener.stderr.readline() == "following session heard\n"
-        sent = Stream(session)
-        sent.send(samples_of_file(SENTENCE))
-        sent.finish()
+        streamed = StreamedSession(session)
+        streamed.send(samples_of_file(SENTENCE))
+        streamed.finish()
     output_of(recorder)
     animation = read_fap(recorded)
     assert animation.frame_rate_hz == 50
-    np.testing.assert_allclose(animation.faps, sent.faps, atol=0.5)
+    np.testing.assert_allclose(animation.faps, streamed.faps, atol=0.5)
     spoken = [line.split()[-1] for line in output_of(printer)[0].splitlines()]
     assert "sil" not in spoken
     assert {*spoken} & {"a", "e", "yi", "wu", "yu"}

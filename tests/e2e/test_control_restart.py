@@ -6,7 +6,7 @@ import numpy as np
 from kouxing_client import Client
 
 from kouxing.shared.face.shapes import ARKIT, VRM
-from tests.e2e.streaming import Stream
+from tests.e2e.streaming import StreamedSession
 from tests.system import CHAIN, DEMO, System, samples_of_file
 
 
@@ -18,15 +18,15 @@ def test_a_session_continues_while_control_is_killed_and_started_again(tmp_path:
     ):
         session = client.open_session(encoding="f32le", shapes=["vrm"])
         opened = session.info
-        sent = Stream(session)
-        sent.send(samples[:16000], paced=True)
+        streamed = StreamedSession(session)
+        streamed.send(samples[:16000], paced=True)
         client.set_face(session.name, expressiveness=1.8, shapes=["arkit"])
         system.process("control").kill()
         system.process("control").wait()
-        sent.send(samples[16000:32000], paced=True)
+        streamed.send(samples[16000:32000], paced=True)
         system.start("control")
         session.set_face(expressions={"joy": 0.5})  # before control knows the session
-        sent.send(samples[32000:40000], paced=True)
+        streamed.send(samples[32000:40000], paced=True)
         assert session.info == opened, "it has not moved"
         (state,) = client.status().sessions
         assert (state.session, state.state) == (session.name, "open")
@@ -34,15 +34,15 @@ def test_a_session_continues_while_control_is_killed_and_started_again(tmp_path:
 
         system.add("synthesizer-2")
         system.lose("synthesizer").wait()
-        sent.send(samples[40000:], paced=True)
-        sent.finish()
+        streamed.send(samples[40000:], paced=True)
+        streamed.finish()
         assert session.info["epoch"] == 2, "the new control reports the move to the client"
         session.close()
         assert not client.status().sessions
         system.assert_all_alive()
         assert "session restored" in system.log("control")
 
-    frames = {(frame.epoch, frame.sequence): frame for frame in sent.frames}
+    frames = {(frame.epoch, frame.sequence): frame for frame in streamed.frames}
     newest = max(place for place in frames if place[0] == 1)  # of the killed synthesizer
     for name, shapes in (("vrm", VRM), ("arkit", ARKIT)):
         published = {
@@ -54,7 +54,7 @@ def test_a_session_continues_while_control_is_killed_and_started_again(tmp_path:
         for place, weights in published.items():
             expected_weights = shapes.weights(np.frombuffer(frames[place].values, "<f4"))
             np.testing.assert_array_equal(np.frombuffer(weights, "<f4"), expected_weights)
-    sounds = [sound for sound in sent.sounds if sound.epoch == 1]
+    sounds = [sound for sound in streamed.sounds if sound.epoch == 1]
     ends = [sound.media_time + len(sound.pcm) // 2 for sound in sounds]
     assert [sound.media_time for sound in sounds] == [0, *ends[:-1]]
     assert ends[-1] >= 40000

@@ -22,7 +22,7 @@ from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, Sessio
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
-from tests.e2e.streaming import Stream
+from tests.e2e.streaming import StreamedSession
 from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until
 
 MessageType = TypeVar("MessageType", bound=Message)
@@ -184,16 +184,16 @@ def test_rejects_nan_and_accepts_empty_chunks_silence_and_clipping(
     client: Client, witness: Session
 ) -> None:
     with client.open_session(encoding="f32le", paced=False) as session:
-        sent = Stream(session)
+        streamed = StreamedSession(session)
         session.push(np.array([0.0, np.nan, 0.0], np.float32).tobytes())
         errors: list[Refused] = []
         wait_until(lambda: errors, step=lambda: errors.extend(session.take_errors()))
         assert [error.code for error in errors] == ["bad-audio"]
         for samples in (np.zeros(0), np.zeros(8000), np.full(8000, 1e9)):
             session.push(samples.astype(np.float32).tobytes())
-        sent.finish()
-    assert sent.times[-1] >= 16000
-    assert np.isfinite(sent.faps).all()
+        streamed.finish()
+    assert streamed.times[-1] >= 16000
+    assert np.isfinite(streamed.faps).all()
 
 
 def test_the_error_names_an_unknown_session(client: Client, bus: Bus, witness: Session) -> None:

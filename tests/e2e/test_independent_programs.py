@@ -21,7 +21,7 @@ from kouxing_client.keys import Key
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.keys import load_key, load_user_key
 from tests.documents import code_blocks
-from tests.e2e.streaming import Stream
+from tests.e2e.streaming import StreamedSession
 from tests.system import (
     LIMIT_S,
     NODE,
@@ -250,12 +250,12 @@ def test_follow_a_session_that_moves_to_its_end(system: System, programs: list[l
         for process in running:
             assert process.stdout is not None
             assert process.stdout.readline() == f"following {session.name}\n"
-        sent = Stream(session)
-        sent.send(SAMPLES[:16000], paced=True)
+        streamed = StreamedSession(session)
+        streamed.send(SAMPLES[:16000], paced=True)
         system.add("synthesizer-2")
         system.lose("synthesizer").wait()
-        sent.send(SAMPLES[16000:], paced=True)
-        sent.finish()
+        streamed.send(SAMPLES[16000:], paced=True)
+        streamed.finish()
         assert session.info["epoch"] > 1
         outputs = []
         for process in running:
@@ -267,7 +267,7 @@ def test_follow_a_session_that_moves_to_its_end(system: System, programs: list[l
         times_s, jaw = zip(*(map(float, line.split()) for line in lines), strict=True)
         times = [round(16000 * time_s) for time_s in times_s]
         assert times == sorted(times)
-        assert {*sent.times} <= {*times}
+        assert {*streamed.times} <= {*times}
         assert 0.2 < max(jaw) <= 1, "/a/ must open the jaw"
         assert min(jaw) == 0
 

@@ -10,7 +10,7 @@ import pytest
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.keys import key_folder, read_grants
 from tests.e2e.conftest import CommandRunner
-from tests.e2e.streaming import stream
+from tests.e2e.streaming import stream_audio
 from tests.system import SERVICE, System, kouxing, own_addresses, start_python, wait_until
 
 WORKERS = ("recognizer", "synthesizer")
@@ -45,7 +45,7 @@ def test_machines_with_copied_keys_work_until_the_keys_are_revoked(
             system.add(kind, XDG_STATE_HOME=str(own))
         laptop = create_machine(command, tmp_path, "laptop", "client", "client")
         monkeypatch.setenv("XDG_STATE_HOME", str(laptop))
-        assert stream(system.control, np.zeros(3200, np.float32)).frames
+        assert stream_audio(system.control, np.zeros(3200, np.float32)).frames
         checked = kouxing("doctor", control=system.control)
         assert checked.returncode == 0, checked.stdout
         assert "key client: control accepts it" in checked.stdout

@@ -30,7 +30,7 @@ NUM_PICTURES = 8
 def write_speaking_head(path: Path) -> None:
     """Write a second of a head whose mouth opens and closes."""
     renderer = Renderer(heads.load("woman", "coarse"), 320, 240, samples=0)
-    rest, opened = neutral_faps(), heads.OPEN
+    rest, opened = neutral_faps(), heads.OPEN_MOUTH
     shares = np.linspace(0, 1, NUM_PICTURES, dtype=np.float32)
     pictures = [renderer.draw(rest + share * (opened - rest)) for share in shares]
     renderer.close()

@@ -14,7 +14,7 @@ from kouxing.services.service_kinds import KINDS
 from kouxing.shared.errors import UserError
 from tests.browser import Browser
 from tests.documents import code_blocks
-from tests.e2e.streaming import Stream, stream
+from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.system import DEMO, LIGHT_MODEL, ROOT, System, samples_of_file, wait_until
 
 
@@ -35,17 +35,17 @@ def test_a_session_continues_after_its_only_worker_hangs_or_crashes(
     system: System, service: str, blow: signal.Signals, text: str
 ) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")[:48000]
-    undisturbed = stream(system.control, samples)
+    undisturbed = stream_audio(system.control, samples)
     with Client(system.control) as client, client.open_session(encoding="f32le") as session:
-        sent = Stream(session)
-        sent.send(samples[:24000], paced=True)
+        streamed = StreamedSession(session)
+        streamed.send(samples[:24000], paced=True)
         failed = system.process(service)
         failed.send_signal(blow)
-        sent.send(samples[24000:], paced=True)
-        sent.finish()
+        streamed.send(samples[24000:], paced=True)
+        streamed.finish()
         assert system.process(service) is not failed
     assert text in system.console.getvalue()
-    assert {*undisturbed.times} <= {*sent.times}
+    assert {*undisturbed.times} <= {*streamed.times}
 
 
 def test_the_driver_is_restarted(system: System) -> None:

@@ -20,7 +20,7 @@ from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.config import variable_name
-from tests.e2e.streaming import Stream, stream
+from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.system import LIMIT_S, VOWELS_FILE, System, samples_of_file, wait_until
 
 FACE = SynthesizerConfig(
@@ -50,10 +50,10 @@ def frames_of_the_chain(lips: str) -> NDArray[np.float32]:
 
 
 def test_the_face_has_the_frames_of_the_chain_with_these_settings(system: System) -> None:
-    sent = stream(system.control, SAMPLES, chunk=997)
-    np.testing.assert_allclose(np.diff(np.array(sent.times) / 16000), 1 / 30, atol=1e-4)
-    np.testing.assert_array_equal(sent.faps, frames_of_the_chain("dynamic-visemes"))
-    assert np.abs(sent.faps[:, 2]).max() > 50.0
+    streamed = stream_audio(system.control, SAMPLES, chunk=997)
+    np.testing.assert_allclose(np.diff(np.array(streamed.times) / 16000), 1 / 30, atol=1e-4)
+    np.testing.assert_array_equal(streamed.faps, frames_of_the_chain("dynamic-visemes"))
+    assert np.abs(streamed.faps[:, 2]).max() > 50.0
 
 
 def test_lips_are_switched_while_a_session_runs(system: System) -> None:
@@ -63,11 +63,11 @@ def test_lips_are_switched_while_a_session_runs(system: System) -> None:
     ):
         session.set_face(lip_model="muscles")  # is reported and ignored
         session.set_face(lip_model="learned")
-        sent = Stream(session)
-        sent.send(SAMPLES)
-        sent.finish()
+        streamed = StreamedSession(session)
+        streamed.send(SAMPLES)
+        streamed.finish()
     # the choice may overtake the start of the audio; the face is at rest there
-    np.testing.assert_allclose(sent.faps, frames_of_the_chain("learned"), atol=0.5)
+    np.testing.assert_allclose(streamed.faps, frames_of_the_chain("learned"), atol=0.5)
 
 
 def test_refuses_one_session_too_many_and_the_others_continue(
@@ -77,12 +77,12 @@ def test_refuses_one_session_too_many_and_the_others_continue(
     monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
     samples = SAMPLES[:24000]
     with Client(system.control) as client:
-        alone = stream(system.control, samples)
+        alone = stream_audio(system.control, samples)
         sessions = [client.open_session(encoding="f32le") for _ in range(MIN_SESSIONS)]
         with pytest.raises(Refused, match="every recognizer is busy") as caught:
             client.open_session(encoding="f32le")
         all_received = speak(sessions, samples)
-        message, answer = asyncio.run(_refused(system.page))
+        message, answer = asyncio.run(_rejections(system.page))
         for session in sessions:
             session.close()
 
@@ -97,7 +97,7 @@ def test_refuses_one_session_too_many_and_the_others_continue(
         assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
 
 
-async def _refused(page: str) -> tuple[dict[str, object], aiohttp.ClientResponse]:
+async def _rejections(page: str) -> tuple[dict[str, object], aiohttp.ClientResponse]:
     """Return the gateway's answers to a microphone and to a WebRTC client."""
     peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
     peer.addTransceiver("audio")

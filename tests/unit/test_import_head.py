@@ -12,13 +12,13 @@ from kouxing.services.driver.head.import_head import import_head
 from kouxing.shared.errors import UserError
 from tests import heads
 from tests.glb_writer import write_glb
-from tests.heads import OPEN, neutral_faps
+from tests.heads import OPEN_MOUTH, neutral_faps
 from tests.meshes import ORIGINAL, meshes, write_obj
 
-TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
+HALF_TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
 
 
-def lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
+def point_lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
     rows = []
     for name, vertex in head.feature_points.items():
         x, y, z = place(head.vertices[vertex].astype(float))
@@ -32,13 +32,13 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Head:
     folder = tmp_path_factory.mktemp("import")
 
     def place(points: np.ndarray) -> np.ndarray:
-        return points * [100, 112, 100] * TURN + [30, 150, -7]  # type: ignore[no-any-return]
+        return points * [100, 112, 100] * HALF_TURN + [30, 150, -7]  # type: ignore[no-any-return]
 
     parts = meshes()
     for part in parts:
         part.vertices = place(part.vertices)
     write_glb(folder / "face.glb", parts)
-    (folder / "points.tsv").write_text(lines(ORIGINAL, place), encoding="utf-8")
+    (folder / "points.tsv").write_text(point_lines(ORIGINAL, place), encoding="utf-8")
     warnings = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
     assert warnings == [
         "no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"
@@ -46,7 +46,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Head:
     return Head.load(folder / "face.npz")
 
 
-def moved(head: Head, faps: np.ndarray) -> np.ndarray:
+def displacement(head: Head, faps: np.ndarray) -> np.ndarray:
     return head.deform(np.asarray(faps, np.float32)) - head.vertices
 
 
@@ -64,24 +64,24 @@ def test_parts_textures_and_units(imported: Head) -> None:
 
 
 def test_feature_points_move_as_defined(imported: Head) -> None:
-    for fap, value in product(heads.DISPLACING, (300.0, -120.0)):
+    for fap, value in product(heads.DISPLACING_FAPS, (300.0, -120.0)):
         axis, expected = heads.travel_m(imported, fap, value)
-        shift = moved(imported, heads.single_fap(fap.number, value))
+        shift = displacement(imported, heads.single_fap(fap.number, value))
         for point in imported.feature_points.keys() & fap.feature_points:
             travel = shift[imported.feature_points[point], axis]
             assert travel == pytest.approx(expected, rel=0.05), (fap.name, point)
 
 
 def test_jaw_eyes_head_and_shoulders(imported: Head) -> None:
-    shift = moved(imported, OPEN)
+    shift = displacement(imported, OPEN_MOUTH)
     unit = imported.fapu["MNS"]
     assert shift[imported.part("teeth_lower").vertices, 1].max() < -0.05 * unit
     assert np.abs(shift[imported.part("teeth_upper").vertices]).max() < 0.02 * unit
-    turn = moved(imported, neutral_faps(yaw_l_eyeball=30_000))
+    turn = displacement(imported, neutral_faps(yaw_l_eyeball=30_000))
     left, right = (imported.part(name).vertices for name in ("eye_left", "eye_right"))
     assert np.abs(turn[left]).max() > 0.002
     assert not turn[right].any()
-    nod = np.abs(moved(imported, neutral_faps(head_yaw=30_000))).max(axis=1)
+    nod = np.abs(displacement(imported, neutral_faps(head_yaw=30_000))).max(axis=1)
     assert nod[imported.feature_points["2.1"]] > 0.01
     assert nod[np.argmin(imported.vertices[:, 1])] < 0.001
 
@@ -101,14 +101,14 @@ def test_obj_with_vertex_numbers_and_seams(tmp_path: Path) -> None:
     warnings = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
     assert "no eyeballs separate from the skin: the eyes do not rotate" in warnings
     head = Head.load(tmp_path / "out.npz")
-    shift = moved(head, OPEN)
+    shift = displacement(head, OPEN_MOUTH)
     assert shift[head.feature_points["2.3"], 1] < -0.4 * head.fapu["MNS"]
     # both vertices at a texture seam move and have the same normal
     skin = head.part("skin").vertices
     places = np.round(head.vertices[skin], 5)
     group = np.unique(places, axis=0, return_inverse=True)[1].ravel()
     assert len(places) > group.max() + 10
-    for values in (shift[skin], head.pose(OPEN)[1][skin]):
+    for values in (shift[skin], head.pose(OPEN_MOUTH)[1][skin]):
         first_of = np.zeros((group.max() + 1, 3))
         first_of[group] = values
         assert np.abs(first_of[group] - values).max() < 1e-4
@@ -128,7 +128,7 @@ def test_reads_an_fdp_file(face: Path, tmp_path: Path) -> None:
     head = Head.load(tmp_path / "out.npz")
     scale = head.fapu["ES"] / ORIGINAL.fapu["ES"]
     assert head.fapu["MNS"] == pytest.approx(mns * scale, rel=0.02)
-    assert moved(head, OPEN)[head.feature_points["2.1"], 1] < -0.3 * head.fapu["MNS"]
+    assert displacement(head, OPEN_MOUTH)[head.feature_points["2.1"], 1] < -0.3 * head.fapu["MNS"]
 
 
 @pytest.fixture
@@ -162,20 +162,22 @@ def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, message: str)
     ("change", "message"),
     [
         (lambda rows: rows.replace("\n8.1\t", "\n8.1 1 0 0 #"), "too far from the mesh.*: 8.1 by"),
-        (lambda rows: exchange(rows, "8.3", "8.4"), "MW is not positive"),
-        (lambda rows: exchange(rows, "2.1", "3.5", "3.6", "8.1"), "is not below the eyes"),
+        (lambda rows: swap_points(rows, "8.3", "8.4"), "MW is not positive"),
+        (lambda rows: swap_points(rows, "2.1", "3.5", "3.6", "8.1"), "is not below the eyes"),
     ],
 )
 def test_rejects_points_that_are_not_a_face(
     face: Path, tmp_path: Path, change: Callable[[str], str], message: str
 ) -> None:
-    (tmp_path / "points.tsv").write_text(change(lines(ORIGINAL, lambda p: p)), encoding="utf-8")
+    (tmp_path / "points.tsv").write_text(
+        change(point_lines(ORIGINAL, lambda p: p)), encoding="utf-8"
+    )
     with pytest.raises(UserError, match=message):
         import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
     assert not (tmp_path / "out.npz").exists()
 
 
-def exchange(rows: str, *names: str) -> str:
+def swap_points(rows: str, *names: str) -> str:
     """Swap the positions of points."""
     places = dict(row.split("\t", 1) for row in rows.splitlines()[1:])
     shifted = {name: places[names[(i + 1) % len(names)]] for i, name in enumerate(names)}

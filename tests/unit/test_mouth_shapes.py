@@ -121,7 +121,7 @@ def test_errors_equal_rhubarbs(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "no such file" in failure["reason"]
 
 
-class Status(io.StringIO):
+class StatusStream(io.StringIO):
     """Standard error that notes the size of a file whenever a status is printed."""
 
     def __init__(self, result: Path) -> None:
@@ -138,7 +138,7 @@ def test_the_result_is_complete_when_the_success_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = tmp_path / "result.json"
-    status = Status(result)
+    status = StatusStream(result)
     with result.open("w") as output:
         monkeypatch.setattr(sys, "stdout", output)
         monkeypatch.setattr(sys, "stderr", status)
