@@ -274,7 +274,7 @@ export class MouthLesson {
       row.append(...cells.map((text, index) => (index === 0 ? cell("th", translate(text)) : cell("td", text))));
       return row;
     });
-    element("lesson-correlationRows").replaceChildren(...rows);
+    element("lesson-figures").replaceChildren(...rows);
     const box = { ...BOX, ...extent(...CURVES.map((name) => curves.opening[name])) };
     for (const name of CURVES) {
       const path = curvePath(curves.time_s, curves.opening[name], box);
