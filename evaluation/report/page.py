@@ -59,8 +59,11 @@ def write_page(folder: Path, page: Path) -> None:
         *better_recognizers(results),
         *system_tables.better_packages(results),
     ]
-    columns = ("measure", "best other program", "its figure", "kouxing")
-    text = _TEMPLATE.read_text("utf-8").replace("[[better]]\n", markdown((columns, better)))
+    lines = [
+        f"{measure}: {figure} ({program}); kouxing {own}"
+        for measure, program, figure, own in better
+    ]
+    text = _TEMPLATE.read_text("utf-8").replace("[[better]]\n", bullets(lines or ["In no measure"]))
     parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _render_table(match[1], steps, results), text)
     page.write_text(parts, encoding="utf-8")
     if "lookahead" in results:
