@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from kouxing.services.driver.config import HEAD_NAMES, Framing
 from kouxing.services.driver.head.head import DEFAULT_HEAD, Head
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.render.scene import camera
+from kouxing.services.driver.render.scene import place_camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
@@ -146,7 +146,7 @@ def _render(
     framing: Framing = Framing.FACE,
 ) -> Image.Image:
     head = Head.load(name)
-    view = camera(head, framing, yaw_deg)
+    view = place_camera(head, framing, yaw_deg)
     renderer = Renderer(head, _SCALE * size[0], _SCALE * size[1], camera=view)
     image = Image.fromarray(renderer.draw(faps))
     renderer.close()

@@ -36,7 +36,7 @@ def write_head_videos(folder: Path, model: AcousticModel, recordings: Sequence[P
     show = partial(track, description="recognizing", console=CONSOLE, transient=True)
     frames = chain.animate(samples, show)
     for name, head in track(loaded.items(), "drawing", console=CONSOLE, transient=True):
-        renderer = Renderer(head, *VIDEO_PX, camera=scene.camera(head))
+        renderer = Renderer(head, *VIDEO_PX, camera=scene.place_camera(head))
         with contextlib.closing(renderer):
             write_video(folder / name / "minute.mp4", frames, samples, renderer)
 

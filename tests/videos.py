@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.services.driver.video.video_writer import VideoWriter
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
 DURATION_S = 0.25

@@ -58,7 +58,7 @@ def write_videos(
     if not missing:
         return []
     head = scene.load_head()
-    renderer = Renderer(head, *VIDEO_PX, camera=scene.camera(head, Framing.FACE))
+    renderer = Renderer(head, *VIDEO_PX, camera=scene.place_camera(head, Framing.FACE))
     for make, sentence, path in track(missing, description="rendering", transient=True):
         write_video(path, make(sentence), sentence.sentence.clip.samples, renderer)
     renderer.close()

@@ -1,4 +1,4 @@
-"""The motion of a face: computed from sound, or read from a ``.fap`` file or a table."""
+"""Computes the motion of a face from sound, or reads it from a ``.fap`` file or a table."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from rich.progress import Progress
 
 from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
-from kouxing.services.cli.spoken_text import read_text, report_mismatch
+from kouxing.services.cli.spoken_text import read_transcript, report_mismatch
 from kouxing.services.driver.video import film
-from kouxing.services.driver.video.time_stretch import stretch
+from kouxing.services.driver.video.time_stretch import stretch_time
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -43,9 +43,9 @@ _MAX_IMAGE_RATE_HZ = 240.0
 
 @dataclass(frozen=True, slots=True)
 class FaceMotion:
-    """A face over time."""
+    """The motion of a face, or of several faces side by side."""
 
-    frames: list[film.Frame]
+    frames: list[film.TimedFaps]
     frame_rate_hz: float
     image_rate_hz: float  # default for a video
     samples: NDArray[np.float32] | None  # 16 kHz mono, shape (n,)
@@ -62,13 +62,15 @@ def slow_down(motion: FaceMotion, speed: float) -> FaceMotion:
     return dataclasses.replace(
         motion,
         frames=[(time_s / speed, faps) for time_s, faps in motion.frames],
-        samples=None if motion.samples is None else stretch(motion.samples, speed),
-        phones=None if motion.phones is None else [_slower(item, speed) for item in motion.phones],
-        syllables=[_slower(item, speed) for item in motion.syllables],
+        samples=None if motion.samples is None else stretch_time(motion.samples, speed),
+        phones=None
+        if motion.phones is None
+        else [_slow_down_item(item, speed) for item in motion.phones],
+        syllables=[_slow_down_item(item, speed) for item in motion.syllables],
     )
 
 
-def _slower(item: T, speed: float) -> T:
+def _slow_down_item(item: T, speed: float) -> T:
     return replace(item, onset_s=item.onset_s / speed, duration_s=item.duration_s / speed)
 
 
@@ -119,7 +121,7 @@ def animate(
     settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
     transcript = None
     try:
-        transcript = None if text is None else read_text(text, load_inventory(language))
+        transcript = None if text is None else read_transcript(text, load_inventory(language))
     except UserError as error:
         if not text_may_differ:
             raise

@@ -1,4 +1,4 @@
-"""Commands that take many files: their outputs, and errors that do not stop the other files."""
+"""Processes many files in one command: names their outputs, and continues after errors."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The syllables of a recording as they are written, and the captions of its video."""
+"""Writes the syllables of a recording, and makes the captions of its video."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from kouxing.services.cli.options import CaptionKind
-from kouxing.services.driver.render.captions import Caption, Captions
+from kouxing.services.driver.render.captions import Caption, CaptionDrawer
 from kouxing.services.recognizer.alignment import find_syllable_times
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
@@ -29,7 +29,7 @@ def write_syllables(
     The text of a syllable is its character, or else its spelling.
     """
     if transcript is None:
-        return [_syllable_of(group, inventory) for group in group_syllables(phones, inventory)]
+        return [_join_phones(group, inventory) for group in group_syllables(phones, inventory)]
     syllables = []
     for timed in find_syllable_times(phones, transcript, inventory):
         spelling = inventory.write(timed.spelling)
@@ -38,7 +38,7 @@ def write_syllables(
     return syllables
 
 
-def _syllable_of(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyllable:
+def _join_phones(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyllable:
     spelling = inventory.spell(tuple(phone.symbol for phone in group))
     onset_s, end_s = group[0].onset_s, group[-1].onset_s + group[-1].duration_s
     return TimedSyllable(spelling, spelling, onset_s, end_s - onset_s)
@@ -46,7 +46,7 @@ def _syllable_of(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyll
 
 def make_captions(
     kind: CaptionKind | None, motion: FaceMotion, size_px: tuple[int, int]
-) -> Captions | None:
+) -> CaptionDrawer | None:
     """Return the captions of a video of this size, if any.
 
     Raises ``UserError`` if characters are required, but there is no text with characters, or no
@@ -56,7 +56,7 @@ def make_captions(
         return None
     captions: list[Caption] = []
     if kind is CaptionKind.PHONES:
-        captions = _captions_of_phones(motion.phones or [], load_inventory(motion.language))
+        captions = _phone_captions(motion.phones or [], load_inventory(motion.language))
     else:
         is_text = kind is CaptionKind.CHARACTERS
         if is_text and all(syllable.text == syllable.spelling for syllable in motion.syllables):
@@ -71,10 +71,10 @@ def make_captions(
         ]
     if not can_draw("".join(caption.text for caption in captions)):
         raise UserError(f"--captions characters: {NO_CHINESE_FONT}, or use --captions pinyin")
-    return Captions(captions, size_px)
+    return CaptionDrawer(captions, size_px)
 
 
-def _captions_of_phones(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Caption]:
+def _phone_captions(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Caption]:
     joined = {
         phone.index
         for before, phone in pairwise(phones)

@@ -293,10 +293,10 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
 
 def doctor(control: Control = "") -> None:
     """Check keys, addresses, clocks and versions from this machine, and print what to do."""
-    from kouxing.services.cli.doctor import examine
+    from kouxing.services.cli.doctor import run_checks
 
     num_checks = num_failed = 0
-    for finding in examine(control):
+    for finding in run_checks(control):
         num_checks += 1
         num_failed += bool(finding.fix)
         typer.echo(f"{'FAIL' if finding.fix else 'ok  '} {finding.subject}: {finding.result}")

@@ -1,4 +1,4 @@
-"""Reads the motion of a face from a table, as ``CsvExporter`` and ``JsonLinesExporter`` write it.
+"""Reads the motion of a face from a table of ``CsvExporter`` or ``JsonLinesExporter``.
 
 Tables of spreadsheet programs may be in UTF-16, and have semicolons or tabs with decimal commas.
 Takes of the app Live Link Face (CSV) are read too. Their frames without a face, with a count of 0,
@@ -84,7 +84,7 @@ def read_table(path: Path) -> FapAnimation:
             raise UserError(f"{path}: the table has more than {MAX_FRAMES} frames; split it")
     if not times:
         raise UserError(f"{path}: the table has no frames with a face; record it again")
-    times_s = _times_s(path, times, is_time_code=time_name == "timecode")
+    times_s = _parse_times_s(path, times, is_time_code=time_name == "timecode")
     return _resample(path, times_s, np.array(values) @ basis)
 
 
@@ -164,7 +164,7 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
     return [folded.index(name.lower()) for name in known], np.array([*known.values()])
 
 
-def _times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:
+def _parse_times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:
     try:
         codes = [_TIME_CODE.fullmatch(str(time).strip()) for time in times]
         values = [code.groups() if code else () for code in codes] if is_time_code else times

@@ -22,9 +22,13 @@ from kouxing.shared.terminal import plural
 
 MAX_CLOCK_OFFSET_MS = 1000.0
 MAX_AGE_S = 2.0  # limit for the age of the newest heartbeat
-MIN_SERVICES = ("control", "recognizer", "synthesizer")  # without them, no face moves
+REQUIRED_SERVICES = ("control", "recognizer", "synthesizer")  # without them, no face moves
 PUBLISHERS = ("phones", "faps", "events")  # accept every allowed key
-ROUTERS = {"audio": "client", "unpaced_audio": "client", "phone_input": "service"}  # and its role
+ROUTER_ROLES = {
+    "audio": "client",
+    "unpaced_audio": "client",
+    "phone_input": "service",
+}  # and its role
 
 
 class CheckResult(NamedTuple):
@@ -35,7 +39,7 @@ class CheckResult(NamedTuple):
     fix: str = ""  # empty: the check passed
 
 
-def examine(address: str) -> Iterator[CheckResult]:
+def run_checks(address: str) -> Iterator[CheckResult]:
     """Yield the result of each check; if ``address`` is empty, control is the configured one."""
     control, config = find_system(address)
     control = control or config.control
@@ -72,7 +76,7 @@ def examine(address: str) -> Iterator[CheckResult]:
         buses = {name: stack.enter_context(Bus(key)) for name, key in accepted.items()}
         for service in services:
             yield from _check_service(service, buses)
-    for name in MIN_SERVICES:
+    for name in REQUIRED_SERVICES:
         if name not in {service.service for service in services}:
             yield CheckResult(
                 name, "is not running", f"start it: kouxing {name} --config kouxing.toml"
@@ -96,11 +100,13 @@ def _check_key(name: str, key: Key | None, address: str) -> CheckResult:
             "set XDG_STATE_HOME to the same folder as for 'kouxing run'",
         )
     return CheckResult(
-        f"key {name}", "control does not accept it", rejection_hint(control, name, _roles(name))
+        f"key {name}",
+        "control does not accept it",
+        rejection_hint(control, name, _default_roles(name)),
     )
 
 
-def _roles(name: str) -> Collection[str]:
+def _default_roles(name: str) -> Collection[str]:
     """Return the default roles for a key name."""
     return KINDS[name].key_roles if name in KINDS else CLIENT_ROLES
 
@@ -137,8 +143,8 @@ def _endpoint_problem(name: str, endpoint: str, buses: Mapping[str, Bus]) -> str
         return reason
     is_publisher = name in PUBLISHERS
     for key_name, bus in buses.items():
-        roles = {role.partition(":")[0] for role in _roles(key_name)}
-        if not is_publisher and ROUTERS.get(name) not in roles:
+        roles = {role.partition(":")[0] for role in _default_roles(key_name)}
+        if not is_publisher and ROUTER_ROLES.get(name) not in roles:
             continue
         if bus.probe(endpoint, is_publisher=is_publisher) is ProbeResult.REFUSED:
             return (

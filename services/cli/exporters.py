@@ -1,4 +1,4 @@
-"""The output formats of ``kouxing render``: one class per format, found by the file's suffix."""
+"""The output formats of ``kouxing render``. The suffix of the file chooses the class."""
 
 import contextlib
 from collections.abc import Sequence
@@ -10,15 +10,15 @@ from rich.progress import Progress
 
 from kouxing.services.cli.animation import FaceMotion, slow_down
 from kouxing.services.cli.captions import make_captions
-from kouxing.services.cli.curves import CURVE_EXPORTERS
+from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS
 from kouxing.services.cli.options import ExportOptions
 from kouxing.services.driver.config import check_even, parse_size
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.captions import band_height_px
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.render.side_by_side import SideBySide
+from kouxing.services.driver.render.side_by_side import SideBySideRenderer
 from kouxing.services.driver.video import film
-from kouxing.services.driver.video.writer import (
+from kouxing.services.driver.video.video_writer import (
     VIDEO_SUFFIXES,
     check_name,
     existing_pictures,
@@ -36,7 +36,7 @@ class Exporter(Protocol):
     options: ClassVar[frozenset[str]]  # fields of ``ExportOptions`` that apply
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
-        """Check output and options, before any long work."""
+        """Check the output and the options before any long computation."""
 
     def export(self, motion: FaceMotion, progress: Progress) -> int:
         """Write the motion and return the number of frames or images."""
@@ -144,7 +144,7 @@ def _check_options(output: Path, options: ExportOptions, exporter: type[Exporter
 
 def _make_renderer(
     output: Path, options: ExportOptions, size_px: tuple[int, int]
-) -> Renderer | SideBySide:
+) -> Renderer | SideBySideRenderer:
     """Return a renderer that draws a face for each lip model, side by side, above captions."""
     num_faces = len(options.lips)
     width_px, height_px = size_px
@@ -152,17 +152,17 @@ def _make_renderer(
         height_px -= band_height_px(size_px)
     if width_px % num_faces:
         raise UserError(f"--size {options.size}: choose a width that is a multiple of {num_faces}")
-    background = scene.background(options.background)
+    background = scene.parse_background(options.background)
     if background is None and output.suffix == ".mp4":
         raise UserError("MP4 has no transparency; write .mov, .webm or pictures (.png)")
     head = scene.load_head(options.head)
-    camera = scene.camera(head, options.camera)
+    camera = scene.place_camera(head, options.camera)
     renderer = Renderer(
         head, width_px // num_faces, height_px, background=background, camera=camera
     )
     if num_faces == 1:
         return renderer
-    return SideBySide(renderer, [f"lips: {name}" for name in options.lips])
+    return SideBySideRenderer(renderer, [f"lips: {name}" for name in options.lips])
 
 
 def _parse_size(text: str, *, even: bool) -> tuple[int, int]:

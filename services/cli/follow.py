@@ -1,4 +1,4 @@
-"""Prints or records the output of a session: FAPs or shapes, syllables or phones."""
+"""Prints or records the output of a session: FAPs, shapes, syllables or phones."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -8,7 +8,13 @@ from typing import TypeVar
 import numpy as np
 from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 
-from kouxing.services.cli.curves import CURVE_EXPORTERS, CurveExporter, Curves, Row, json_line
+from kouxing.services.cli.curve_exporters import (
+    CURVE_EXPORTERS,
+    CurveExporter,
+    FrameRow,
+    FrameStream,
+    json_line,
+)
 from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
 from kouxing.services.cli.streaming import missed_warning
 from kouxing.shared.client_connection import connect_client
@@ -58,14 +64,14 @@ def follow(
         arriving = _iter_until_interrupt(results, followed.name)
         if is_speech:
             inventory = load_inventory(followed.info["facts"]["language"] or DEFAULT_LANGUAGE)
-            phones = map(_event_of, arriving)
+            phones = map(_to_event, arriving)
             if form is ListenFormat.SYLLABLES:
                 count = _print(_syllable_lines(phones, inventory))
             else:
                 count = _print(_phone_lines(respell(phones, inventory, alphabet)))
         else:
-            rows = map(_row, arriving)
-            live = Curves(rows, is_live=True)
+            rows = map(_to_row, arriving)
+            live = FrameStream(rows, is_live=True)
             count = _print_frames(rows, curve_form) if exporter is None else exporter.write(live)
     unit = form.value.removesuffix("s") if form and is_speech else "frame"
     if form is ListenFormat.RHUBARB and output is None:
@@ -112,7 +118,7 @@ def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
         yield from results
 
 
-def _event_of(phone: Phone) -> events.Phone:
+def _to_event(phone: Phone) -> events.Phone:
     return events.Phone(
         index=phone.index,
         symbol=phone.symbol,
@@ -141,11 +147,11 @@ def _line(onset_s: float, duration_s: float, text: str) -> str:
     return f"{onset_s:9.3f} s  {duration_s:6.3f} s  {text}"
 
 
-def _row(frame: FapFrame) -> Row:
+def _to_row(frame: FapFrame) -> FrameRow:
     return frame.time_s, frame.sequence, np.array(frame.values, np.float32)
 
 
-def _print_frames(rows: Iterable[Row], form: CurveFormat | None) -> int:
+def _print_frames(rows: Iterable[FrameRow], form: CurveFormat | None) -> int:
     """Print frames, a line for each, and return their number; drawn mouths when they change."""
     if form is CurveFormat.RHUBARB:
         cues = mouth_cues((time_s, faps) for time_s, _, faps in rows)

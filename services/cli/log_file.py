@@ -1,4 +1,4 @@
-"""The log of one service: private, limited in size, and harmless when the disk is full."""
+"""The log file of one service: private, limited in size, and harmless when the disk is full."""
 
 import contextlib
 import errno

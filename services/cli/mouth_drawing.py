@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.options import TimingMethod, WidthSource
-from kouxing.services.cli.spoken_text import print_mismatch, read_text, report_mismatch
-from kouxing.services.driver.video.writer import VideoWriter, write_picture
+from kouxing.services.cli.spoken_text import print_mismatch, read_transcript, report_mismatch
+from kouxing.services.driver.video.video_writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
@@ -56,7 +56,7 @@ from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 from kouxing.shared.terminal import open_progress, plural, print_message, write_text
 
 Array = NDArray[np.float64]
-Span = tuple[float, float, str]  # start and end in seconds, and the label
+LabelSpan = tuple[float, float, str]  # start and end in seconds, and the label
 
 NUM_POINTS = 21  # on each line of the contour, in a table
 FRAME_RATE_HZ = 25.0
@@ -69,7 +69,7 @@ _BLOCK_FRAMES = 250  # number of contours to compute at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Mouth:
+class _MouthMotion:
     """The motion of a mouth, and its labels in the drawing."""
 
     samples: NDArray[np.float32]  # 16 kHz mono, shape (n,)
@@ -91,7 +91,7 @@ class _Mouth:
         return times_s, openings, self.widths_at(times_s)
 
     @property
-    def symbols(self) -> list[Span]:
+    def symbols(self) -> list[LabelSpan]:
         """The phones as labels."""
         return [
             (phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in self.phones
@@ -132,16 +132,16 @@ def draw_mouth(
     if speech_to_text is not None:
         text = Transcriber(speech_to_text).transcribe(samples) or None
         print_message(f"{source}: {text or 'no words were recognized'}")
-    transcript = None if text is None else read_text(text, inventory)
+    transcript = None if text is None else read_transcript(text, inventory)
     with open_progress() as progress:
         with_progress = partial(progress.track, description="timing")
         timed = _time_phones(source, samples, transcript, timing, inventory, with_progress)
         with_progress = partial(progress.track, description="finding the width")
-        widths = _widths(lips, samples, timed, inventory, with_progress)
+        widths = _find_widths(lips, samples, timed, inventory, with_progress)
     phones = drop_pauses(timed, inventory)
     if not phones:
         print_message(f"{source}: no speech was found; the mouth stays closed")
-    mouth = _Mouth(
+    mouth = _MouthMotion(
         samples=samples,
         phones=phones,
         syllables=write_syllables(phones, transcript, inventory),
@@ -178,7 +178,7 @@ def _time_phones(
     return alignment.phones
 
 
-def _widths(
+def _find_widths(
     lips: WidthSource,
     samples: NDArray[np.float32],
     timed: Sequence[Phone],
@@ -198,7 +198,7 @@ def _widths(
     return np.array([time_s for time_s, _ in frames]), 1.0 + np.array(stretch)
 
 
-def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
+def _syllable_labels(mouth: _MouthMotion, *, are_pixels: bool) -> list[LabelSpan]:
     """Return the label of each syllable: its characters, if they can be drawn, and its spelling."""
     texts = [item.text for item in mouth.syllables if item.text != item.spelling]
     shows_text = not are_pixels or can_draw("".join(texts))
@@ -216,7 +216,9 @@ def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
     ]
 
 
-def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.LabeledMouth]:
+def _key_frame_mouths(
+    mouth: _MouthMotion, labels: Sequence[LabelSpan]
+) -> list[drawing.LabeledMouth]:
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
     anchors = build_anchors(mouth.phones, mouth.inventory.silence) or [
@@ -240,9 +242,9 @@ def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.LabeledM
     ]
 
 
-def _write_picture(output: Path, mouth: _Mouth) -> str:
+def _write_picture(output: Path, mouth: _MouthMotion) -> str:
     is_svg = output.suffix.lower() == ".svg"
-    moments = _key_moments(mouth, _labels(mouth, are_pixels=not is_svg))
+    moments = _key_frame_mouths(mouth, _syllable_labels(mouth, are_pixels=not is_svg))
     if len(moments) > _MAX_MOUTHS:
         raise UserError(
             f"{output}: a picture holds {_MAX_MOUTHS} mouths, but this sound has {len(moments)};"
@@ -256,8 +258,8 @@ def _write_picture(output: Path, mouth: _Mouth) -> str:
     return f"{plural(len(moments), 'key frame')}, {plural(len(mouth.phones), 'phone')}"
 
 
-def _write_video(output: Path, mouth: _Mouth) -> str:
-    labels = _labels(mouth, are_pixels=True)
+def _write_video(output: Path, mouth: _MouthMotion) -> str:
+    labels = _syllable_labels(mouth, are_pixels=True)
     write = mouth.inventory.write
     symbols = [(start_s, end_s, write(symbol)) for start_s, end_s, symbol in mouth.symbols]
     frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))
@@ -277,13 +279,13 @@ def _write_video(output: Path, mouth: _Mouth) -> str:
     return f"{plural(len(frames), 'image')}, {plural(len(mouth.phones), 'phone')}"
 
 
-def _label_at(time_s: float, spans: Sequence[Span]) -> str:
+def _label_at(time_s: float, spans: Sequence[LabelSpan]) -> str:
     """Return the label at a time; the spans are in order."""
     index = bisect_right(spans, time_s, key=lambda span: span[0]) - 1
     return spans[index][2] if index >= 0 and time_s < spans[index][1] else ""
 
 
-def _write_csv(output: Path, mouth: _Mouth) -> str:
+def _write_csv(output: Path, mouth: _MouthMotion) -> str:
     times_s, openings, widths = mouth.sample()
     symbols = mouth.symbols
     with open_output(output) as file, open_progress() as progress:
@@ -305,7 +307,7 @@ def _write_csv(output: Path, mouth: _Mouth) -> str:
     return plural(len(times_s), "frame")
 
 
-_WRITERS: dict[str, Callable[[Path, _Mouth], str]] = {
+_WRITERS: dict[str, Callable[[Path, _MouthMotion], str]] = {
     ".svg": _write_picture,
     ".png": _write_picture,
     ".mp4": _write_video,

@@ -281,7 +281,7 @@ def align(
     The exit status is 1 if the text does not fit the sound.
     """
     with show_loading():
-        from kouxing.services.cli.spoken_text import read_text, report_mismatch
+        from kouxing.services.cli.spoken_text import read_transcript, report_mismatch
         from kouxing.services.mono_audio import read_mono_16k
         from kouxing.services.recognizer.acoustic.languages import load_model_for_language
         from kouxing.services.recognizer.alignment import align_syllables, find_syllable_times
@@ -294,7 +294,7 @@ def align(
     check_output(output, inputs=[audio, Path(text)], force=force)
     with show_loading():
         model = load_model_for_language(language, acoustic)
-        transcript = read_text(text, load_inventory(language or model.inventory.language))
+        transcript = read_transcript(text, load_inventory(language or model.inventory.language))
     with open_progress() as progress:
         samples = read_mono_16k(audio, track, progress)
         with_progress = partial(progress.track, description="aligning")

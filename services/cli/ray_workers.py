@@ -1,4 +1,4 @@
-"""Recognizers and synthesizers as actors of a Ray cluster.
+"""Runs recognizers and synthesizers as actors of a Ray cluster.
 
 Ray places each worker on a host with a free core. If a worker or its host is lost, Ray restarts
 the worker elsewhere. Each actor runs one worker process. That process finds control and uses ZeroMQ
@@ -99,7 +99,7 @@ class RayWorkers:
         """
         insecure = settings.load(kind.config_type).insecure
         key = "" if insecure else format_key(load_key(kind.name, (f"service:{kind.name}",)))
-        running = set(_names(kind.name))
+        running = set(_worker_names(kind.name))
         wanted = {f"{kind.name}-{index}" for index in range(number)}
         for name in sorted(wanted - running):
             ray.remote(Worker).options(
@@ -118,7 +118,7 @@ class RayWorkers:
 
     def hosts(self) -> dict[str, str]:
         """Wait until the workers start; return each worker's host, or why it has no host."""
-        names = [name for kind in KINDS for name in _names(kind)]
+        names = [name for kind in KINDS for name in _worker_names(kind)]
         answers = {ray.get_actor(name).host.remote(): name for name in names}
         num_cores = int(ray.cluster_resources().get("CPU", 0))
         num_ready = min(len(answers), num_cores)
@@ -153,5 +153,5 @@ def _environment(kind: ServiceKind, settings: Settings) -> dict[str, str]:
     return environment
 
 
-def _names(kind: str) -> list[str]:
+def _worker_names(kind: str) -> list[str]:
     return sorted(name for name in ray.util.list_named_actors() if name.startswith(f"{kind}-"))

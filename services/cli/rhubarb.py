@@ -16,7 +16,7 @@ from pathlib import Path
 from rich.progress import Progress
 
 from kouxing.services.cli.animation import FaceMotion, animate
-from kouxing.services.cli.cues import write_cues
+from kouxing.services.cli.cue_files import format_cues
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
@@ -25,7 +25,7 @@ from kouxing.shared.phones.inventory import AUTO, find_language
 from kouxing.shared.terminal import write_text
 from kouxing.shared.user_file import read_text
 
-_BASIC = {"G": "A", "H": "C", "X": "A"}  # shown instead of a mouth that is not drawn
+_BASIC_MOUTHS = {"G": "A", "H": "C", "X": "A"}  # shown instead of a mouth that is not drawn
 _PRESTON_BLAIR = dict(zip("ABCDEFGHX", "MBP etc E AI O U FV L rest".split(), strict=True))
 _MAX_TEXT_BYTES = 8 << 20
 
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _report(options, "start", f"reading {options.input}", file=options.input)
         motion = _animate(options)
         _report(options, "progress", "finished", value=1.0)
-        result = _format(motion, options)
+        result = _format_mouths(motion, options)
         if options.output is None:
             sys.stdout.write(result)
             sys.stdout.flush()  # plug-ins read the result when the success is reported
@@ -98,16 +98,20 @@ def _animate(options: argparse.Namespace) -> FaceMotion:
     return motion
 
 
-def _format(motion: FaceMotion, options: argparse.Namespace) -> str:
+def _format_mouths(motion: FaceMotion, options: argparse.Namespace) -> str:
     """Return the mouths of a recording in the format of the options."""
-    instead = {letter: _BASIC[letter] for letter in _BASIC if letter not in options.extendedShapes}
+    instead = {
+        letter: _BASIC_MOUTHS[letter]
+        for letter in _BASIC_MOUTHS
+        if letter not in options.extendedShapes
+    }
     samples = motion.samples if motion.samples is not None else ()
     end_s, rest = len(samples) / MEDIA_RATE_HZ, instead.get(REST, REST)
     cues = [(start_s, instead.get(mouth, mouth)) for start_s, mouth in mouth_cues(motion.frames)]
     if options.exportFormat == "dat":
         names = _PRESTON_BLAIR if options.datUsePrestonBlair else {}
         return _moho_switches([*cues, (end_s, rest)], options.datFrameRate, names)
-    return write_cues(f".{options.exportFormat}", cues, rest, end_s, motion.source)
+    return format_cues(f".{options.exportFormat}", cues, rest, end_s, motion.source)
 
 
 def _moho_switches(cues: Iterable[Cue], rate_hz: float, names: dict[str, str]) -> str:

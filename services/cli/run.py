@@ -15,7 +15,12 @@ import typer
 
 from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, ServiceAssignments
-from kouxing.services.cli.running_system import announce, find_control, reserve, starting
+from kouxing.services.cli.running_system import (
+    announce_system,
+    find_control,
+    lock_output_folder,
+    lock_startup,
+)
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.service_kinds import (
@@ -34,7 +39,7 @@ from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 if TYPE_CHECKING:
     from kouxing.shared.audio_file import AudioSource
 
-BOUND_CONTROL = variable_name("control", "control")
+BOUND_CONTROL_VARIABLE = variable_name("control", "control")
 _SAMPLE_SESSION = "demo"
 
 
@@ -76,20 +81,22 @@ def run(
     driver = settings.load(DriverConfig)
     out = Path(driver.out)
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
-    reservation = _enter(reserve(out))
+    reservation = _enter(lock_output_folder(out))
     arguments = ["--config", str(config)] if config else []
-    startup = _enter(starting(lambda: print_message("waiting until another kouxing has started")))
+    startup = _enter(
+        lock_startup(lambda: print_message("waiting until another kouxing has started"))
+    )
     with rename_key_in_errors("--port", "gateway.port", is_given=port is not None):
         addresses = available_port_environment(settings)
     control_config = settings.load(ControlConfig)
-    bound_control = addresses.get(BOUND_CONTROL, control_config.bound_control)
+    bound_control = addresses.get(BOUND_CONTROL_VARIABLE, control_config.bound_control)
     control = _control_address(bound_control)
     environment = {
         **_assigned_environment(given),
         **head_environment(head or driver.head, out),
         **addresses,
         variable_name(COMMON, "control"): control,
-        BOUND_CONTROL: bound_control,
+        BOUND_CONTROL_VARIABLE: bound_control,
     }
     if not control_config.insecure:
         check_keys({kind.name: kind.key_roles for kind in KINDS.values()})
@@ -112,7 +119,7 @@ def run(
         startup.close()
         supervisor.watch()
         page = supervisor.page_address(client_control)
-        with announce(client_control):
+        with announce_system(client_control):
             print_message(f"the face is at {page}")
             if browser and not stop_after:
                 _open_browser(page)
@@ -189,13 +196,13 @@ def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) ->
         for setting in settings.describe(kind.config_type)
         if setting.is_default and variable_name(kind.name, setting.key) in moved
     ]
-    running = find_control() if BOUND_CONTROL in moved else ""
+    running = find_control() if BOUND_CONTROL_VARIABLE in moved else ""
     if running:
         owner = f"another kouxing is running, with control at {running.partition(' ')[0]}"
     else:
         owner = f"other programs use {', '.join(taken)}"
     warnings = [f"{owner}; this kouxing uses free ports"] if taken else []
-    if BOUND_CONTROL in moved:
+    if BOUND_CONTROL_VARIABLE in moved:
         warnings.append(
             f"your commands use this kouxing; for other programs, set KOUXING_CONTROL={control}"
         )

@@ -1,4 +1,4 @@
-"""The running systems of a user, for commands without an address.
+"""Finds the running systems of a user, for commands without an address.
 
 ``kouxing run`` writes control's address to a file in the user's own folder, and locks the file. The
 lock ends with the process, even if the process is killed.
@@ -15,12 +15,12 @@ from kouxing.shared.errors import UserError
 
 
 @contextlib.contextmanager
-def announce(control: str) -> Iterator[None]:
-    """Let this user's commands find a system while it runs.
+def announce_system(control: str) -> Iterator[None]:
+    """Publish control's address to this user's commands while the system runs.
 
     If the folder cannot be used or written, nothing is announced.
     """
-    folder = _folder()
+    folder = _own_folder()
     if folder is None:
         yield
         return
@@ -35,13 +35,13 @@ def announce(control: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def starting(on_wait: Callable[[], None]) -> Iterator[None]:
+def lock_startup(on_wait: Callable[[], None]) -> Iterator[None]:
     """Let only one of the user's systems start at a time, so that each detects the others' ports.
 
     ``on_wait`` is called if another system is starting. If the folder cannot be used, nothing
     waits.
     """
-    folder = _folder()
+    folder = _own_folder()
     if folder is None:
         yield
         return
@@ -58,8 +58,8 @@ def starting(on_wait: Callable[[], None]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def reserve(folder: Path) -> Iterator[None]:
-    """Lock the folder for logs and videos while this system runs.
+def lock_output_folder(folder: Path) -> Iterator[None]:
+    """Lock the folder of logs and videos while this system runs.
 
     Raises ``UserError`` if another system uses the folder. An unusable folder is not locked.
     """
@@ -80,7 +80,7 @@ def reserve(folder: Path) -> Iterator[None]:
 
 def find_control() -> str:
     """Return the address of control in the user's newest running system, or an empty string."""
-    folder = _folder()
+    folder = _own_folder()
     paths = [] if folder is None else folder.iterdir()
     for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
         with contextlib.suppress(FileNotFoundError), path.open(encoding="utf-8") as file:
@@ -94,8 +94,8 @@ def find_control() -> str:
     return ""
 
 
-def _folder() -> Path | None:
-    """Return a folder that only this user can write to, or None if that is impossible."""
+def _own_folder() -> Path | None:
+    """Return a folder that only this user can write to, or None if there is no such folder."""
     root = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     folder = Path(root) / f"kouxing-{os.getuid()}"
     try:

@@ -99,7 +99,7 @@ class _SessionFinder:
 
 
 def _send_frames(search: _SessionFinder, client: Client, senders: SenderPool) -> None:
-    """Send the frames of the session that was found last, forever."""
+    """Send the frames of the session that was found last. Does not return."""
     followed: _OpenedSession | None = None
     session: Session | None = None
     frames: Results[FapFrame] | None = None

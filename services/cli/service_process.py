@@ -1,4 +1,4 @@
-"""A service as a child process. The service reports each heartbeat through a pipe."""
+"""Runs a service as a child process, which reports each heartbeat through a pipe."""
 
 import contextlib
 import os
@@ -15,8 +15,8 @@ from kouxing.shared.parent_process import IDLE_PULSE, PARENT_VARIABLE, PULSE_VAR
 from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 
 POLL_S = 0.5  # interval between checks of a process
-SILENT_S = 1.0  # a loop without a heartbeat for longer may hang
-HANG_S = 5.0  # a loop without a heartbeat for longer hangs
+SILENT_S = 1.0  # a loop that sends no heartbeat for longer may hang
+HANG_S = 5.0  # a loop that sends no heartbeat for longer hangs
 
 
 class ServiceProcess(subprocess.Popen[bytes]):
@@ -71,7 +71,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         return self._silence.duration_s > SILENT_S + self._idle_s
 
     def reset_silence(self) -> None:
-        """Restart the timeout, as after a heartbeat."""
+        """Restart the timeout as if a heartbeat had arrived."""
         self._silence.duration_s = 0.0
 
     @property

@@ -1,4 +1,4 @@
-"""Reads the spoken texts of commands: given directly, or as a file."""
+"""Reads the spoken text of a command: an argument, or the content of a file."""
 
 import os
 import re
@@ -32,13 +32,13 @@ _TABLE_SUFFIXES = {".csv", ".xlsx"}
 _MARKDOWN_SUFFIXES = {".md", ".markdown"}
 
 
-def read_text(text: str, inventory: PhoneInventory) -> Transcript:
+def read_transcript(text: str, inventory: PhoneInventory) -> Transcript:
     """Return the syllables of a text or of a text file.
 
     Prints a message about words that cannot be read, and about a format with more than the text.
     Raises ``UserError`` if the file or the text cannot be read, or the text has no syllables.
     """
-    spoken = text_of(text)
+    spoken = read_spoken_text(text)
     for kind, limit, number in (
         ("characters", _MAX_CHARACTERS, len(spoken)),
         ("digits", _MAX_DIGITS, sum(map(str.isdigit, spoken))),
@@ -78,13 +78,13 @@ def print_mismatch(audio: Path, reason: str) -> None:
     )
 
 
-def text_of(text: str) -> str:
-    """Return the spoken text of a text, or of the file of that name.
+def read_spoken_text(text: str) -> str:
+    """Extract the spoken text from a text, or from the file that it names.
 
     Prints the format if it is not plain text. Raises ``UserError`` if the file cannot be read, or
     its format is not supported.
     """
-    path = _path_of(text)
+    path = _find_file(text)
     if path is None:
         given = SpokenText(text) if _is_unicode(text) else decode_text(os.fsencode(text))
         spoken, encoding = extract_text(given.text), given.form
@@ -112,7 +112,7 @@ def _is_unicode(text: str) -> bool:
     return not re.search("[\ud800-\udfff]", text)
 
 
-def _path_of(text: str) -> Path | None:
+def _find_file(text: str) -> Path | None:
     """Return the file that a text names; None if the text is not a file name."""
     try:
         path = Path(text)

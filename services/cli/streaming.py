@@ -21,7 +21,7 @@ PUSH_TIMEOUT_S = 30.0
 STATUS_S = 1.0  # interval between status requests
 DRIVER_TIMEOUT_S = 20.0  # for a lost driver to restart, on a busy machine
 PIPE_PAUSE_S = 0.2  # a pipe that is silent for longer has paused; its next audio is not late
-PIPE_CLOCK = 0.999  # so that a pipe from a device with a fast clock does not fill
+PIPE_TEMPO = 0.999  # a device with a fast clock would fill the pipe
 QUIET_PEAK = 1e-3  # a file whose peak is lower (-60 dBFS) is called silent
 
 
@@ -52,7 +52,7 @@ def stream(
     ``UserError`` if the system does not answer, refuses the session or stops answering.
     """
     with connect_client(control) as client:
-        return _Streaming(client, source, console).run(
+        return _Streamer(client, source, console).run(
             record=record,
             name=session,
             paced=paced,
@@ -69,8 +69,8 @@ def missed_warning(count: int, noun: str) -> str:
     )
 
 
-class _Streaming:
-    """One source that is streamed into a session."""
+class _Streamer:
+    """Streams one source into a session."""
 
     def __init__(self, client: Client, source: AudioSource, console: Console) -> None:
         self._client = client
@@ -146,7 +146,7 @@ class _Streaming:
                 if paced and not source.is_live:
                     if is_pipe and time.monotonic() > due_s + PIPE_PAUSE_S:
                         due_s = time.monotonic()  # the source resumes after a pause
-                    due_s += len(block) / source.sample_rate_hz * (PIPE_CLOCK if is_pipe else 1.0)
+                    due_s += len(block) / source.sample_rate_hz * (PIPE_TEMPO if is_pipe else 1.0)
                     time.sleep(max(0.0, due_s - time.monotonic()))
         except KeyboardInterrupt:
             if not source.is_live:
@@ -157,7 +157,7 @@ class _Streaming:
         self._clipped = num_clipping / max(1, num_sent * source.num_channels)
 
     def _wait_for_end(self) -> None:
-        """Wait for the last frame; with much queued audio that may take a while."""
+        """Wait for the last frame, which may take long if much audio is queued."""
         ask_s = time.monotonic() + STATUS_S
         while not self._phones.has_ended:
             self._update(0.2)

@@ -202,7 +202,9 @@ class Supervisor:
         )
         self._processes[name] = process
         self._started_s[name] = time.monotonic()
-        follower = threading.Thread(target=self._follow, args=(name, process), daemon=True)
+        follower = threading.Thread(
+            target=self._copy_log_until_end, args=(name, process), daemon=True
+        )
         self._followers[name] = follower
         follower.start()
 
@@ -211,7 +213,7 @@ class Supervisor:
         is_fresh = self._backoff_s[name] <= MIN_BACKOFF_S
         return WORKER_HANG_S if kind_of(name) in WORKERS and is_fresh else HANG_S
 
-    def _follow(self, name: str, process: subprocess.Popen[bytes]) -> None:
+    def _copy_log_until_end(self, name: str, process: subprocess.Popen[bytes]) -> None:
         """Copy a service's log until it ends, then wake the watcher."""
         if process.stderr is not None:
             self._copy_log(name, process.stderr)

@@ -1,4 +1,4 @@
-"""Finds columns of times or names that every line of a text has next to its spoken part."""
+"""Removes columns of times or names that every line of a text has next to its spoken part."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Extracts the spoken text from subtitles, markup and other files with more than the text.
+"""Extracts the spoken text from subtitles, markup and other files that contain more.
 
 A format is recognized by its content, because a text may have no file name. Times and tags
 are left out. A format whose text cannot be extracted is rejected by its name.
@@ -16,7 +16,7 @@ from kouxing.services.cli.text_columns import remove_columns
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import parse_json
 
-_BINARY = {  # by their first bytes
+_BINARY_SIGNATURES = {  # by their first bytes
     b"%PDF": "a PDF document",
     b"{\\rtf": "an RTF document",
     b"PK\x03\x04": "a Word, OpenDocument, EPUB or zip file",
@@ -30,7 +30,7 @@ _BINARY = {  # by their first bytes
     b"\x89PNG": "a picture",
     b"\xff\xd8\xff": "a picture",
 }
-_TEXTUAL = {  # text files without an extractor, by their first characters
+_UNSUPPORTED_TEXTS = {  # text files without an extractor, by their first characters
     "Scenarist_SCC": "SCC captions",
     "#!MLF!#": "an HTK label file",
     "@UTF8": "a CHAT transcript",
@@ -38,7 +38,7 @@ _TEXTUAL = {  # text files without an extractor, by their first characters
     "\\documentclass": "a LaTeX document",
     "\\version": "a LilyPond file",
 }
-_MARKS = (
+_BYTE_ORDER_MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
@@ -114,10 +114,10 @@ def decode_text(content: bytes) -> SpokenText:
 
     Raises ``UserError`` if the file is not a text; the message names its format.
     """
-    for beginning, name in _BINARY.items():
+    for beginning, name in _BINARY_SIGNATURES.items():
         if content.startswith(beginning):
             raise UserError(f"this is {name}; save the spoken text as a plain text file")
-    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "")
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), "")
     if not encoding and b"\0" in content:
         encoding = "utf-16-be" if content[::2].count(0) > content[1::2].count(0) else "utf-16-le"
     texts: dict[str, str] = {}
@@ -125,14 +125,16 @@ def decode_text(content: bytes) -> SpokenText:
         with contextlib.suppress(UnicodeDecodeError):
             texts[name] = content.decode(name)
     # bytes in Big5 are mostly valid in GB 18030 too, but give rare characters
-    candidates = [name for name in texts if name != "gb18030" or _is_common(texts[name])]
+    candidates = [
+        name for name in texts if name != "gb18030" or _has_common_characters(texts[name])
+    ]
     name = next(iter(candidates or texts), "")
     if not name or any(ord(letter) < 32 and not letter.isspace() for letter in texts[name]):
         raise UserError("this is not a text file; save the spoken text as plain text in UTF-8")
     return SpokenText(texts[name], "" if name.startswith("utf-8") else name.upper())
 
 
-def _is_common(text: str) -> bool:
+def _has_common_characters(text: str) -> bool:
     """Return whether most characters of a text are among the 7000 that GB 2312 has."""
     characters = [letter for letter in text if not letter.isascii()]
     common = sum(bool(letter.encode("gb2312", "ignore")) for letter in characters)
@@ -146,7 +148,7 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
     names it.
     """
     text = text.lstrip("\ufeff \t\r\n").replace("\r\n", "\n").replace("\r", "\n")
-    for beginning, name in _TEXTUAL.items():
+    for beginning, name in _UNSUPPORTED_TEXTS.items():
         if text.startswith(beginning):
             raise UserError(f"this is {name}; keep only the spoken text")
     for form, pattern, extract in _FORMATS:
@@ -180,10 +182,10 @@ def _read_cues(text: str) -> str:
                 cues[-1].pop()  # the name of the cue
             rest = line[times.end() :]  # settings, or the text itself
             cues.append([rest] if _CHINESE.search(rest) else [])
-    return "\n".join(_without_repeats([_read_markup("\n".join(cue)).split("\n") for cue in cues]))
+    return "\n".join(_remove_repeats([_read_markup("\n".join(cue)).split("\n") for cue in cues]))
 
 
-def _without_repeats(cues: list[list[str]]) -> list[str]:
+def _remove_repeats(cues: list[list[str]]) -> list[str]:
     """Return the lines of cues. In rolling captions, a cue repeats the last line of the one before.
 
     A cue of a single line may really be spoken twice. It is a repeat only if other cues roll.
@@ -297,19 +299,19 @@ def _read_commands(text: str) -> str:
 
 
 def _read_json(text: str) -> str:
-    return _json_text(parse_json(text))
+    return _find_json_text(parse_json(text))
 
 
-def _json_text(value: object) -> str:
+def _find_json_text(value: object) -> str:
     """Extract the text of a transcript: of Whisper, of players, or of ``kouxing align``."""
     if isinstance(value, str):
         return value
     if isinstance(value, list) and value:
-        return "\n".join(map(_json_text, value))
+        return "\n".join(map(_find_json_text, value))
     if isinstance(value, dict):
         for name in ("text", "content", "segments", "body", "syllables"):
             if name in value:
-                return _json_text(value[name])
+                return _find_json_text(value[name])
     raise UserError("this is JSON without the text of a transcript; keep only the spoken text")
 
 

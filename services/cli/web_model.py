@@ -151,8 +151,8 @@ def web_model() -> dict[str, bytes]:
         "log_prior": light.log_prior,
         "block_log_prior": block_archive.floats("log_prior", topology.num_states),
     }
-    blob, places = _pack(arrays)
-    phone_blob, phone_places = _pack(phone_arrays)
+    blob, places = _pack_arrays(arrays)
+    phone_blob, phone_places = _pack_arrays(phone_arrays)
     settings = SynthesizerConfig()
     header = {
         "format": FORMAT,
@@ -185,15 +185,15 @@ def web_model() -> dict[str, bytes]:
         "phoneArrays": phone_places,
     }
     return {
-        "encoder.onnx": _network_in(read_archive(encoder.ENCODER_PATH)),
-        "blocks.onnx": _network_in(block_archive),
+        "encoder.onnx": _read_network(read_archive(encoder.ENCODER_PATH)),
+        "blocks.onnx": _read_network(block_archive),
         "model.bin": blob,
         "phones.bin": phone_blob,
         "model.json": json.dumps(header, separators=(",", ":")).encode(),
     }
 
 
-def _network_in(archive: model_file.Archive) -> bytes:
+def _read_network(archive: model_file.Archive) -> bytes:
     return archive.array("network", None).astype(np.uint8).tobytes()
 
 
@@ -218,20 +218,20 @@ def _phones_header(topology: Topology) -> dict[str, Any]:
     }
 
 
-def _pack(arrays: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, dict[str, Any]]]:
+def _pack_arrays(arrays: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, dict[str, Any]]]:
     """Join arrays; return the bytes, and type, shape and first byte of each array."""
     blob = bytearray()
     places = {}
     for name, array in arrays.items():
-        short = _shortened(array)
+        short = _to_shortest_type(array)
         blob += bytes(-len(blob) % _ALIGNMENT_BYTES)
         places[name] = {"type": short.dtype.name, "shape": short.shape, "begin": len(blob)}
         blob += short.tobytes()
     return bytes(blob), places
 
 
-def _shortened(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array in the shortest type that keeps its values; integers keep theirs."""
+def _to_shortest_type(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array in the shortest type that keeps its values. Integers keep their type."""
     if array.dtype.kind in "iu":
         return array
     for kind in (np.float16, np.float32):

@@ -1,1 +1,1 @@
-"""The driver service: FAP frames in, a rendered head out (window, video)."""
+"""The driver service: renders FAP frames to a window or a video."""

@@ -1,4 +1,4 @@
-"""The driver as a kind of service."""
+"""Declares the driver as a kind of service."""
 
 from kouxing.shared.service_kind import ServiceKind
 

@@ -1,4 +1,4 @@
-"""Decodes and encodes single pictures, also from untrusted files."""
+"""Decodes and encodes single pictures. The files may be untrusted."""
 
 from fractions import Fraction
 from typing import Any

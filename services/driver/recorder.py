@@ -1,7 +1,7 @@
-"""The process that draws and writes the driver's videos.
+"""Draws and writes the driver's videos, in a separate process.
 
-OpenGL and the encoder hold the GIL for up to a second, so they would delay the driver's heartbeats.
-They also keep memory until their process ends.
+OpenGL and the encoder hold the GIL for up to a second, which would delay the driver's
+heartbeats. They also keep memory until their process ends.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ import numpy as np
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.scene import open_renderer
-from kouxing.services.driver.video.recording import Recording
+from kouxing.services.driver.video.video_renderer import VideoRenderer
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG, configure
 
@@ -31,15 +31,17 @@ ALIVE_S = 1.0  # interval between reports that the process runs
 class Recorder:
     """Draws the images of all videos in turn, with the same number of images for each key.
 
-    ``make`` opens a video. ``report`` is called with ``("image", number)``, ``("written", number,
-    path)``, ``("failed", number, reason)`` or, if a video must end before its session,
+    ``open_video`` opens a video. ``report`` is called with ``("image", number)``, ``("written",
+    number, path)``, ``("failed", number, reason)`` or, if a video must end before its session,
     ``("short", number, reason)``.
     """
 
-    def __init__(self, make: Callable[[Path], Recording], report: Callable[..., None]) -> None:
-        self._make = make
+    def __init__(
+        self, open_video: Callable[[Path], VideoRenderer], report: Callable[..., None]
+    ) -> None:
+        self._open_video = open_video
         self._report = report
-        self._recordings: dict[int, Recording] = {}  # least recently drawn first
+        self._videos: dict[int, VideoRenderer] = {}  # least recently drawn first
         self._keys: dict[int, str] = {}
         self._newest_turn: Counter[str] = Counter()  # by key
         self._num_turns = 0
@@ -49,15 +51,15 @@ class Recorder:
         """Open a video for a client's key."""
         self._keys[number] = key
         with self._reports_failure(number):
-            self._recordings[number] = self._make(path)
+            self._videos[number] = self._open_video(path)
 
     def add_frame(self, number: int, time_s: float, values: bytes) -> None:
         """Add a FAP frame (68,), unless the video has ended."""
         if not self._is_open(number):
             return
-        recording = self._recordings[number]
-        recording.add_frame(time_s, np.frombuffer(values, "<f4"))
-        if recording.num_queued >= MAX_QUEUED_FRAMES:
+        video = self._videos[number]
+        video.add_frame(time_s, np.frombuffer(values, "<f4"))
+        if video.num_queued >= MAX_QUEUED_FRAMES:
             self.end(number)
             reason = (
                 f"the video ends after {time_s / 60:.0f} minutes: {MAX_QUEUED_FRAMES} frames are"
@@ -70,19 +72,19 @@ class Recorder:
         if self._is_open(number):
             samples = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(32768)
             with self._reports_failure(number):
-                self._recordings[number].add_sound(media_time, samples)
+                self._videos[number].add_sound(media_time, samples)
 
     def end(self, number: int) -> None:
         """Finish a video once the frames that have arrived are drawn."""
-        if number in self._recordings:
+        if number in self._videos:
             self._ended.add(number)
 
     def draw_image(self) -> bool:
-        """Draw the next due image, or complete a video; return False if nothing is due."""
-        for number in sorted(self._recordings, key=lambda n: self._newest_turn[self._keys[n]]):
+        """Draw the next due image, or complete a video; return whether anything was due."""
+        for number in sorted(self._videos, key=lambda n: self._newest_turn[self._keys[n]]):
             with self._reports_failure(number):
-                if self._recordings[number].step():
-                    self._recordings[number] = self._recordings.pop(number)  # moves to the end
+                if self._videos[number].step():
+                    self._videos[number] = self._videos.pop(number)  # moves to the end
                     self._num_turns += 1
                     self._newest_turn[self._keys[number]] = self._num_turns
                     self._report("image", number)
@@ -94,52 +96,53 @@ class Recorder:
 
     def close_early(self) -> None:
         """Save the finished part of every video."""
-        for number in list(self._recordings):
+        for number in list(self._videos):
             with self._reports_failure(number):
                 self._close(number)
 
     def _is_open(self, number: int) -> bool:
-        return number in self._recordings and number not in self._ended
+        return number in self._videos and number not in self._ended
 
     def _close(self, number: int) -> None:
-        recording = self._recordings[number]
-        recording.close()
-        del self._recordings[number]
-        self._report("written", number, recording.path)
+        video = self._videos[number]
+        video.close()
+        del self._videos[number]
+        self._report("written", number, video.path)
 
     @contextmanager
     def _reports_failure(self, number: int) -> Iterator[None]:
-        """Report an error as the failure of one video; the others continue."""
+        """Report an error as the failure of one video. The other videos continue."""
         try:
             yield
         except Exception as error:
             if not isinstance(error, UserError):
                 LOG.exception("recording a video failed")
-            if recording := self._recordings.pop(number, None):
-                recording.discard()
+            if video := self._videos.pop(number, None):
+                video.discard()
             self._report("failed", number, str(error))
 
 
 def run(connection: Connection, config: DriverConfig) -> None:
-    """Call the ``Recorder`` methods named by commands, until None arrives or the connection closes.
+    """Call the ``Recorder`` methods that the received commands name.
 
-    Unfinished videos then end early. Reports ``("alive",)`` about once a second.
+    None or the end of the connection ends the loop, and unfinished videos end early. Reports
+    ``("alive",)`` about once a second.
     """
     os.setsid()  # Ctrl-C in the terminal reaches only the driver, which stops this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     configure("driver", config.log_level)
     renderers: list[Renderer] = []
 
-    def make(path: Path) -> Recording:
+    def open_video(path: Path) -> VideoRenderer:
         if not renderers:
             renderers.append(open_renderer(config))
-        return Recording(path, renderers[0], config.frame_rate_hz, overwrite=False)
+        return VideoRenderer(path, renderers[0], config.frame_rate_hz, overwrite=False)
 
     def report(*result: object) -> None:
         with contextlib.suppress(OSError):  # the driver was killed
             connection.send(result)
 
-    recorder = Recorder(make, report)
+    recorder = Recorder(open_video, report)
     is_drawing = False
     try:
         while True:

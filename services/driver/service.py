@@ -1,4 +1,4 @@
-"""The driver as a service: FAP frames in, a face in a window or a video out.
+"""The driver service: shows FAP frames in a window, or writes a video.
 
 Reacts to: start-session, close-session (control), fap-frame, end-of-faps (synthesizer), sound
 (recognizer).
@@ -16,9 +16,9 @@ import numpy as np
 
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.kind import KIND
-from kouxing.services.driver.poses import PoseStore
-from kouxing.services.driver.recordings import Recordings
-from kouxing.services.driver.video.writer import remove_unfinished
+from kouxing.services.driver.pose_store import PoseStore
+from kouxing.services.driver.recorder_client import RecorderClient
+from kouxing.services.driver.video.video_writer import remove_unfinished
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.idle_motion import STALL_S
@@ -40,7 +40,7 @@ RETRY_AFTER_S = 5.0  # for a client whose session cannot be recorded now
 
 @dataclass(slots=True)
 class _FollowedSession:
-    """One session that the driver follows."""
+    """A session that the driver follows."""
 
     follower: ServiceFollower
     leave_by_s: float | None = None  # set once the session has closed
@@ -59,7 +59,7 @@ class DriverService(SessionService):
         self._drain_until_s = math.inf
         self.poses = PoseStore(config.session, config.idle_motion_seed)
         self.view = View(config, self.poses.switch)
-        self.recordings = Recordings(
+        self.recorder = RecorderClient(
             config,
             on_written=self._report_written,
             on_failed=self._report_failure,
@@ -82,14 +82,14 @@ class DriverService(SessionService):
         """
         session = self._sessions.get(start.session)
         if session is not None and session.follower.session_start.token != start.token:
-            self._leave(session)  # a different session with the same name
+            self._unfollow(session)  # a different session with the same name
             session = None
         if session is None and not start.record and not self.view.is_live:
             return True
         if session is None:
             key = start.client_key or ""
-            if start.record and (reason := self.recordings.rejection_reason(key)):
-                self._refuse(start, reason)
+            if start.record and (reason := self.recorder.rejection_reason(key)):
+                self._reject_session(start, reason)
                 return False
             handlers: dict[type[Message], Callable[[Any], None]] = {
                 FapFrame: self._on_frame,
@@ -101,7 +101,7 @@ class DriverService(SessionService):
             self._sessions[start.session] = session
             self.poses.add(start.session, time.monotonic())
             if start.record:
-                self.recordings.begin(start.session, key)
+                self.recorder.begin(start.session, key)
         session.follower.session_start = start
         session.follower.follow()
         return False
@@ -111,14 +111,14 @@ class DriverService(SessionService):
         left = self._sessions.get(session)
         if left is None:
             return
-        if not self.recordings.is_open(session):
-            self._leave(left)
+        if not self.recorder.is_open(session):
+            self._unfollow(left)
         elif left.leave_by_s is None:
             left.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
 
     def gauges(self) -> dict[str, float]:
         """Return the number of videos that are not written yet."""
-        return {"unfinished_videos": len(self.recordings.unfinished)}
+        return {"unfinished_videos": len(self.recorder.unfinished)}
 
     def on_startup(self) -> None:
         """Delete the unfinished videos of a killed driver."""
@@ -126,10 +126,10 @@ class DriverService(SessionService):
 
     def on_tick(self, now_s: float) -> float:
         """Draw what is due."""
-        due_s = self.recordings.tick(now_s)
+        due_s = self.recorder.tick(now_s)
         for session in list(self._sessions.values()):
             if session.leave_by_s is not None and now_s >= session.leave_by_s:
-                self._leave(session)
+                self._unfollow(session)
             elif session.leave_by_s is not None:
                 due_s = min(due_s, session.leave_by_s)
         if self.view.is_live:
@@ -141,17 +141,17 @@ class DriverService(SessionService):
     def on_drain(self) -> bool:
         """Finish the open videos."""
         for session in list(self._sessions.values()):
-            self._leave(session)
+            self._unfollow(session)
         now_s = time.monotonic()
-        self.recordings.tick(now_s)
+        self.recorder.tick(now_s)
         self._drain_until_s = min(self._drain_until_s, now_s + MAX_DRAIN_S)
-        return not self.recordings.unfinished or now_s > self._drain_until_s
+        return not self.recorder.unfinished or now_s > self._drain_until_s
 
     def on_shutdown(self) -> None:
         """Save the unfinished part of the remaining videos."""
-        for session in self.recordings.unfinished:
+        for session in self.recorder.unfinished:
             LOG.warning("the driver stopped, so the video ends early", extra={"session": session})
-        self.recordings.close()
+        self.recorder.close()
         self.view.close()
 
     def session_inputs(self) -> dict[str, SessionInput]:
@@ -163,25 +163,25 @@ class DriverService(SessionService):
     def _on_frame(self, frame: FapFrame) -> None:
         faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
         self.poses.update(frame.session, faps, time.monotonic())
-        self.recordings.add_frame(frame.session, to_seconds(frame.media_time), frame.values)
+        self.recorder.add_frame(frame.session, to_seconds(frame.media_time), frame.values)
 
     def _on_sound(self, sound: Sound) -> None:
-        self.recordings.add_sound(sound.session, sound.media_time, sound.pcm)
+        self.recorder.add_sound(sound.session, sound.media_time, sound.pcm)
 
     def _on_end(self, end: EndOfFaps) -> None:
         self.poses.end(end.session)
-        self.recordings.end(end.session)
+        self.recorder.end(end.session)
         session = self._sessions[end.session]
         if session.leave_by_s is not None:
-            self._leave(session)
+            self._unfollow(session)
 
-    def _leave(self, session: _FollowedSession) -> None:
+    def _unfollow(self, session: _FollowedSession) -> None:
         """Close a session's subscriptions and finish its video with the frames received so far."""
         name = session.follower.session
         del self._sessions[name]
         session.follower.close()
         self.poses.remove(name)
-        self.recordings.end(name)
+        self.recorder.end(name)
 
     def _warn_if_stalled(self, now_s: float) -> None:
         is_stalled = self.poses.is_stalled(now_s)
@@ -195,7 +195,7 @@ class DriverService(SessionService):
 
     # --- videos --------------------------------------------------------------------------------
 
-    def _refuse(self, start: StartSession, reason: str) -> None:
+    def _reject_session(self, start: StartSession, reason: str) -> None:
         """Ask control to reject a session that cannot be recorded."""
         LOG.info(reason, extra={"session": start.session})
         self.send_to_control(

@@ -1,4 +1,4 @@
-"""The live view of a face: a window, a virtual camera, both or neither."""
+"""Shows a face live in a window, a virtual camera, both or neither."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver.config import DriverConfig
-from kouxing.services.driver.render.scene import background, camera, load_head, open_renderer
+from kouxing.services.driver.render.scene import (
+    load_head,
+    open_renderer,
+    parse_background,
+    place_camera,
+)
 from kouxing.services.driver.video.virtual_camera import VirtualCamera
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
@@ -42,7 +47,7 @@ class View:
 
     @property
     def is_live(self) -> bool:
-        """Whether the face is visible anywhere."""
+        """Whether a window or a virtual camera shows the face."""
         return self._is_window_open or self._virtual_camera is not None
 
     def show(self, faps: NDArray[np.float32], caption: str, now_s: float) -> None:
@@ -74,8 +79,8 @@ def _open_window(config: DriverConfig, on_switch: Callable[[int], None]) -> Wind
         return Window(
             head,
             *config.size_px,
-            background=background(config.background),
-            camera=camera(head, config.camera),
+            background=parse_background(config.background),
+            camera=place_camera(head, config.camera),
             on_switch=on_switch,
         )
     except UserError as error:

@@ -37,7 +37,7 @@ main()
 """
 CTRL_C_AT_FIRST_IMAGE = """
 import signal
-from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.services.driver.video.video_writer import VideoWriter
 write_image = VideoWriter.write_image
 
 def interrupt(*arguments):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from kouxing_client import follower
 
-from kouxing.services.driver import poses, recordings
+from kouxing.services.driver import pose_store, recorder_client
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.service import DriverService
 from kouxing.shared.face.faps import NUM_FAPS
@@ -104,8 +104,8 @@ def harness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DriverH
 def test_shows_one_session_while_recording_another(
     harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(poses, "FADE_S", 1e-9)  # on a quick machine, the face would fade in
-    monkeypatch.setattr(poses, "STALL_S", 60.0)  # on a busy one, it would fade out
+    monkeypatch.setattr(pose_store, "FADE_S", 1e-9)  # on a quick machine, the face would fade in
+    monkeypatch.setattr(pose_store, "STALL_S", 60.0)  # on a busy one, it would fade out
     harness.start("filmed", record=True)
     harness.start("other")
     values = set()
@@ -181,7 +181,7 @@ def test_refuses_more_videos_than_the_limit(harness: DriverHarness) -> None:
 
 
 def test_limits_the_videos_of_one_key(harness: DriverHarness) -> None:
-    videos = harness.driver.recordings
+    videos = harness.driver.recorder
     for number in range(3):
         assert videos.rejection_reason("greedy") == ""
         videos.begin(f"film-{number}", "greedy")
@@ -193,7 +193,7 @@ def test_a_killed_recorder_fails_its_videos_and_leaves_no_file(harness: DriverHa
     harness.start("film", record=True)
     harness.publish("film", 0, 100.0)
     harness.step_until(harness.unfinished)
-    recorder = harness.driver.recordings._recorder
+    recorder = harness.driver.recorder._recorder
     assert recorder is not None
     recorder.process.kill()
     harness.step_until(lambda: harness.events("error"))
@@ -208,7 +208,7 @@ def test_a_killed_recorder_fails_its_videos_and_leaves_no_file(harness: DriverHa
 def test_the_recorder_ends_when_there_is_no_video(
     harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recordings, "IDLE_S", 0.0)
+    monkeypatch.setattr(recorder_client, "IDLE_S", 0.0)
     harness.start("film", record=True)
     harness.publish("film", 0, 100.0)
     harness.end("film")
@@ -219,7 +219,7 @@ def test_the_recorder_ends_when_there_is_no_video(
 def test_a_stopping_driver_saves_the_finished_part_of_a_video(
     harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recordings, "CLOSE_LIMIT_S", 60.0)
+    monkeypatch.setattr(recorder_client, "CLOSE_LIMIT_S", 60.0)
     harness.start("film", record=True)
     for number in range(26):
         harness.publish("film", number, 100.0)

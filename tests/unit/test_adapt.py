@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from kouxing.corpora.commands import adapt_app, track_app
 from kouxing.corpora.lip_clips import read_clip
-from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.services.driver.video.video_writer import VideoWriter
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.shared.errors import UserError

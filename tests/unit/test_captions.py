@@ -6,8 +6,8 @@ import pytest
 from kouxing.services.cli.animation import FaceMotion, slow_down
 from kouxing.services.cli.captions import make_captions, write_syllables
 from kouxing.services.cli.options import CaptionKind
-from kouxing.services.driver.render.captions import Caption, Captions, band_height_px
-from kouxing.services.driver.video.time_stretch import stretch
+from kouxing.services.driver.render.captions import Caption, CaptionDrawer, band_height_px
+from kouxing.services.driver.video.time_stretch import stretch_time
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
 from tests import lips
@@ -67,7 +67,7 @@ def test_phones_of_other_languages_are_ipa() -> None:
 
 def test_long_texts_and_pauses_start_a_new_line() -> None:
     words = [Caption(0.1 * number, 0.1 * number + 0.1, "zhuang") for number in range(40)]
-    captions = Captions([*words, Caption(9.0, 9.2, "a")], SIZE)
+    captions = CaptionDrawer([*words, Caption(9.0, 9.2, "a")], SIZE)
     picture = np.zeros((SIZE[1] - band_height_px(SIZE), SIZE[0], 3), np.uint8)
     bands = [captions.add_below(picture, time_s)[len(picture) :] for time_s in (0.0, 3.9, 9.3)]
     assert len({band.tobytes() for band in bands}) == 3
@@ -86,7 +86,7 @@ def test_slow_motion_keeps_the_pitch_and_moves_everything() -> None:
     assert slow.syllables[1].onset_s == pytest.approx(0.8)
     times_s = np.arange(16_000) / 16_000
     tone = np.sin(2 * np.pi * 440 * times_s).astype(np.float32) * (times_s > 0.5)
-    slow_tone = stretch(tone.astype(np.float32), 0.25)
+    slow_tone = stretch_time(tone.astype(np.float32), 0.25)
     assert len(slow_tone) == 64_000
     loud = np.flatnonzero(np.abs(slow_tone) > 0.3)
     assert loud[0] / 16_000 == pytest.approx(2.0, abs=0.15)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS, FrameStream
 from kouxing.services.cli.curve_reader import read_table
-from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
 from kouxing.services.cli.options import CurveFormat, ExportOptions
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
@@ -21,14 +21,14 @@ ARKIT_JAW_HALF_OPEN = np.where(np.array(ARKIT.names) == "jawOpen", 0.5, 0.0)
 HEAD_YAW = FAP_NUMBER["head_yaw"] - 1
 
 
-def face_curves() -> Curves:
+def face_curves() -> FrameStream:
     faps = np.zeros((60, NUM_FAPS), np.float32)
     for row, jaw_open in zip(faps, np.linspace(0.0, 0.5, 60), strict=True):
         row[:] = ARKIT.faps(np.where(np.array(ARKIT.names) == "jawOpen", jaw_open, 0.0))
         row[HEAD_YAW] = 5000.0
     rows = [(number / RATE_HZ, number, row) for number, row in enumerate(faps)]
     phone = Phone(index=0, symbol="a", onset_s=0.1, duration_s=0.195, confidence=1.0, final=True)
-    return Curves(rows, RATE_HZ, [phone])
+    return FrameStream(rows, RATE_HZ, [phone])
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from rich.progress import Progress
 
 from kouxing.services.cli.animation import FaceMotion
-from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves, Row
+from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS, FrameRow, FrameStream
 from kouxing.services.cli.exporters import open_exporter
 from kouxing.services.cli.follow import follow
 from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
@@ -23,7 +23,7 @@ from kouxing.shared.face.shapes import ARKIT
 RATE_HZ = 40.0
 
 
-def rows(number: int = 5) -> list[Row]:
+def rows(number: int = 5) -> list[FrameRow]:
     faps = np.zeros((number, NUM_FAPS), np.float32)
     faps[:, 2] = np.linspace(0, 400, number)  # open_jaw
     return [(index / RATE_HZ, index, faps[index]) for index in range(number)]
@@ -59,7 +59,7 @@ def test_json_lines_have_an_object_per_frame(tmp_path: Path) -> None:
 def test_fap_has_the_frame_rate_of_the_motion_or_of_the_times(tmp_path: Path) -> None:
     export(tmp_path / "face.fap")
     exporter = CURVE_EXPORTERS[".fap"](tmp_path / "live.fap", ExportOptions())
-    assert exporter.write(Curves(rows())) == 5
+    assert exporter.write(FrameStream(rows())) == 5
     for name in ("face.fap", "live.fap"):
         animation = read_fap(tmp_path / name)
         assert animation.frame_rate_hz == pytest.approx(RATE_HZ)

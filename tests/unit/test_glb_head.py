@@ -12,7 +12,7 @@ from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.render.scene import camera, load_head
+from kouxing.services.driver.render.scene import load_head, place_camera
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
@@ -35,7 +35,7 @@ def test_reads_an_exported_head_unchanged(tmp_path: Path) -> None:
     assert shape_error(head, faps) < 0.01
     pictures = []
     for model in (ORIGINAL, head):
-        renderer = Renderer(model, 96, 72, samples=0, camera=camera(model))
+        renderer = Renderer(model, 96, 72, samples=0, camera=place_camera(model))
         pictures.append(renderer.draw(faps.astype(np.float32)).astype(float))
         renderer.close()
     assert np.abs(pictures[0] - pictures[1]).mean() < 3

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer, mouth_light
-from kouxing.services.driver.render.scene import camera
+from kouxing.services.driver.render.scene import place_camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes import visemes
 from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
@@ -37,7 +37,7 @@ def coarse_head(request: pytest.FixtureRequest) -> Head:
 
 
 def test_any_two_mouths_differ(coarse_head: Head) -> None:
-    renderer = Renderer(coarse_head, *SIZE_PX, samples=0, camera=camera(coarse_head))
+    renderer = Renderer(coarse_head, *SIZE_PX, samples=0, camera=place_camera(coarse_head))
     pictures = {viseme: renderer.draw(spoken(viseme)).astype(np.int32) for viseme in VISEMES}
     renderer.close()
     for one, other in combinations(VISEMES, 2):

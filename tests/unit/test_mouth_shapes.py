@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.cli import rhubarb
-from kouxing.services.cli.cues import write_cues
+from kouxing.services.cli.cue_files import format_cues
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -70,16 +70,16 @@ def test_oculus_visemes_are_found_again() -> None:
 
 
 def test_the_tsv_output_equals_the_readmes() -> None:
-    text = write_cues(".tsv", HI, "X", 0.479, None)
+    text = format_cues(".tsv", HI, "X", 0.479, None)
     assert text == "0.00\tX\n0.05\tD\n0.27\tC\n0.31\tB\n0.43\tX\n0.47\tX\n"
 
 
 def test_json_and_xml_have_the_same_cues(tmp_path: Path) -> None:
     source = tmp_path / "<hi> & bye.wav"
-    content = json.loads(write_cues(".json", HI, "X", 0.47, source))
+    content = json.loads(format_cues(".json", HI, "X", 0.47, source))
     assert content["metadata"] == {"soundFile": str(source), "duration": 0.47}
     assert content["mouthCues"][1] == {"start": 0.05, "end": 0.27, "value": "D"}
-    root = ET.fromstring(write_cues(".xml", HI, "X", 0.47, source))  # noqa: S314 - our own
+    root = ET.fromstring(format_cues(".xml", HI, "X", 0.47, source))  # noqa: S314 - our own
     assert root.findtext("metadata/soundFile") == str(source)
     assert [
         {"start": float(cue.attrib["start"]), "end": float(cue.attrib["end"]), "value": cue.text}
@@ -88,9 +88,9 @@ def test_json_and_xml_have_the_same_cues(tmp_path: Path) -> None:
 
 
 def test_lips_that_close_for_a_rest_are_at_rest_at_once() -> None:
-    text = write_cues(".tsv", [(0.0, "C"), (0.1, "A"), (0.3, "X")], "X", 0.5, None)
+    text = format_cues(".tsv", [(0.0, "C"), (0.1, "A"), (0.3, "X")], "X", 0.5, None)
     assert text == "0.00\tC\n0.10\tX\n0.50\tX\n"
-    assert write_cues(".tsv", [], "X", 0.2, None) == "0.00\tX\n0.20\tX\n"
+    assert format_cues(".tsv", [], "X", 0.2, None) == "0.00\tX\n0.20\tX\n"
 
 
 @pytest.mark.slow

@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 from kouxing.evaluation.commands import plot_heads
 from kouxing.services.cli.animation import FaceMotion
 from kouxing.services.cli.batch import pair_outputs, process_all
-from kouxing.services.cli.curves import CURVE_EXPORTERS, Curves
+from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS, FrameStream
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
-from kouxing.services.driver.video.film import Frame
-from kouxing.services.driver.video.writer import PictureSequence, check_name
+from kouxing.services.driver.video.film import TimedFaps
+from kouxing.services.driver.video.video_writer import PictureSequence, check_name
 from kouxing.shared.errors import UserError
 from kouxing.shared.output_file import open_output
 from kouxing.shared.terminal import check_output
@@ -169,7 +169,7 @@ def test_a_file_is_deleted_if_the_disk_is_full(tmp_path: Path) -> None:
     assert not path.exists()
 
 
-def interrupted_frames() -> Iterator[Frame]:
+def interrupted_frames() -> Iterator[TimedFaps]:
     yield 0.0, np.zeros(68, np.float32)
     raise KeyboardInterrupt
 
@@ -178,7 +178,7 @@ def interrupt_export(output: Path) -> None:
     exporter = CURVE_EXPORTERS[output.suffix](output, ExportOptions())
     with pytest.raises(KeyboardInterrupt):
         exporter.export(
-            FaceMotion(cast(list[Frame], interrupted_frames()), 50.0, 25.0, None), Progress()
+            FaceMotion(cast(list[TimedFaps], interrupted_frames()), 50.0, 25.0, None), Progress()
         )
 
 
@@ -198,7 +198,7 @@ def test_an_interrupted_live_table_keeps_its_frames(tmp_path: Path) -> None:
     output = tmp_path / "face.csv"
     rows = ((time_s, 0, faps) for time_s, faps in interrupted_frames())
     with pytest.raises(KeyboardInterrupt):
-        CURVE_EXPORTERS[".csv"](output, ExportOptions()).write(Curves(rows, is_live=True))
+        CURVE_EXPORTERS[".csv"](output, ExportOptions()).write(FrameStream(rows, is_live=True))
     assert len(output.read_text().splitlines()) == 2
 
 

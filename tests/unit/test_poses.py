@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kouxing.services.driver.poses import PoseStore
+from kouxing.services.driver.pose_store import PoseStore
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.idle_motion import FADE_S
 

@@ -12,7 +12,7 @@ from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render import renderer as render
 from kouxing.services.driver.render.renderer import BACKGROUND, Renderer
-from kouxing.services.driver.render.scene import background, camera, load_head
+from kouxing.services.driver.render.scene import load_head, parse_background, place_camera
 from kouxing.services.driver.render.window import Window
 from kouxing.services.driver.video.virtual_camera import VirtualCamera
 from kouxing.shared.errors import UserError
@@ -30,7 +30,7 @@ def test_error_names_missing_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(moderngl, "create_standalone_context", fail)
     with pytest.raises(UserError, match="libegl1 libgl1 libgl1-mesa-dri"):
-        render.standalone_context()
+        render.create_offscreen_context()
 
 
 def test_a_window_needs_a_display(head: Head, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,7 +42,7 @@ def test_a_window_needs_a_display(head: Head, monkeypatch: pytest.MonkeyPatch) -
 
 def seen(head: Head, framing: Framing, point: str, size: tuple[int, int] = (160, 90)) -> np.ndarray:
     """Return the position of a feature point in the picture, -1 to 1."""
-    matrix = camera(head, framing).view_projection(*size)
+    matrix = place_camera(head, framing).view_projection(*size)
     place = matrix @ [*head.vertices[head.feature_points[point]], 1.0]
     seen_at: np.ndarray = place[:2] / place[3]
     return seen_at
@@ -61,13 +61,13 @@ def test_framed_parts_are_in_the_picture(head: Head, framing: Framing) -> None:
 
 
 def test_parses_backgrounds_and_rejects_others() -> None:
-    assert background("studio") == BACKGROUND
-    assert background("transparent") is None
-    assert background("#Ff8000") == ((1.0, 128 / 255, 0.0),) * 2
-    assert background("white") == ((1.0, 1.0, 1.0),) * 2
+    assert parse_background("studio") == BACKGROUND
+    assert parse_background("transparent") is None
+    assert parse_background("#Ff8000") == ((1.0, 128 / 255, 0.0),) * 2
+    assert parse_background("white") == ((1.0, 1.0, 1.0),) * 2
     for text in ("", "pink-ish", "#12345", "#gggggg"):
         with pytest.raises(UserError, match="write studio, transparent, #rrggbb"):
-            background(text)
+            parse_background(text)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,12 @@ from pathlib import Path
 import pytest
 
 from kouxing.services.cli.clients import control_address
-from kouxing.services.cli.running_system import announce, find_control, reserve, starting
+from kouxing.services.cli.running_system import (
+    announce_system,
+    find_control,
+    lock_output_folder,
+    lock_startup,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import load_user_key
 
@@ -27,7 +32,7 @@ def test_finds_the_newest_running_system_even_if_others_were_killed(
     with ExitStack() as stack:
         for number in (1, 2):
             monkeypatch.setattr(os, "getpid", lambda number=number: number)
-            stack.enter_context(announce(f"tcp://127.0.0.1:{number}"))
+            stack.enter_context(announce_system(f"tcp://127.0.0.1:{number}"))
             (folder,) = tmp_path.iterdir()
             os.utime(folder / str(number), (number, number))
         assert find_control() == "tcp://127.0.0.1:2"
@@ -39,7 +44,7 @@ def test_finds_the_newest_running_system_even_if_others_were_killed(
 
 
 def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    with announce("tcp://127.0.0.1:1"):
+    with announce_system("tcp://127.0.0.1:1"):
         assert control_address("") == "tcp://127.0.0.1:1"
         key = load_user_key().control
         assert control_address("tcp://127.0.0.1:4") == f"tcp://127.0.0.1:4 {key}"
@@ -52,7 +57,7 @@ def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.Monkey
 
 
 def test_ignores_a_folder_that_others_can_write_to(tmp_path: Path) -> None:
-    with announce("tcp://127.0.0.1:1"):
+    with announce_system("tcp://127.0.0.1:1"):
         (folder,) = tmp_path.iterdir()
         folder.chmod(0o777)
         assert find_control() == ""
@@ -68,7 +73,7 @@ def test_a_second_start_waits_for_the_first(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(fcntl, "flock", flock)
     waits: list[str] = []
-    with starting(lambda: waits.append("waits")):
+    with lock_startup(lambda: waits.append("waits")):
         assert operations == [fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_EX]
     assert waits == ["waits"]
 
@@ -79,20 +84,20 @@ def test_a_system_that_cannot_be_announced_runs(monkeypatch: pytest.MonkeyPatch)
 
     with monkeypatch.context() as full_disk:
         full_disk.setattr(Path, "open", fail)
-        with announce("tcp://127.0.0.1:1"):
+        with announce_system("tcp://127.0.0.1:1"):
             pass
     assert find_control() == ""
 
 
 def test_two_systems_do_not_share_a_folder(tmp_path: Path) -> None:
     folder = tmp_path / "my" / "out"
-    with reserve(folder):
-        with reserve(tmp_path / "other"):
+    with lock_output_folder(folder):
+        with lock_output_folder(tmp_path / "other"):
             pass
         with (
             pytest.raises(UserError, match=r"my/out: another kouxing writes .* driver.out=FOLDER"),
-            reserve(folder),
+            lock_output_folder(folder),
         ):
             pass
-    with reserve(folder):
+    with lock_output_folder(folder):
         pass

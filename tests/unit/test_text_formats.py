@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.cli.spoken_text import read_text, text_of
+from kouxing.services.cli.spoken_text import read_spoken_text, read_transcript
 from kouxing.services.cli.text_formats import decode_text, extract_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
@@ -254,7 +254,7 @@ def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
 def test_rejects_a_file_that_is_not_text(content: bytes, name: str, tmp_path: Path) -> None:
     (tmp_path / "said.txt").write_bytes(content)
     with pytest.raises(UserError, match=rf"said\.txt: this is .*{name}"):
-        text_of(str(tmp_path / "said.txt"))
+        read_spoken_text(str(tmp_path / "said.txt"))
 
 
 def test_reads_a_subtitle_file_and_names_its_format(
@@ -262,14 +262,14 @@ def test_reads_a_subtitle_file_and_names_its_format(
 ) -> None:
     path = tmp_path / "said.srt"
     path.write_bytes(TEXTS["SubRip (SRT)"].encode("gb18030", "ignore"))
-    assert len(read_text(str(path), MANDARIN).syllables) == len(SPOKEN_TEXT)
+    assert len(read_transcript(str(path), MANDARIN).syllables) == len(SPOKEN_TEXT)
     assert "said.srt was read as SubRip (SRT) in GB18030" in capsys.readouterr().err
 
 
 def test_warns_about_a_spoken_time_of_day(capsys: pytest.CaptureFixture[str]) -> None:
-    assert text_of("12:30 我们走") == "12:30 我们走"
+    assert read_spoken_text("12:30 我们走") == "12:30 我们走"
     assert "12:30 is read as a spoken time of day" in capsys.readouterr().err
-    text_of("我们12:30走")
+    read_spoken_text("我们12:30走")
     assert capsys.readouterr().err == ""
 
 
@@ -286,38 +286,38 @@ def test_warns_about_a_spoken_time_of_day(capsys: pytest.CaptureFixture[str]) ->
 def test_warns_about_labels_that_may_not_be_spoken(
     text: str, label: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert text_of(text) == text
+    assert read_spoken_text(text) == text
     message = capsys.readouterr().err
     assert message.startswith(f"{label} is read as spoken text") if label else not message
 
 
 def test_warns_about_speakers_in_subtitles(capsys: pytest.CaptureFixture[str]) -> None:
-    text_of("1\n0:01 --> 0:02\n张三：大家好\n\n2\n0:02 --> 0:03\n李四：你好\n")
+    read_spoken_text("1\n0:01 --> 0:02\n张三：大家好\n\n2\n0:02 --> 0:03\n李四：你好\n")
     assert "'张三：' is read as spoken text" in capsys.readouterr().err
 
 
 def test_decodes_an_argument_in_another_encoding(capsys: pytest.CaptureFixture[str]) -> None:
-    assert text_of(os.fsdecode("你好".encode("gb18030"))) == "你好"
+    assert read_spoken_text(os.fsdecode("你好".encode("gb18030"))) == "你好"
     assert "read as GB18030" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["no.srt", "no.TextGrid", "no.docx", "no.svg"])
 def test_rejects_a_missing_file(name: str) -> None:
     with pytest.raises(UserError, match=f"{re.escape(name)}: no such file"):
-        text_of(name)
+        read_spoken_text(name)
 
 
 def test_reports_each_word_that_cannot_be_read(capsys: pytest.CaptureFixture[str]) -> None:
     for text in ("大家好 hello world，café Tom，Tom", "da4 jia1 hao3 hello, world! café Tom"):
         assert MANDARIN.read(text).dropped[:4] == ("hello", "world", "café", "Tom")
-        assert len(read_text(text, MANDARIN).syllables) == 3
+        assert len(read_transcript(text, MANDARIN).syllables) == 3
         assert "ignored: 'hello', 'world', 'café', 'Tom'; write" in capsys.readouterr().err
     with pytest.raises(
         UserError, match="read: 'hello', 'world'; write them in characters, or use --language auto"
     ):
-        read_text("hello world", MANDARIN)
+        read_transcript("hello world", MANDARIN)
     with pytest.raises(UserError, match="read: '你好'; write them as they are spoken, or use ano"):
-        read_text("你好", load_inventory("german"))
+        read_transcript("你好", load_inventory("german"))
 
 
 @pytest.mark.parametrize(

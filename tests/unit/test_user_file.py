@@ -14,10 +14,9 @@ from kouxing.corpora.speech_corpus import RowErrors, read_corpus
 from kouxing.evaluation.mos.study import load_study
 from kouxing.services.cli.animation import read_motion
 from kouxing.services.cli.configuration import config
-from kouxing.services.cli.spoken_text import read_text as read_spoken_text
-from kouxing.services.cli.spoken_text import text_of
+from kouxing.services.cli.spoken_text import read_spoken_text, read_transcript
+from kouxing.services.driver.head.feature_points_file import read_points
 from kouxing.services.driver.head.mesh_file import read_mesh
-from kouxing.services.driver.head.points_file import read_points
 from kouxing.services.driver.render.scene import load_head
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
@@ -43,7 +42,7 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
     ("a.fap", lambda path: read_motion(path, None)),
     ("a.csv", lambda path: read_motion(path, None)),
     ("a.jsonl", lambda path: read_motion(path, None)),
-    ("a.txt", lambda path: text_of(str(path))),
+    ("a.txt", lambda path: read_spoken_text(str(path))),
     ("a.glb", lambda path: load_head(str(path))),
     ("a.gltf", lambda path: load_head(str(path))),
     ("a.ply", read_mesh),
@@ -144,7 +143,7 @@ def test_a_sample_rate_must_be_possible(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["1" * 10_001, "你" * 150_001])
 def test_a_spoken_text_is_limited(text: str) -> None:
     with pytest.raises(UserError, match="the spoken text has more than"):
-        read_spoken_text(text, load_inventory())
+        read_transcript(text, load_inventory())
 
 
 def test_a_long_word_of_pinyin_is_not_read() -> None:

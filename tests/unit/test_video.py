@@ -14,8 +14,8 @@ from PIL import Image, ImageSequence
 
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.video.recording import Recording
-from kouxing.services.driver.video.writer import VideoWriter, open_writer, remove_unfinished
+from kouxing.services.driver.video.video_renderer import VideoRenderer
+from kouxing.services.driver.video.video_writer import VideoWriter, open_writer, remove_unfinished
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 
@@ -205,7 +205,7 @@ def frame(value: float) -> np.ndarray:
 
 
 def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_path: Path) -> None:
-    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
+    recording = VideoRenderer(tmp_path / "a.mp4", renderer, 25.0)
     loud = np.full(8000, 0.5, np.float32)
     recording.add_sound(8000, loud)
     recording.add_sound(12000, loud)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kouxing.services.driver.render.renderer import standalone_context
+from kouxing.services.driver.render.renderer import create_offscreen_context
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.measures import neckline_height
 from kouxing.training.heads.parts import Geometry, HeadPiece
@@ -45,7 +45,7 @@ def openness(vertices: Float, normals: Float, triangles: NDArray[np.int64]) -> F
     directions = np.stack(
         [np.sin(polar) * np.cos(turn), np.cos(polar), np.sin(polar) * np.sin(turn)], axis=1
     )
-    context = standalone_context()
+    context = create_offscreen_context()
     program = context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
     array = context.vertex_array(
         program,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from kouxing.services.driver.head.surface import Float, Index, edges_of
+from kouxing.services.driver.head.surface import Float, Index, find_edges
 
 
 def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, Index]:
@@ -18,7 +18,7 @@ def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, In
     points, face points), and the new quads (4 F, 4).
     """
     num_faces = len(quads)
-    edges, edge_of_corner = edges_of(quads)
+    edges, edge_of_corner = find_edges(quads)
     num_edges = len(edges)
     face_rows = np.repeat(np.arange(num_faces), 4)
     faces = sparse.csr_array(

@@ -21,7 +21,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from kouxing.services.driver.head import surface
-from kouxing.services.driver.head.import_fields import AXES, CORNER_SLOPE, INNER, OUTER
+from kouxing.services.driver.head.skin_fields import (
+    CORNER_SLOPE,
+    DIRECTION_AXES,
+    INNER_LIPS,
+    OUTER_LIPS,
+)
 from kouxing.shared.face.faps import FAPS
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.makehuman import FEATURE_POINTS
@@ -96,18 +101,20 @@ def close_lips(skin: Skin, overlap: float = 0.002) -> None:
         shifts[int(vertex)] = 0.0
     points = np.array(list(shifts))
     far = surface.Geodesics(skin.vertices, skin.quads).distance(points) > 0.10
-    field = smoothest(skin, points, np.flatnonzero(far))
+    field = smoothest_fields(skin, points, np.flatnonzero(far))
     skin.vertices[:, 1] += field @ np.array(list(shifts.values()))
 
 
 def axis_of(fap: int) -> tuple[int, float]:
     """Return axis (0 x, 1 y, 2 z) and sign of a displacement FAP."""
-    return AXES[FAPS[fap - 1].direction]
+    return DIRECTION_AXES[FAPS[fap - 1].direction]
 
 
-def smoothest(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
-    """Interpolate between points of the skin, see ``surface.smoothest``."""
-    return surface.smoothest(skin.vertices, subdivision.triangles_of(skin.quads), points, fixed)
+def smoothest_fields(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
+    """Interpolate between points of the skin, see ``surface.smoothest_fields``."""
+    return surface.smoothest_fields(
+        skin.vertices, subdivision.triangles_of(skin.quads), points, fixed
+    )
 
 
 def _axis_field(fap: int, weight: Float) -> Float:
@@ -152,12 +159,12 @@ class FaceFields:
         skin = self.skin
         x, y, z = skin.vertices.T
         nose = (y > 5.325) & (np.abs(x) < 0.28) & ~self.cavity
-        outside = self._far(INNER + OUTER, 0.34) | nose | ((y < 4.87) & ~self.cavity)
+        outside = self._far(INNER_LIPS + OUTER_LIPS, 0.34) | nose | ((y < 4.87) & ~self.cavity)
         fixed = np.flatnonzero(outside | (self.cavity & (z < 1.08)))
-        names = INNER + OUTER
+        names = INNER_LIPS + OUTER_LIPS
         points = skin.points(*names)
         fixed = np.setdiff1d(fixed, points)
-        self.lip_y = dict(zip(names, smoothest(skin, points, fixed).T, strict=True))
+        self.lip_y = dict(zip(names, smoothest_fields(skin, points, fixed).T, strict=True))
         for fap, name in (
             (4, "2.2"), (5, "2.3"), (8, "2.6"), (9, "2.7"), (10, "2.8"), (11, "2.9"),
             (12, "2.4"), (13, "2.5"), (51, "8.1"), (52, "8.2"), (55, "8.5"), (56, "8.6"),
@@ -169,7 +176,7 @@ class FaceFields:
         halfway = (("2.6", "2.8"), ("2.7", "2.9"), ("8.5", "8.7"), ("8.6", "8.8"))
         middles = ("2.2", "2.3", "8.1", "8.2")
         between = tuple(name for pair in halfway for name in pair)
-        single = smoothest(skin, skin.points(*corners, *between, *middles), fixed)
+        single = smoothest_fields(skin, skin.points(*corners, *between, *middles), fixed)
         self.lip_x = {}
         for row, (fap, name) in enumerate(((6, "2.4"), (7, "2.5"), (53, "8.3"), (54, "8.4"))):
             half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
@@ -177,7 +184,7 @@ class FaceFields:
             self._add(fap, self.lip_x[name])
             # a corner slides along the curve of the lips, outward and backward
             self.fields[fap][:, 2] = -CORNER_SLOPE * self.lip_x[name]
-        pushed = smoothest(skin, skin.points("2.3", "2.2", *corners), fixed)[:, :2]
+        pushed = smoothest_fields(skin, skin.points("2.3", "2.2", *corners), fixed)[:, :2]
         self.lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
         self._add(16, self.lip_z["2.3"])
         self._add(17, self.lip_z["2.2"])
@@ -230,17 +237,17 @@ class FaceFields:
                 groups.append(np.union1d(np.flatnonzero(near & (y > 5.90)), [point]))
             return groups
 
-        raised = smoothest(self.skin, bars("4.1", "4.3", "4.5", "4.2", "4.4", "4.6"), fixed)
+        raised = smoothest_fields(self.skin, bars("4.1", "4.3", "4.5", "4.2", "4.4", "4.6"), fixed)
         for fap, weight in zip((31, 33, 35, 32, 34, 36), raised.T, strict=True):
             self._add(fap, weight)
-        squeezed = smoothest(self.skin, bars("4.1", "4.2", "4.5", "4.6"), fixed)
+        squeezed = smoothest_fields(self.skin, bars("4.1", "4.2", "4.5", "4.6"), fixed)
         self._add(37, squeezed[:, 0])
         self._add(38, squeezed[:, 1])
 
     def _zones(self) -> None:
         chin = self.skin.points("2.1", "8.2", "8.7", "8.8")
         nose = self.skin.points("9.1", "9.2", "9.3", "9.4", "9.5", "9.15")
-        lips = np.concatenate([self.skin.points(*INNER), self.skin.points(*OUTER)])
+        lips = np.concatenate([self.skin.points(*INNER_LIPS), self.skin.points(*OUTER_LIPS)])
         self._zone(18, "2.10", 0.02, 0.26, chin)
         # a puffed cheek also comes forward, and a lifted one swells
         for fap, name, reach, forward in (
@@ -266,10 +273,14 @@ class FaceFields:
         _, y, _ = self.skin.vertices.T
         lids = ("3.3", "3.4", "3.7", "3.8", "3.11", "3.12")
         fixed = self._far((name,), reach) | self.cavity | (y > 5.80)
-        for others, margin in ((INNER + OUTER, 0.07), (("9.1", "9.2", "9.15"), 0.10), (lids, 0.07)):
+        for others, margin in (
+            (INNER_LIPS + OUTER_LIPS, 0.07),
+            (("9.1", "9.2", "9.15"), 0.10),
+            (lids, 0.07),
+        ):
             fixed |= ~self._far(others, margin)
         top = np.flatnonzero(~self._far((name,), 0.08))
-        return smoothest(self.skin, [top], np.flatnonzero(fixed))[:, 0]
+        return smoothest_fields(self.skin, [top], np.flatnonzero(fixed))[:, 0]
 
     def _zone(
         self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Index

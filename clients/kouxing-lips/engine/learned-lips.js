@@ -1,5 +1,5 @@
 // Learned lips: lip frames and levels in, FAPs of the mouth out; services/synthesizer/lips/learned has
-// the rules in model.py and closures.py. The tongue stays at rest.
+// the rules in model.py and closure_rule.py. The tongue stays at rest.
 
 import { ClosingPhones, logOddsOf } from "./closing-phones.js";
 import { clamp, smoothStep } from "./math.js";

@@ -1,6 +1,7 @@
-"""Writes binary glTF (GLB): the lists of the description, accessors and sparse accessors.
+"""Writes binary glTF (GLB) files: the JSON description, accessors and sparse accessors.
 
-pygltflib is not used: it has no accessors from arrays, so this code would remain.
+pygltflib is not used. It cannot create accessors from arrays, so this code would still be
+needed.
 """
 
 import json
@@ -15,7 +16,7 @@ from kouxing.shared.output_file import open_output
 
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
 MAX_SHORT_VERTICES = 65535  # more vertices need 4-byte indices; 65535 itself is not a valid index
-_COMPONENT = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
+_COMPONENT_TYPES = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
 
 
 class GlbDocument:
@@ -36,7 +37,7 @@ class GlbDocument:
         self.json[kind].append(item)
         return len(self.json[kind]) - 1
 
-    def view(self, data: bytes, target: int | None = None) -> int:
+    def add_view(self, data: bytes, target: int | None = None) -> int:
         """Append bytes, aligned to four; return the index of their buffer view."""
         self.binary += b"\0" * (-len(self.binary) % 4)
         view: dict[str, Any] = {
@@ -49,7 +50,7 @@ class GlbDocument:
         self.binary += data
         return self.add("bufferViews", view)
 
-    def accessor(
+    def add_accessor(
         self,
         array: NDArray[Any],
         kind: str,
@@ -60,8 +61,8 @@ class GlbDocument:
     ) -> int:
         """Store an array (N,) or (N, components); return the index of its accessor."""
         item: dict[str, Any] = {
-            "bufferView": self.view(np.ascontiguousarray(array).tobytes(), target),
-            "componentType": _COMPONENT[array.dtype.str[1:]],
+            "bufferView": self.add_view(np.ascontiguousarray(array).tobytes(), target),
+            "componentType": _COMPONENT_TYPES[array.dtype.str[1:]],
             "count": len(array),
             "type": kind,
         }
@@ -73,16 +74,16 @@ class GlbDocument:
             )
         return self.add("accessors", item)
 
-    def sparse_vectors(
+    def add_sparse_vectors(
         self, rows: NDArray[np.intp], values: NDArray[np.float32], count: int
     ) -> int:
-        """Store displacements (count, 3) that are zero except in ``rows``."""
+        """Store displacements (count, 3), zero outside ``rows``; return their accessor's index."""
         number = np.uint16 if count <= MAX_SHORT_VERTICES else np.uint32
         padded = np.concatenate([values, np.zeros((int(len(rows) < count), 3), np.float32)])
         return self.add(
             "accessors",
             {
-                "componentType": _COMPONENT["f4"],
+                "componentType": _COMPONENT_TYPES["f4"],
                 "count": count,
                 "type": "VEC3",
                 "min": padded.min(axis=0).tolist(),
@@ -90,10 +91,10 @@ class GlbDocument:
                 "sparse": {
                     "count": len(rows),
                     "indices": {
-                        "bufferView": self.view(rows.astype(number).tobytes()),
-                        "componentType": _COMPONENT[np.dtype(number).str[1:]],
+                        "bufferView": self.add_view(rows.astype(number).tobytes()),
+                        "componentType": _COMPONENT_TYPES[np.dtype(number).str[1:]],
                     },
-                    "values": {"bufferView": self.view(values.tobytes())},
+                    "values": {"bufferView": self.add_view(values.tobytes())},
                 },
             },
         )

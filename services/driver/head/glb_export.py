@@ -1,4 +1,4 @@
-"""Exports a head as binary glTF (GLB) that a browser or an engine can animate by FAPs.
+"""Exports a head as binary glTF (GLB), which a browser or a game engine can animate with FAPs.
 
 Khronos glTF 2.0. Every displacement FAP is a morph target with sparse accessors, named after the
 FAP. Each of ARKit's 52 shapes is also a morph target, the sum of FAPs in ``arkit.tsv``. Animate
@@ -17,8 +17,8 @@ next to the root, skinned to both joints. Lengths are in meters, y is up, the fa
 ``extras.coarse`` of a mesh is an accessor of alternative indices for viewers without a graphics
 card: fewer triangles on the first vertices of the mesh.
 
-With a motion, an animation ``speech`` sets the weights of every mesh and the rotating nodes; it is
-linear between frames.
+For a motion, the animation ``speech`` sets the weights of every mesh and the rotating nodes,
+linearly between frames.
 
 The suffix ``.vrm`` makes a VRM 1.0 avatar instead, see ``vrm``.
 """
@@ -38,22 +38,22 @@ from kouxing.services.driver.head.glb_document import (
     GlbDocument,
 )
 from kouxing.services.driver.head.head import ASSETS, Head, HeadPart
-from kouxing.services.driver.head.morphs import (
+from kouxing.services.driver.head.morph_targets import (
     ARKIT_MORPHS,
     AVATAR_MORPHS,
     FAP_MORPHS,
-    Morph,
+    MorphTarget,
     units_per_weight,
 )
 from kouxing.services.driver.render import shaders
 from kouxing.services.driver.render.renderer import BACKGROUND
-from kouxing.services.driver.render.scene import camera
+from kouxing.services.driver.render.scene import place_camera
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
 from kouxing.shared.face.shapes import ARKIT
 
-Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
+TimedFaps: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 
 _ROTATION_OF = {
     23: ("eye_left", (0, 1, 0)),
@@ -69,7 +69,7 @@ _TURNS_EYES = np.isin(np.arange(1, NUM_FAPS + 1), (23, 24, 25, 26))
 
 
 def export_glb(
-    head: Head, path: str | Path, motion: Sequence[Frame] = (), *, as_arkit: bool = False
+    head: Head, path: str | Path, motion: Sequence[TimedFaps] = (), *, as_arkit: bool = False
 ) -> None:
     """Write a head as ``.glb`` or ``.vrm``.
 
@@ -91,7 +91,7 @@ def export_glb(
     for name, encoded in head.textures.items():
         kind = "image/png" if encoded.startswith(b"\x89PNG") else "image/jpeg"
         image = document.add(
-            "images", {"bufferView": document.view(encoded), "mimeType": kind, "name": name}
+            "images", {"bufferView": document.add_view(encoded), "mimeType": kind, "name": name}
         )
         textures[name] = document.add("textures", {"sampler": sampler, "source": image})
 
@@ -111,7 +111,7 @@ def export_glb(
     extras = {"kouxing": _description(head)}
     nodes["kouxing"] = document.add("nodes", _parent("kouxing", [root]) | {"extras": extras})
     identity = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)).reshape(2, 16)
-    matrices = document.accessor(identity, "MAT4", target=None)
+    matrices = document.add_accessor(identity, "MAT4", target=None)
     joints = [nodes["body"], nodes["head"]]
     document.add(
         "skins", {"joints": joints, "skeleton": nodes["body"], "inverseBindMatrices": matrices}
@@ -152,11 +152,11 @@ def _vrm(document: GlbDocument, head: Head, nodes: dict[str, int]) -> dict[str, 
             for index, name in enumerate(names):
                 bindings[name].append((number, index))
     x, y, z = head.eye_centers.mean(axis=0).tolist()
-    return vrm.extension(head.name, nodes, bindings, (x, y, z), is_free=_is_built_in(head))
+    return vrm.build_extension(head.name, nodes, bindings, (x, y, z), is_free=_is_built_in(head))
 
 
 def _add_animation(
-    document: GlbDocument, nodes: dict[str, int], motion: Sequence[Frame], *, as_arkit: bool
+    document: GlbDocument, nodes: dict[str, int], motion: Sequence[TimedFaps], *, as_arkit: bool
 ) -> None:
     """Add an animation of all weights and rotations."""
     times_s = np.array([time_s for time_s, _ in motion], np.float32)
@@ -179,13 +179,13 @@ def _add_animation(
             curves[name, "weights"] = np.stack(
                 [weights.get(target, still) for target in names], axis=1
             )
-    times = document.accessor(times_s, "SCALAR", target=None, bounds=True)
+    times = document.add_accessor(times_s, "SCALAR", target=None, bounds=True)
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
     for (name, path), values in curves.items():
         kind = "VEC4" if path == "rotation" else "SCALAR"
         flat = values if path == "rotation" else values.ravel()
-        output = document.accessor(flat.astype(np.float32), kind, target=None)
+        output = document.add_accessor(flat.astype(np.float32), kind, target=None)
         channels.append({"sampler": len(samplers), "target": {"node": nodes[name], "path": path}})
         samplers.append({"input": times, "output": output, "interpolation": "LINEAR"})
     document.add("animations", {"name": "speech", "samplers": samplers, "channels": channels})
@@ -216,7 +216,7 @@ def _part_node(
     head: Head,
     part: HeadPart,
     textures: dict[str, int],
-    morphs: Sequence[Morph],
+    morphs: Sequence[MorphTarget],
 ) -> int:
     vertices = head.vertices[part.vertices]
     node: dict[str, Any] = {"name": part.name}
@@ -227,12 +227,12 @@ def _part_node(
     colors = np.ones((len(vertices), 4))
     colors[:, :3] = head.colors[part.vertices]
     attributes = {
-        "POSITION": document.accessor(vertices, "VEC3", bounds=True),
-        "NORMAL": document.accessor(head.normals[part.vertices], "VEC3"),
-        "TEXCOORD_0": document.accessor(
+        "POSITION": document.add_accessor(vertices, "VEC3", bounds=True),
+        "NORMAL": document.add_accessor(head.normals[part.vertices], "VEC3"),
+        "TEXCOORD_0": document.add_accessor(
             np.round(head.uv[part.vertices] * 65535).astype(np.uint16), "VEC2", normalized=True
         ),
-        "COLOR_0": document.accessor(
+        "COLOR_0": document.add_accessor(
             np.round(colors * 65535).astype(np.uint16), "VEC4", normalized=True
         ),
     }
@@ -241,14 +241,14 @@ def _part_node(
         joints, weights = np.zeros((2, len(vertices), 4), np.uint8)
         joints[:, 1] = turning > 0  # an unused joint must be 0
         weights[:, 0], weights[:, 1] = 255 - turning, turning
-        attributes["JOINTS_0"] = document.accessor(joints, "VEC4")
-        attributes["WEIGHTS_0"] = document.accessor(weights, "VEC4", normalized=True)
+        attributes["JOINTS_0"] = document.add_accessor(joints, "VEC4")
+        attributes["WEIGHTS_0"] = document.add_accessor(weights, "VEC4", normalized=True)
         node["skin"] = 0
 
     def add_indices(triangles: NDArray[np.uint32]) -> int:
         indices = (triangles - part.vertices.start).ravel()
         number = np.uint16 if len(vertices) <= MAX_SHORT_VERTICES else np.uint32
-        return document.accessor(indices.astype(number), "SCALAR", target=ELEMENT_BUFFER)
+        return document.add_accessor(indices.astype(number), "SCALAR", target=ELEMENT_BUFFER)
 
     triangles = head.triangles[part.triangles]
     coarse = head.coarse_triangles[head.parts.index(part)]
@@ -270,7 +270,7 @@ def _part_node(
 
 
 def _material(part: HeadPart, textures: dict[str, int], *, cel: bool) -> dict[str, Any]:
-    wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
+    wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN_MATERIAL)
     material: dict[str, Any] = {
         "name": part.name,
         "pbrMetallicRoughness": {
@@ -280,12 +280,12 @@ def _material(part: HeadPart, textures: dict[str, int], *, cel: bool) -> dict[st
         },
         "extras": {"kouxing": {"wrap": wrap, "gloss": gloss, "shine": shine}},
     }
-    if part.name == shaders.HAIR:  # blended triangles would need sorting
+    if part.name == shaders.HAIR_PART:  # blended triangles would need sorting
         material |= {"alphaMode": "MASK", "alphaCutoff": _HAIR_ALPHA_CUTOFF}
     elif part.transparent:
         material["alphaMode"] = "BLEND"
     relief = textures.get(f"{part.texture}_normal")
-    if part.name in shaders.EYES:
+    if part.name in shaders.EYE_PARTS:
         material["extensions"] = {
             "KHR_materials_clearcoat": {"clearcoatFactor": 1.0, "clearcoatRoughnessFactor": 0.03}
         }
@@ -299,7 +299,7 @@ def _material(part: HeadPart, textures: dict[str, int], *, cel: bool) -> dict[st
 
 
 def _targets(
-    document: GlbDocument, head: Head, part: HeadPart, morphs: Sequence[Morph]
+    document: GlbDocument, head: Head, part: HeadPart, morphs: Sequence[MorphTarget]
 ) -> tuple[list[dict[str, int]], list[str]]:
     """Return the morph targets of a part, and their names."""
     count = part.vertices.stop - part.vertices.start
@@ -314,7 +314,7 @@ def _targets(
             shift = shift + (head.deform(turn) - head.vertices)[part.vertices]
         moved = np.flatnonzero(np.abs(shift).max(axis=1) > morph.min_shift_m)
         if len(moved):
-            accessor = document.sparse_vectors(moved, shift[moved], count)
+            accessor = document.add_sparse_vectors(moved, shift[moved], count)
             targets.append({"POSITION": accessor})
             names.append(morph.name)
     return targets, names
@@ -336,7 +336,7 @@ def _description(head: Head) -> dict[str, Any]:
         else:
             entry["unitsPerWeight"] = units_per_weight(fap.fapu)
         faps.append(entry)
-    view = camera(head)
+    view = place_camera(head)
     return {
         "version": 1,
         "cel": head.cel,

@@ -24,19 +24,24 @@ from kouxing.shared.user_file import check_content, parse_json, read_file
 MAX_BYTES = 512 << 20  # limit for all files together, unpacked
 MAX_COUNT = 2_000_000  # elements of an accessor
 MAX_NODES = 20_000
-_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_NUM_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _MESHOPT, _DRACO = "EXT_meshopt_compression", "KHR_draco_mesh_compression"
 _SUPPORTED = {
     _MESHOPT, _DRACO, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp",
 }  # fmt: skip
-_LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "VRM")  # extensions whose data is plain glTF
+_LOOK_EXTENSIONS = (
+    "KHR_materials_",
+    "KHR_lights_",
+    "KHR_xmp",
+    "VRM",
+)  # extensions whose data is plain glTF
 
 Float64 = NDArray[np.float64]
 
 
 class BadGlbError(Exception):
-    """An undamaged file cannot be used; the text names the problem and the remedy."""
+    """Raised if an undamaged file cannot be used; the text names the problem and the remedy."""
 
 
 @contextlib.contextmanager
@@ -50,7 +55,7 @@ def check_glb(path: Path) -> Iterator[None]:
 
 
 def _chunks(data: bytes) -> dict[bytes, bytes]:
-    """Return the chunks of a GLB by their kind."""
+    """Return the chunks of a GLB by type."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise ValueError("it is not a binary glTF file")
     version, length = struct.unpack_from("<II", data, 4)
@@ -69,8 +74,8 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
     return chunks
 
 
-class Glb:
-    """A file with its buffers.
+class GlbFile:
+    """A glTF file with its buffers.
 
     Raises ``UserError`` if the file cannot be read, ``BadGlbError`` if it requires an unsupported
     extension, and any exception if it is damaged (``check_glb``).
@@ -86,7 +91,7 @@ class Glb:
             text, self._binary = chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
         self.json: dict[str, Any] = parse_json(text)
         needed = set(self.json.get("extensionsRequired", ()))
-        unknown = {name for name in needed - _SUPPORTED if not name.startswith(_LOOKS)}
+        unknown = {name for name in needed - _SUPPORTED if not name.startswith(_LOOK_EXTENSIONS)}
         if unknown:
             names = ", ".join(sorted(unknown))
             raise BadGlbError(
@@ -127,7 +132,7 @@ class Glb:
         return self._uri(str(uri)) if uri is not None else self._binary if index == 0 else b""
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
-        """Return an item of one of the lists in the description."""
+        """Return an item of a list in the JSON description."""
         entries = self.json.get(kind, [])
         if not isinstance(index, int) or not 0 <= index < len(entries):
             raise ValueError(f"{kind} has no item {index}")
@@ -155,7 +160,7 @@ class Glb:
         return buffer[start : start + size]
 
     def attributes(self, primitive: dict[str, Any], names: Iterable[str]) -> dict[str, Float64]:
-        """Return some attributes (V, components) of a primitive, and its "indices" (N, 1)."""
+        """Return the named attributes (V, components) of a primitive, and its "indices" (N, 1)."""
         accessors = {k: v for k, v in primitive["attributes"].items() if k in names}
         if "indices" in primitive:
             accessors["indices"] = primitive["indices"]
@@ -169,7 +174,9 @@ class Glb:
             for name in accessors.keys() & compressed["attributes"].keys():
                 item = self.item("accessors", accessors[name])
                 data = mesh.get_attribute_by_unique_id(compressed["attributes"][name])["data"]
-                decoded[name] = _to_float(data.astype(_TYPES[item["componentType"]]), item)
+                decoded[name] = _to_float(
+                    data.astype(_COMPONENT_TYPES[item["componentType"]]), item
+                )
         return {
             name: self.accessor(index) for name, index in accessors.items() if name not in decoded
         } | decoded
@@ -177,8 +184,8 @@ class Glb:
     def accessor(self, index: object) -> Float64:
         """Return an accessor's values (N, components); normalized values are in [-1, 1]."""
         item = self.item("accessors", index)
-        width, count = _COMPONENTS[item["type"]], int(item["count"])
-        kind = np.dtype(_TYPES[item["componentType"]])
+        width, count = _NUM_COMPONENTS[item["type"]], int(item["count"])
+        kind = np.dtype(_COMPONENT_TYPES[item["componentType"]])
         if not 0 <= count <= MAX_COUNT:
             raise ValueError(f"an accessor has {count} elements")
         values = np.zeros((count, width), kind)
@@ -195,7 +202,7 @@ class Glb:
                 indices["bufferView"],
                 int(indices.get("byteOffset", 0)),
                 (size, 1),
-                np.dtype(_TYPES[indices["componentType"]]),
+                np.dtype(_COMPONENT_TYPES[indices["componentType"]]),
             )
             if size and rows.max() >= count:
                 raise ValueError("a sparse accessor has an index out of range")

@@ -1,4 +1,4 @@
-"""A user's GLB or VRM as a head: its shapes become the linear basis of FAPs.
+"""Converts a user's GLB or VRM to a head. Its shapes become the linear basis of the FAPs.
 
 Shapes are recognized by name (``shared.face.shape_names``): FAPs, ARKit's blendshapes, Oculus'
 visemes, or VRM's vowels; the last two also with ARKit's or VRM's shapes outside the mouth. A FAP
@@ -26,11 +26,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb, check_glb
+from kouxing.services.driver.head.glb_file import BadGlbError, Float64, GlbFile, check_glb
 from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
-from kouxing.services.driver.head.head import Head, assemble
-from kouxing.services.driver.head.morphs import units_per_weight
-from kouxing.services.driver.head.pieces import Fields, Primitive, pack, part_names
+from kouxing.services.driver.head.head import Head, assemble_head
+from kouxing.services.driver.head.mesh_pieces import FapFields, MeshPiece, pack_head, part_names
+from kouxing.services.driver.head.morph_targets import units_per_weight
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import (
     FAP_NUMBER,
@@ -45,25 +45,25 @@ from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
 EYE_DISTANCE_M = 0.055  # heads are scaled to this
 RELATIVE_FAPU = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}  # eye distances
 # offsets from the middle between the eyes, in eye distances
-PIVOT = np.array([0.0, -0.66, -1.42])
-MOUTH = np.array([0.0, -1.2, 0.25])
+PIVOT_OFFSET = np.array([0.0, -0.66, -1.42])
+MOUTH_OFFSET = np.array([0.0, -1.2, 0.25])
 _HEAD_WIDTH = 2.9  # including ears, in eye distances
 _EYE_RADIUS_M = 0.012
 _RIDGE_M = 0.001
 _TRAVEL_M = 0.01  # typical displacement of a feature point by a strong FAP
-_FADE = (-2.1, -3.2)  # heights relative to the eyes where the neck stops following the head
+_NECK_HEIGHTS = (-2.1, -3.2)  # heights relative to the eyes where the neck stops following the head
 _MIN_FAPS = 12
 _MAX_FACES_APART = 2.0  # distance of the parts of one face, in sizes of a part
 _MAX_TILT_RAD = 0.17  # angle between the eyes and the x axis that is not corrected
-_STEEPER = 1.5  # how much farther the mouth is below the eyes along an axis that replaces y
+_MIN_STEEPNESS = 1.5  # how much farther the mouth is below the eyes along an axis that replaces y
 
-_JAW_RAD = 0.3  # rotation of a jaw bone at full weight of ARKit's jawOpen
+_JAW_RAD = 0.3  # rotation of a jaw bone at a weight of 1 of ARKit's jawOpen
 _JAW = FAP_NUMBER["open_jaw"] - 1
 _OPEN_JAW = float(ARKIT.basis[ARKIT.names.index("jawOpen"), _JAW])
 _FAP_BY_NAME = {fap.name: fap for fap in FAPS[2:]}
 _NOT_MOUTH = re.compile("eye|brow|cheek|nose|blink|look")
 _SETS = {"arkit": ARKIT, "oculus": OCULUS, "vrm": VRM}
-Names = dict[str, Float64]  # shape: FAPs (68,) at weight 1
+ShapeFaps = dict[str, Float64]  # shape: FAPs (68,) at weight 1
 
 
 def read_glb(path: Path) -> Head:
@@ -72,13 +72,13 @@ def read_glb(path: Path) -> Head:
     Raises ``UserError`` if the file is not such a GLB; the text says what is missing.
     """
     with check_glb(path), np.errstate(invalid="ignore", over="ignore"):  # the results are checked
-        glb = Glb(path)
+        glb = GlbFile(path)
         pieces = read_pieces(glb)
-        return _head(path.stem, glb, pieces, _recognize(pieces))
+        return _head(path.stem, glb, pieces, _select_known_shapes(pieces))
 
 
-def _recognize(pieces: list[Primitive]) -> Names:
-    """Keep the known shapes of the pieces under their standard names; return their FAPs.
+def _select_known_shapes(pieces: list[MeshPiece]) -> ShapeFaps:
+    """Keep only known shapes in the pieces, under their standard names; return the shapes' FAPs.
 
     Raises ``BadGlbError`` if the shapes cannot express speech.
     """
@@ -86,7 +86,7 @@ def _recognize(pieces: list[Primitive]) -> Names:
         name for piece in pieces for name, shift in piece.shapes.items() if shift.any()
     )
     faps = {name: fap for name in names if (fap := re.split("[.:|]", name)[-1]) in _FAP_BY_NAME}
-    table: Names = {}
+    table: ShapeFaps = {}
     if len(faps) >= _MIN_FAPS:
         for fap in _FAP_BY_NAME.values():
             table[fap.name] = np.zeros(NUM_FAPS)
@@ -108,13 +108,13 @@ def _recognize(pieces: list[Primitive]) -> Names:
             for name, shape in find_shapes(kind, piece.shapes).items()
             if shape in table
         }
-        _keep_known(piece, shape_of)
+        _rename_known_shapes(piece, shape_of)
     known = {name for piece in pieces for name in piece.shapes}
     return {name: row for name, row in table.items() if name in known}
 
 
-def _keep_known(piece: Primitive, shape_of: Mapping[str, str]) -> None:
-    """Rename the shapes of a piece, and apply the weights at rest of the others (of the body)."""
+def _rename_known_shapes(piece: MeshPiece, shape_of: Mapping[str, str]) -> None:
+    """Rename the known shapes of a piece, and apply the other shapes' weights at rest."""
     shapes, piece.shapes = piece.shapes, {}
     for name, shift in shapes.items():
         if name in shape_of:
@@ -124,8 +124,8 @@ def _keep_known(piece: Primitive, shape_of: Mapping[str, str]) -> None:
             piece.vertices = piece.vertices + piece.rest[name] * shift
 
 
-def _turn_jaw(piece: Primitive, arm: Float64, known: Names) -> None:
-    """Let a jaw bone move a piece without shapes that open the mouth: teeth and tongue."""
+def _turn_jaw(piece: MeshPiece, arm: Float64, known: ShapeFaps) -> None:
+    """Let a jaw bone move the teeth and the tongue, if they have no shapes that open the mouth."""
     opening = {name: row[_JAW] / _OPEN_JAW for name, row in known.items() if row[_JAW] > 0}
     if not opening.keys() & piece.shapes.keys():
         shift = _JAW_RAD * np.cross([1, 0, 0], arm)
@@ -135,16 +135,16 @@ def _turn_jaw(piece: Primitive, arm: Float64, known: Names) -> None:
 # --- the head -------------------------------------------------------------------------------------
 
 
-def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
+def _head(name: str, glb: GlbFile, pieces: list[MeshPiece], known: ShapeFaps) -> Head:
     names = part_names(pieces)
     _check_single_face(pieces, known)
-    eyes = _eyes(glb, pieces, names)
+    eyes = _find_eye_centers(glb, pieces, names)
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
         raise BadGlbError("both eyes, found by shapes or names, are in the same place")
     mouth = [name for name in known if not _NOT_MOUTH.search(name)]
     is_mirrored = any(piece.is_mirrored for piece in pieces if piece.shapes.keys() & mouth)
-    turn = _upright(eyes, _moved_center(pieces, mouth), is_mirrored=is_mirrored)
+    turn = _upright_rotation(eyes, _moved_center(pieces, mouth), is_mirrored=is_mirrored)
     for piece in pieces:
         if piece.is_mirrored != is_mirrored:
             piece.triangles = piece.triangles[:, ::-1]
@@ -154,7 +154,7 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
             _turn_jaw(piece, piece.jaw_arm @ turn.T, known)
     eyes = eyes @ turn.T
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
-    pivot = _pivot(glb, turn, middle, unit)
+    pivot = _find_pivot(glb, turn, middle, unit)
     world = np.concatenate([piece.vertices for piece in pieces])
     weight = _head_weight(pieces, (world[:, 1] - middle[1]) / unit)
     for piece in pieces:
@@ -162,15 +162,15 @@ def _head(name: str, glb: Glb, pieces: list[Primitive], known: Names) -> Head:
         piece.shapes = {name: shift * scale for name, shift in piece.shapes.items()}
     has_eyes = any(name.startswith("eye_") for name in names)
     weights = _weights_by_fap(known, gaze=not has_eyes)
-    arrays = pack(
+    arrays = pack_head(
         pieces,
-        fields=[_fields(piece, weights) for piece in pieces],
+        fields=[_displacement_fields(piece, weights) for piece in pieces],
         head_weight=weight,
         fapu=standard_fapu(),
         feature_points={},
         eye_centers=(eyes - pivot) * scale,
     )
-    return assemble(name, arrays)
+    return assemble_head(name, arrays)
 
 
 def standard_fapu() -> dict[str, float]:
@@ -179,14 +179,14 @@ def standard_fapu() -> dict[str, float]:
     return lengths | {"AU": RADIANS_PER_ANGLE_UNIT}
 
 
-def fade(height: Float64) -> Float64:
+def head_weight_at(height: Float64) -> Float64:
     """Return the fraction (V,) of the head rotation by height above the eyes, in eye distances."""
-    x = np.clip((height - _FADE[1]) / (_FADE[0] - _FADE[1]), 0, 1)
+    x = np.clip((height - _NECK_HEIGHTS[1]) / (_NECK_HEIGHTS[0] - _NECK_HEIGHTS[1]), 0, 1)
     faded: Float64 = x**2 * (3 - 2 * x)
     return faded
 
 
-def _check_single_face(pieces: list[Primitive], known: Names) -> None:
+def _check_single_face(pieces: list[MeshPiece], known: ShapeFaps) -> None:
     """Raise ``BadGlbError`` if two meshes far from each other have a mouth."""
     opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in known)
     centers: list[Float64] = []
@@ -201,7 +201,7 @@ def _check_single_face(pieces: list[Primitive], known: Names) -> None:
         raise BadGlbError("it has several faces; export only one avatar")
 
 
-def _upright(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Float64:
+def _upright_rotation(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Float64:
     """Return the rotation (3, 3) after which y is up and the face looks along z.
 
     It turns by right angles, and then by the remaining angle of the eyes if that is large. For a
@@ -214,7 +214,7 @@ def _upright(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Floa
     if mouth is not None:
         up = eyes.mean(axis=0) - mouth
         other = 3 - x - y
-        if abs(up[other]) > _STEEPER * abs(up[y]):
+        if abs(up[other]) > _MIN_STEEPNESS * abs(up[y]):
             y = other
         sign = -1.0 if up[y] < 0 else 1.0
     turn = np.zeros((3, 3))
@@ -226,8 +226,8 @@ def _upright(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Floa
     return turn
 
 
-def _eyes(glb: Glb, pieces: list[Primitive], names: list[str]) -> Float64:
-    """Return the centers of the left and right eye (2, 3), from bones, eyeballs, lids or mouth."""
+def _find_eye_centers(glb: GlbFile, pieces: list[MeshPiece], names: list[str]) -> Float64:
+    """Find the centers of the left and right eye (2, 3) by bones, eyeballs, lids or the mouth."""
     bones = {bone: number for number, bone in find_bones(glb).items()}
     matrices = dict(glb.nodes())
     centers = []
@@ -252,14 +252,14 @@ def _eyes(glb: Glb, pieces: list[Primitive], names: list[str]) -> Float64:
     near = np.abs(skin.vertices[:, 1] - (mouth if mouth is not None else skin.vertices.mean(0))[1])
     width = np.ptp(skin.vertices[near < np.quantile(near, 0.5), 0])
     unit = width / _HEAD_WIDTH
-    middle = (mouth if mouth is not None else skin.vertices.mean(axis=0)) - MOUTH * unit
+    middle = (mouth if mouth is not None else skin.vertices.mean(axis=0)) - MOUTH_OFFSET * unit
     half = np.array([unit / 2, 0, 0])
     if "VRM" in glb.json.get("extensions", {}):  # version 0 looks along -z
         half = -half
     return np.stack([middle + half, middle - half])
 
 
-def _moved_center(pieces: list[Primitive], names: list[str]) -> Float64 | None:
+def _moved_center(pieces: list[MeshPiece], names: list[str]) -> Float64 | None:
     """Return the mean position of the vertices that some shapes move."""
     total, center = 0.0, np.zeros(3)
     for piece in pieces:
@@ -270,7 +270,7 @@ def _moved_center(pieces: list[Primitive], names: list[str]) -> Float64 | None:
     return center / total if total > 0 else None
 
 
-def _pivot(glb: Glb, turn: Float64, middle: Float64, unit: float) -> Float64:
+def _find_pivot(glb: GlbFile, turn: Float64, middle: Float64, unit: float) -> Float64:
     """Return the position of the joint that the head rotates about."""
     bones = find_bones(glb)
     for number, matrix in glb.nodes():
@@ -278,16 +278,16 @@ def _pivot(glb: Glb, turn: Float64, middle: Float64, unit: float) -> Float64:
         is_joint = bones.get(number) == "head" and "mesh" not in glb.item("nodes", number)
         if is_joint and np.linalg.norm(position - middle) < 4 * unit:
             return position
-    return middle + PIVOT * unit
+    return middle + PIVOT_OFFSET * unit
 
 
-def _head_weight(pieces: list[Primitive], height: Float64) -> Float64:
-    """Return the fraction (V,) of the head rotation; heights above the eyes in eye distances."""
+def _head_weight(pieces: list[MeshPiece], height: Float64) -> Float64:
+    """Return the fraction (V,) of the head rotation: of the skeleton, or else by ``height``."""
     weights = [piece.head_weight for piece in pieces if piece.head_weight is not None]
-    return np.concatenate(weights) if len(weights) == len(pieces) else fade(height)
+    return np.concatenate(weights) if len(weights) == len(pieces) else head_weight_at(height)
 
 
-def _weights_by_fap(known: Names, *, gaze: bool) -> dict[str, Float64]:
+def _weights_by_fap(known: ShapeFaps, *, gaze: bool) -> dict[str, Float64]:
     """Return each shape's weight per unit of every FAP (68,), by the module's equation."""
     names = sorted(known, key=str.lower)
     shapes = np.array([known[name] for name in names])
@@ -302,7 +302,7 @@ def _weights_by_fap(known: Names, *, gaze: bool) -> dict[str, Float64]:
     return dict(zip(names, weights, strict=True))
 
 
-def _fields(piece: Primitive, weights: dict[str, Float64]) -> Fields:
+def _displacement_fields(piece: MeshPiece, weights: dict[str, Float64]) -> FapFields:
     """Return the displacements (V, 3) of a piece by one unit of each FAP, m."""
     names = [name for name in piece.shapes if name in weights]
     if not names:

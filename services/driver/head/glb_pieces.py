@@ -1,4 +1,4 @@
-"""Reads the meshes of a GLB in one coordinate system, with their shapes and skeleton.
+"""Reads the meshes of a GLB in common axes, with their shapes and skeleton.
 
 The shapes of a mesh are its morph targets. In a VRM, an expression is also a shape: a weighted sum
 of morph targets of several meshes (``VRM`` of version 0, ``VRMC_vrm`` of version 1).
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
-from kouxing.services.driver.head.pieces import Primitive
+from kouxing.services.driver.head.glb_file import BadGlbError, Float64, GlbFile
+from kouxing.services.driver.head.mesh_pieces import MeshPiece
 from kouxing.shared.errors import UserError
 
 MAX_VERTICES = 300_000
@@ -27,13 +27,13 @@ _JAW_BONES = ("jaw", "jawroot", "lowerjaw")
 _LOOK_RAD = {"Out": 0.43, "Down": 0.31}  # rotation of the eyes at full weight of ARKit's shapes
 
 
-def read_pieces(glb: Glb) -> list[Primitive]:
-    """Return the triangles of the scene with everything that moves them."""
+def read_pieces(glb: GlbFile) -> list[MeshPiece]:
+    """Return the meshes of the scene, with the shapes and joints that move them."""
     nodes = glb.nodes()
     matrices = dict(nodes)
     turn_fractions = _turn_fractions(glb, matrices)
     expressions = _expressions(glb)
-    pieces: list[Primitive] = []
+    pieces: list[MeshPiece] = []
     num_vertices = num_triangles = num_shifts = 0
     for number, matrix in nodes:
         node = glb.item("nodes", number)
@@ -66,8 +66,8 @@ def read_pieces(glb: Glb) -> list[Primitive]:
     return pieces
 
 
-def _check_textures(pieces: list[Primitive]) -> None:
-    """Decode every texture once; formats outside the glTF core are converted to PNG."""
+def _check_textures(pieces: list[MeshPiece]) -> None:
+    """Decode every texture once to check it, and convert formats outside the glTF core to PNG."""
     known = {b"": b""}
     num_pixels = 0
     for piece in pieces:
@@ -86,7 +86,7 @@ def _check_textures(pieces: list[Primitive]) -> None:
         piece.texture = known[piece.texture]
 
 
-def _turn_fractions(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
+def _turn_fractions(glb: GlbFile, nodes: dict[int, Float64]) -> dict[int, float]:
     """Return each node's fraction of the head rotation: 1 below a node "head", less on the neck."""
     fraction: dict[int, float] = {}
     bones = find_bones(glb)
@@ -99,7 +99,7 @@ def _turn_fractions(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
     return fraction if any(value == 1.0 for value in fraction.values()) else {}
 
 
-def find_bones(glb: Glb) -> dict[int, str]:
+def find_bones(glb: GlbFile) -> dict[int, str]:
     """Return the bones by node: all bones of a VRM, otherwise head, neck and jaw by name."""
     extensions = glb.json.get("extensions", {})
     old_bones = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
@@ -116,7 +116,7 @@ def find_bones(glb: Glb) -> dict[int, str]:
     return {number: known[word] for number, word in enumerate(words) if word in known}
 
 
-def _uses_eye_bones(glb: Glb) -> bool:
+def _uses_eye_bones(glb: GlbFile) -> bool:
     """Return whether a VRM rotates its eyes with bones, not with expressions."""
     extensions = glb.json.get("extensions", {})
     old = extensions.get("VRM", {}).get("firstPerson", {}).get("lookAtTypeName")
@@ -127,7 +127,7 @@ def _uses_eye_bones(glb: Glb) -> bool:
 Binds = list[tuple[str, int, float]]  # name of an expression, target, weight
 
 
-def _expressions(glb: Glb) -> defaultdict[str, Binds]:
+def _expressions(glb: GlbFile) -> defaultdict[str, Binds]:
     """Return the name, target and weight of a VRM's expressions, by "node N" or "mesh N"."""
     binds: defaultdict[str, Binds] = defaultdict(list)
     extensions = glb.json.get("extensions", {})
@@ -147,7 +147,7 @@ def _expressions(glb: Glb) -> defaultdict[str, Binds]:
 
 
 def _piece(
-    glb: Glb,
+    glb: GlbFile,
     node: dict[str, Any],
     mesh: dict[str, Any],
     primitive: dict[str, Any],
@@ -155,7 +155,7 @@ def _piece(
     matrix: Float64,
     turn_fractions: dict[int, float],
     binds: Binds,
-) -> Primitive:
+) -> MeshPiece:
     material = glb.item("materials", primitive["material"]) if "material" in primitive else {}
     base, uv_name = _texture(material)
     attributes = glb.attributes(
@@ -191,7 +191,7 @@ def _piece(
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
             raise ValueError("a coordinate or color is not finite or very large")
-    return Primitive(
+    return MeshPiece(
         name=str(node.get("name") or mesh.get("name") or "part"),
         vertices=vertices,
         triangles=_corners(index, primitive.get("mode", 4)),
@@ -226,7 +226,7 @@ def _moved_uv(uv: Float64, base: dict[str, Any]) -> Float64:
 
 
 def _shapes(
-    glb: Glb,
+    glb: GlbFile,
     node: dict[str, Any],
     mesh: dict[str, Any],
     primitive: dict[str, Any],
@@ -266,7 +266,7 @@ def _corners(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
     return corners
 
 
-def _target_names(glb: Glb, mesh: dict[str, Any], primitive: dict[str, Any]) -> list[str]:
+def _target_names(glb: GlbFile, mesh: dict[str, Any], primitive: dict[str, Any]) -> list[str]:
     """Return a name for each morph target; programs write them in different places."""
     targets = primitive.get("targets", [])
     for owner in (primitive, mesh):
@@ -284,7 +284,7 @@ class _Skin:
     """The joints that move the vertices of a mesh, and their weights."""
 
     def __init__(
-        self, glb: Glb, skin: object, attributes: dict[str, Float64], nodes: dict[int, Float64]
+        self, glb: GlbFile, skin: object, attributes: dict[str, Float64], nodes: dict[int, Float64]
     ) -> None:
         entry = glb.item("skins", skin)
         self._glb = glb

@@ -1,4 +1,4 @@
-"""The talking head: a mesh and a linear basis of facial animation parameters.
+"""A head: a mesh and a linear basis of facial animation parameters.
 
 Every FAP except the rotations is a displacement field over the vertices, so a face is
 
@@ -33,7 +33,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.config import HEAD_NAMES
-from kouxing.services.driver.head.shading import NormalUpdater
+from kouxing.services.driver.head.normal_updater import NormalUpdater
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS, RADIANS_PER_ANGLE_UNIT
@@ -78,17 +78,17 @@ class Head:
     feature_points: dict[str, int]  # vertex by point name, such as "2.1"
     eye_centers: Float32  # (2, 3), left and right, m
     textures: dict[str, bytes]  # encoded JPEG or PNG by name
-    shading: NormalUpdater
+    normal_updater: NormalUpdater
     cel: bool = False  # cartoon shading with one light and one dark tone
 
     @property
     def normals(self) -> Float32:
         """Unit normals of the neutral face (V, 3)."""
-        return self.shading.rest
+        return self.normal_updater.rest
 
     @classmethod
     def load(cls, path: str | Path = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
-        """Read a head by the name of a built-in one, or the path of an ``.npz``.
+        """Read a built-in head by its name, or a head from an ``.npz`` file.
 
         A "coarse" head has a quarter of the skin's triangles; feature points move equally.
 
@@ -104,7 +104,7 @@ class Head:
             )
         expected = "a head; make one with kouxing head import"
         with check_content(file, expected):
-            return assemble(file.stem, read_arrays(file, MAX_BYTES, expected), detail)
+            return assemble_head(file.stem, read_arrays(file, MAX_BYTES, expected), detail)
 
     def part(self, name: str) -> HeadPart:
         """Return a part by name."""
@@ -117,7 +117,7 @@ class Head:
     def pose(self, faps: Float32) -> tuple[Float32, Float32]:
         """Return the vertices moved by FAPs (68,), and their normals, both (V, 3)."""
         vertices = self._displace(faps)
-        normals = self.shading.normals(vertices)
+        normals = self.normal_updater.normals(vertices)
         return self._rotate(vertices, faps, points=True), self._rotate(normals, faps, points=False)
 
     def _displace(self, faps: Float32) -> Float32:
@@ -150,14 +150,16 @@ def _rotation(yaw: float, pitch: float, roll: float) -> Float32:
     return np.asarray(rotation.as_matrix(), dtype=np.float32)
 
 
-def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail = "fine") -> Head:
+def assemble_head(
+    name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail = "fine"
+) -> Head:
     """Build a head from the arrays of its file.
 
     Raises ``ValueError``, ``KeyError`` or ``IndexError`` if the arrays are not consistent.
     """
     if str(arrays["format"]) != FORMAT:
         raise ValueError(f"format {arrays['format']}, expected {FORMAT}")
-    _check(arrays)
+    _check_arrays(arrays)
     coarse = detail == "coarse"
     # coarse vertices come first in each part, so the coarse head is a selection of rows
     first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
@@ -197,12 +199,12 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
     vertices = arrays["vertices"].astype(np.float32)[used]
     basis = _basis(arrays, new_index, len(used))
     welds = new_index[arrays["welds"].astype(np.int64)[used]] if "welds" in arrays else None
-    shading = NormalUpdater.of(vertices, faces, basis, welds)
+    normal_updater = NormalUpdater.of(vertices, faces, basis, welds)
     return Head(
         name=name,
         parts=tuple(parts),
         vertices=vertices,
-        shading=shading,
+        normal_updater=normal_updater,
         triangles=faces,
         coarse_triangles=tuple(coarse_triangles),
         uv=arrays["uv"].astype(np.float32)[used] / np.float32(65535),
@@ -227,8 +229,8 @@ def _by_name(names: NDArray[Any], values: NDArray[Any]) -> dict[str, Any]:
     return dict(zip(names.astype(str).tolist(), values.tolist(), strict=True))
 
 
-def _check(arrays: dict[str, NDArray[np.generic]]) -> None:
-    """Check the consistency of arrays that later steps do not check."""
+def _check_arrays(arrays: dict[str, NDArray[np.generic]]) -> None:
+    """Check the arrays as far as later steps do not."""
     count, num_parts = len(arrays["vertices"]), len(arrays["part_names"])
     for key, shape in (
         ("vertices", (count, 3)), ("uv", (count, 2)), ("colors", (count, 3)),

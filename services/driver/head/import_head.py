@@ -1,4 +1,4 @@
-"""Makes a head from a mesh and its feature points.
+"""Builds a head from a mesh and its feature points.
 
 The connected surface that contains point 8.1 is the skin; it gets the fields of ``import_fields``.
 The role of other connected surfaces follows from their position. Eyeballs rotate. Objects in the
@@ -15,27 +15,27 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
+from kouxing.services.driver.head.feature_points_file import FeaturePoints, read_points
 from kouxing.services.driver.head.glb_file import Float64
-from kouxing.services.driver.head.glb_head import EYE_DISTANCE_M, PIVOT, fade
-from kouxing.services.driver.head.import_fields import (
-    INNER,
+from kouxing.services.driver.head.glb_head import EYE_DISTANCE_M, PIVOT_OFFSET, head_weight_at
+from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
+from kouxing.services.driver.head.mesh_pieces import FapFields, MeshPiece, pack_head, weld
+from kouxing.services.driver.head.skin_fields import (
+    INNER_LIPS,
     LOWER_LIP,
-    OUTER,
+    OUTER_LIPS,
     UPPER_LIP,
     SkinFields,
 )
-from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
-from kouxing.services.driver.head.pieces import Fields, Primitive, pack, weld
-from kouxing.services.driver.head.points_file import FeaturePoints, read_points
 from kouxing.services.driver.head.surface import Geodesics
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.output_file import open_output
 
 MAX_VERTICES = 65_535  # limit of 16-bit indices in the page's GLB
-NEEDED = ("2.1", *sorted(INNER), "2.10", *sorted(OUTER))
-_MOVING = {name for fap in FAPS for name in fap.feature_points}
-_SNAP = 0.15  # maximum distance of a point from the mesh, eye distances
+REQUIRED_POINTS = ("2.1", *sorted(INNER_LIPS), "2.10", *sorted(OUTER_LIPS))
+_MOVED_POINTS = {name for fap in FAPS for name in fap.feature_points}
+_MAX_SNAP = 0.15  # maximum distance of a point from the mesh, eye distances
 _OFF_SURFACE = ("3.5", "3.6", "7.1", "3.13", "3.14")  # points that are not on the surface
 
 Index = NDArray[np.int64]
@@ -57,14 +57,14 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
         raise UserError(f"{mesh} has {count} vertices; reduce it to at most {MAX_VERTICES}")
     feature_points = read_points(points)
     positions = _positions(mesh, points, pieces, feature_points)
-    arrays, warnings = _Import(mesh, points, pieces, positions, feature_points).run()
+    arrays, warnings = _HeadImport(mesh, points, pieces, positions, feature_points).run()
     with open_output(output) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     return warnings
 
 
 def _positions(
-    mesh: Path, path: Path, pieces: list[Primitive], points: FeaturePoints
+    mesh: Path, path: Path, pieces: list[MeshPiece], points: FeaturePoints
 ) -> dict[str, Float64]:
     """Return the coordinates of every point in the mesh's own axes."""
     vertices, named = numbered_vertices(mesh, pieces)
@@ -84,42 +84,42 @@ def _positions(
     return positions
 
 
-class _Import:
-    """The steps of one import."""
+class _HeadImport:
+    """Builds the arrays of one head."""
 
     def __init__(
         self,
         mesh: Path,
         path: Path,
-        pieces: list[Primitive],
+        pieces: list[MeshPiece],
         positions: dict[str, Float64],
         feature_points: FeaturePoints,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
         self._warnings: list[str] = []
         self._stated_fapu = feature_points.fapu
-        self._find_frame(positions)
-        self._join()
-        self._snap(positions)
+        self._align_axes(positions)
+        self._weld_vertices()
+        self._snap_points(positions)
 
     def run(self) -> tuple[dict[str, NDArray[np.generic]], list[str]]:
         """Return the arrays of the head's file, and warnings."""
-        fapu = self._measure()
+        fapu = self._measure_fapu()
         skin, local, inside = self._skin
         points = {name: int(local[v]) for name, v in self._points.items() if local[v] >= 0}
         face = SkinFields(self._welded[skin], inside, points, self._eyes, fapu)
-        fields, roles = self._move(face, fapu)
-        pieces, rows = self._split(roles)
+        fields, roles = self._assign_fields(face, fapu)
+        pieces, rows = self._split_eyeballs(roles)
         order = np.concatenate(rows)
         new_index = np.empty(len(order), np.int64)
         new_index[order] = np.arange(len(order))
         first_of = {int(w): int(v) for v, w in reversed(list(enumerate(self._weld_of)))}
         self._check_movements(fields, points)
         height = (self._vertices[order, 1] - self._eyes.mean(axis=0)[1]) / EYE_DISTANCE_M
-        arrays = pack(
+        arrays = pack_head(
             pieces,
             fields=[{fap: field[selected] for fap, field in fields.items()} for selected in rows],
-            head_weight=fade(height),
+            head_weight=head_weight_at(height),
             fapu=fapu | {"AU": RADIANS_PER_ANGLE_UNIT},
             feature_points={
                 name: int(new_index[first_of[vertex]]) for name, vertex in self._points.items()
@@ -128,35 +128,35 @@ class _Import:
         )
         return arrays, self._warnings
 
-    def _fail(self, text: str) -> UserError:
+    def _points_error(self, text: str) -> UserError:
         return UserError(f"{self._path}: {text}")
 
     # --- the mesh in the axes of a head ---------------------------------------------------------
 
-    def _find_frame(self, positions: dict[str, Float64]) -> None:
+    def _align_axes(self, positions: dict[str, Float64]) -> None:
         eyes = {}
         for name, lids in (("3.5", ("3.1", "3.3")), ("3.6", ("3.2", "3.4"))):
             if name in positions:
                 eyes[name] = positions[name]
             elif all(lid in positions for lid in lids):
                 eyes[name] = (positions[lids[0]] + positions[lids[1]]) / 2
-        missing = [name for name in NEEDED if name not in positions]
+        missing = [name for name in REQUIRED_POINTS if name not in positions]
         missing += [f"{name} (or its eyelids)" for name in ("3.5", "3.6") if name not in eyes]
         if "9.15" not in positions and "MNS" not in self._stated_fapu:
             missing.append("9.15")
         if missing:
-            raise self._fail(f"points are missing: {', '.join(missing)}")
+            raise self._points_error(f"points are missing: {', '.join(missing)}")
         left, right = eyes["3.5"], eyes["3.6"]
         middle, unit = (left + right) / 2, float(np.linalg.norm(left - right))
         down = middle - positions["2.1"]
         sideways = left - right
         if unit == 0 or down[1] < 0.8 * np.linalg.norm(down) or abs(sideways[0]) < 0.8 * unit:
-            raise self._fail(
+            raise self._points_error(
                 "the chin (2.1) is not below the eyes (3.5, 3.6); rotate the mesh so that y is up"
                 " and the face looks along z"
             )
         turn = np.array([1.0, 1.0, 1.0]) if sideways[0] > 0 else np.array([-1.0, 1.0, -1.0])
-        pivot = positions.get("7.1", middle + PIVOT * turn * unit)
+        pivot = positions.get("7.1", middle + PIVOT_OFFSET * turn * unit)
         scale = EYE_DISTANCE_M / unit
         self._pivot, self._turn, self._scale = pivot, turn, scale
         self._eyes = self._to_head(np.stack([left, right]))
@@ -168,8 +168,8 @@ class _Import:
         turned: Float64 = (rows - self._pivot) * self._turn * self._scale
         return turned
 
-    def _join(self) -> None:
-        """Merge vertices at the same position, and find the connected surfaces."""
+    def _weld_vertices(self) -> None:
+        """Merge vertices with the same position, and find the connected surfaces."""
         first = np.cumsum([0] + [len(piece.vertices) for piece in self._pieces])
         uv = np.concatenate([piece.uv for piece in self._pieces])
         flat = np.ptp(uv, axis=0).max() == 0  # slits are visible only in texture coordinates
@@ -190,7 +190,7 @@ class _Import:
         graph = sparse.coo_array((np.ones(len(edges)), edges.T), (count, count))
         _, self._component = csgraph.connected_components(graph, directed=False)
 
-    def _snap(self, positions: dict[str, Float64]) -> None:
+    def _snap_points(self, positions: dict[str, Float64]) -> None:
         """Find the vertex of each point."""
         used = np.unique(self._triangles)
         tree = cKDTree(self._welded[used])
@@ -200,31 +200,35 @@ class _Import:
             distance, row = tree.query(self._to_head(position))
             if name in _OFF_SURFACE:
                 continue
-            if distance <= _SNAP * EYE_DISTANCE_M:
+            if distance <= _MAX_SNAP * EYE_DISTANCE_M:
                 self._points[name] = int(used[row])
-            elif name in _MOVING or name in NEEDED:
+            elif name in _MOVED_POINTS or name in REQUIRED_POINTS:
                 off.append(f"{name} by {distance / self._scale:.3g}")
         if off:
-            raise self._fail(f"points are too far from the mesh, in its unit: {', '.join(off)}")
+            raise self._points_error(
+                f"points are too far from the mesh, in its unit: {', '.join(off)}"
+            )
         skin = np.flatnonzero(self._component == self._component[self._points["8.1"]])
         local = np.full(len(self._welded), -1)
         local[skin] = np.arange(len(skin))
         inside = local[self._triangles]
         self._skin = skin, local, inside[(inside >= 0).all(axis=1)]
-        self._part_lips(positions)
-        lips = {name: self._points[name] for name in (*INNER, *OUTER, "2.1", "2.10")}
+        self._separate_lips(positions)
+        lips = {name: self._points[name] for name in (*INNER_LIPS, *OUTER_LIPS, "2.1", "2.10")}
         apart = [name for name, vertex in lips.items() if local[vertex] < 0]
         if apart:
-            raise self._fail(f"{', '.join(apart)} and 8.1 are on separate meshes; join the meshes")
+            raise self._points_error(
+                f"{', '.join(apart)} and 8.1 are on separate meshes; join the meshes"
+            )
         name_of_vertex: dict[int, str] = {}
         for name, vertex in lips.items():
             if vertex in name_of_vertex:
-                raise self._fail(
+                raise self._points_error(
                     f"{name_of_vertex[vertex]} and {name} have the same vertex; separate them"
                 )
             name_of_vertex[vertex] = name
 
-    def _part_lips(self, positions: dict[str, Float64]) -> None:
+    def _separate_lips(self, positions: dict[str, Float64]) -> None:
         """Move inner points of closed lips to the correct lip."""
         skin, local, inside = self._skin
         if local[self._points["8.2"]] < 0:
@@ -247,7 +251,7 @@ class _Import:
 
     # --- what moves -----------------------------------------------------------------------------
 
-    def _measure(self) -> dict[str, float]:
+    def _measure_fapu(self) -> dict[str, float]:
         """Return the FAPUs, m."""
 
         def height(name: str) -> float:
@@ -268,13 +272,15 @@ class _Import:
             fapu["IRISD"] = stated.get("IRISD", 0.163 * EYE_DISTANCE_M)
         wrong = [name for name, length in fapu.items() if length <= 0]
         if wrong:
-            raise self._fail(
+            raise self._points_error(
                 f"{', '.join(wrong)} is not positive: left and right, or upper and lower points,"
                 " are swapped (left is the subject's left, at positive x)"
             )
         return fapu
 
-    def _move(self, face: SkinFields, fapu: dict[str, float]) -> tuple[Fields, NDArray[np.int8]]:
+    def _assign_fields(
+        self, face: SkinFields, fapu: dict[str, float]
+    ) -> tuple[FapFields, NDArray[np.int8]]:
         """Return the fields (V, 3), and per vertex 1 (left eye), 2 (right eye) or 0."""
         skin = self._skin[0]
         fields = {fap: np.zeros_like(self._welded) for fap in face.fields}
@@ -303,7 +309,7 @@ class _Import:
                 and low[1] > chin[1]
                 and high[1] < lips[1] + 1.5 * fapu["MNS"]
             ):
-                moved: Fields = {}
+                moved: FapFields = {}
                 tip, body = (self._points.get(name) for name in ("6.1", "6.2"))
                 if tip is not None and self._component[tip] == component:
                     moved = face.tongue_fields(self._welded, rows, tip, body)
@@ -328,7 +334,7 @@ class _Import:
                 return number
         return 0
 
-    def _split(self, roles: NDArray[np.int8]) -> tuple[list[Primitive], list[Index]]:
+    def _split_eyeballs(self, roles: NDArray[np.int8]) -> tuple[list[MeshPiece], list[Index]]:
         """Split pieces so that each eyeball is separate; return them and their vertex rows."""
         pieces, rows = [], []
         first = 0
@@ -355,7 +361,7 @@ class _Import:
             first += len(piece_roles)
         return pieces, rows
 
-    def _check_movements(self, fields: Fields, points: dict[str, int]) -> None:
+    def _check_movements(self, fields: FapFields, points: dict[str, int]) -> None:
         still = [
             fap.name
             for fap in FAPS[2:]

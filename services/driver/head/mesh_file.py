@@ -1,4 +1,4 @@
-"""Reads a user's mesh file (OBJ, PLY, GLB) as pieces in common axes."""
+"""Reads the pieces of a user's mesh file (OBJ, PLY or GLB) in common axes."""
 
 import io
 import warnings
@@ -10,9 +10,9 @@ import trimesh
 from PIL import Image
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import Float64, Glb, check_glb
+from kouxing.services.driver.head.glb_file import Float64, GlbFile, check_glb
 from kouxing.services.driver.head.glb_pieces import read_pieces
-from kouxing.services.driver.head.pieces import Primitive
+from kouxing.services.driver.head.mesh_pieces import MeshPiece
 from kouxing.shared.errors import UserError
 from kouxing.shared.user_file import check_content, read_file
 
@@ -24,7 +24,7 @@ _NO_DIFFUSE = [102, 102, 102]  # trimesh's default
 _SKIN_COLOR = (0.58, 0.40, 0.32)  # linear, for meshes without color
 
 
-def read_mesh(path: Path) -> list[Primitive]:
+def read_mesh(path: Path) -> list[MeshPiece]:
     """Read the triangles of a mesh file; a GLB is read in its skeleton's rest pose.
 
     Raises ``UserError`` if the file cannot be read, has no triangles, or is too large.
@@ -34,17 +34,17 @@ def read_mesh(path: Path) -> list[Primitive]:
         raise UserError(f"{path}: use a mesh in one of the formats {', '.join(MESH_SUFFIXES)}")
     if suffix == ".glb":
         with check_glb(path):
-            pieces = read_pieces(Glb(path))
+            pieces = read_pieces(GlbFile(path))
     else:
         with check_content(path, "a mesh; export it again"):
-            meshes = _load(path, suffix)
-            pieces = [_from_trimesh(mesh) for mesh in meshes if len(getattr(mesh, "faces", ()))]
+            meshes = _load_meshes(path, suffix)
+            pieces = [_parse_trimesh(mesh) for mesh in meshes if len(getattr(mesh, "faces", ()))]
     if not pieces:
         raise UserError(f"{path} has no faces; export the mesh with its triangles")
     return pieces
 
 
-def _load(path: Path, suffix: str) -> list[Any]:
+def _load_meshes(path: Path, suffix: str) -> list[Any]:
     """Read the meshes of an OBJ or PLY file, with the materials and images that it names."""
     content = read_file(path, MAX_MESH_BYTES)
     if content.count(b" ") + content.count(b"\n") > MAX_WORDS:  # trimesh would need minutes
@@ -61,7 +61,7 @@ def _load(path: Path, suffix: str) -> list[Any]:
 
 
 class _NamedFiles(trimesh.resolvers.FilePathResolver):
-    """Reads the files that a mesh names. trimesh ignores errors, so the last one is kept."""
+    """Reads the files that a mesh names. The last error is kept, because trimesh ignores errors."""
 
     error: UserError | None = None
 
@@ -89,7 +89,7 @@ def _check_picture(path: Path, content: bytes) -> None:
             raise ValueError(f"it has more than {picture.MAX_PIXELS / 1e6:.0f} million pixels")
 
 
-def _from_trimesh(mesh: Any) -> Primitive:
+def _parse_trimesh(mesh: Any) -> MeshPiece:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     triangles = np.asarray(mesh.faces, dtype=np.int64)
     if not np.isfinite(vertices).all():
@@ -112,7 +112,7 @@ def _from_trimesh(mesh: Any) -> Primitive:
         vertex_colors = visual.vertex_colors
     if vertex_colors is not None and len(vertex_colors) == len(vertices):
         colors = (np.asarray(vertex_colors, dtype=np.float64)[:, :3] / 255) ** 2
-    return Primitive(
+    return MeshPiece(
         name=str(mesh.metadata.get("name", "part")),
         vertices=vertices,
         triangles=triangles,
@@ -124,7 +124,7 @@ def _from_trimesh(mesh: Any) -> Primitive:
     )
 
 
-def numbered_vertices(mesh: Path, pieces: list[Primitive]) -> tuple[Float64, dict[str, Float64]]:
+def numbered_vertices(mesh: Path, pieces: list[MeshPiece]) -> tuple[Float64, dict[str, Float64]]:
     """Return the vertices (V, 3) in file order: all of them, and by mesh name.
 
     Raises ``UserError`` if a vertex line of an OBJ file is invalid.

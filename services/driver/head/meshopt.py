@@ -1,7 +1,8 @@
 """Decodes buffer views that meshoptimizer compressed.
 
-Khronos EXT_meshopt_compression, appendix A (attributes, triangles, indices) and B (filters). PyPI
-has no package with wheels for all platforms. The input is not trusted: reading past its end fails.
+Source: Khronos EXT_meshopt_compression, appendix A (attributes, triangles, indices) and B
+(filters). No package on PyPI has wheels for all platforms. The input is not trusted;
+reading past its end is an error.
 """
 
 from typing import Any
@@ -14,7 +15,7 @@ Bytes = NDArray[np.uint8]
 
 _HEADERS = {"ATTRIBUTES": 0xA0, "TRIANGLES": 0xE1, "INDICES": 0xD1}
 _MAX_STRIDE = 256
-_AT, _NEXT, _LAST, _NUM_RECENT = range(4)  # indices into the decoder's state for triangles
+_OFFSET, _NEXT, _LAST, _NUM_RECENT = range(4)  # indices into the decoder's state for triangles
 
 
 def decode_view(data: bytes, view: dict[str, Any]) -> bytes:
@@ -34,7 +35,7 @@ def decode_view(data: bytes, view: dict[str, Any]) -> bytes:
         )
         if not is_complete:
             raise ValueError("compressed data is cut off")
-        return _filtered(out, str(view.get("filter", "NONE")))
+        return _apply_filter(out, str(view.get("filter", "NONE")))
     indices = np.zeros(count, np.uint32)
     decode, tail = (_decode_triangles, 16) if mode == "TRIANGLES" else (_decode_indices, 4)
     if not decode(padded, len(data) - tail, indices):
@@ -42,7 +43,7 @@ def decode_view(data: bytes, view: dict[str, Any]) -> bytes:
     return indices.astype("<u2" if stride == 2 else "<u4").tobytes()
 
 
-def _filtered(out: Bytes, name: str) -> bytes:
+def _apply_filter(out: Bytes, name: str) -> bytes:
     if name == "NONE":
         return out.tobytes()
     if name != "EXPONENTIAL" or out.shape[1] % 4:  # the others are for normals and rotations
@@ -94,7 +95,7 @@ def _decode_attributes(data: Bytes, end: int, tail: int, out: Bytes) -> bool:
 
 @numba.njit(cache=True)
 def _decode_varint(data: Bytes, offset: int) -> tuple[np.int64, int]:
-    """Return a number in LEB128 and the offset after it."""
+    """Return a LEB128 number and the offset after it."""
     value, shift = np.int64(0), 0
     while True:
         byte = np.int64(data[offset])
@@ -130,7 +131,7 @@ def _next_vertex(
     if choice < 15:
         return np.int64(recent[(state[_NUM_RECENT] - choice) & 15])
     if choice == 15:
-        value, state[_AT] = _decode_varint(data, state[_AT])
+        value, state[_OFFSET] = _decode_varint(data, state[_OFFSET])
         state[_LAST] += value >> 1 ^ -(value & 1)
     else:
         state[_LAST] += choice - 17
@@ -139,14 +140,17 @@ def _next_vertex(
 
 @numba.njit(cache=True)
 def _decode_triangles(data: Bytes, end: int, out: NDArray[np.uint32]) -> bool:
-    """Fill ``out`` (3 N,); the codes come first, then data, then a table of 16 codes."""
+    """Fill ``out`` (3 N,) and return whether the data is long enough.
+
+    The data starts with codes and ends with a table of 16 codes.
+    """
     num_triangles = len(out) // 3
     edges, num_edges = np.zeros((16, 2), np.int64), 0
     recent, state = np.zeros(16, np.int64), np.zeros(4, np.int64)
     corners, choices = np.zeros(3, np.int64), np.zeros(3, np.int64)
-    state[_AT] = 1 + num_triangles
+    state[_OFFSET] = 1 + num_triangles
     for triangle in range(num_triangles):
-        if state[_AT] > end:
+        if state[_OFFSET] > end:
             return False
         code = np.int64(data[1 + triangle])
         edge, low = code >> 4, code & 15
@@ -159,8 +163,8 @@ def _decode_triangles(data: Bytes, end: int, out: NDArray[np.uint32]) -> bool:
         else:
             codes = np.int64(data[end + low])
             if low >= 14:
-                codes = np.int64(data[state[_AT]])
-                state[_AT] += 1
+                codes = np.int64(data[state[_OFFSET]])
+                state[_OFFSET] += 1
                 state[_NEXT] *= codes != 0
             choices[0], choices[1], choices[2] = 15 * (low == 15), codes >> 4, codes & 15
             first = 0
@@ -174,4 +178,4 @@ def _decode_triangles(data: Bytes, end: int, out: NDArray[np.uint32]) -> bool:
             edges[num_edges & 15] = (corners[(start + 1) % 3], corners[start])
             num_edges += 1
         out[3 * triangle : 3 * triangle + 3] = corners & 0xFFFFFFFF
-    return bool(state[_AT] <= end)
+    return bool(state[_OFFSET] <= end)

@@ -9,7 +9,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-def edges_of(quads: Index) -> tuple[Index, Index]:
+def find_edges(quads: Index) -> tuple[Index, Index]:
     """Return the undirected edges (E, 2) of quads (F, 4) or triangles (F, 3).
 
     The smaller vertex number comes first. The second result is the number of the edge after each
@@ -24,7 +24,7 @@ class Geodesics:
     """Shortest paths along the edges of a surface of triangles or quads, and quad diagonals."""
 
     def __init__(self, vertices: Float, faces: Index) -> None:
-        pairs, _ = edges_of(faces)
+        pairs, _ = find_edges(faces)
         if faces.shape[1] == 4:
             pairs = np.concatenate([pairs, faces[:, [0, 2]], faces[:, [1, 3]]])
         length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
@@ -56,7 +56,7 @@ class Geodesics:
         return weight
 
 
-def smoothest(
+def smoothest_fields(
     vertices: Float, triangles: Index, points: Index | list[Index], fixed: Index
 ) -> Float:
     """Return the smoothest fields (V, P) with value 1 at ``points[p]`` and 0 at the other points.

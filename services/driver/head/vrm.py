@@ -1,4 +1,4 @@
-"""The additions that turn a GLB into a VRM 1.0 avatar: a skeleton and the extension ``VRMC_vrm``.
+"""Additions that make a GLB a VRM 1.0 avatar: a skeleton and the extension ``VRMC_vrm``.
 
 VRM Consortium, "VRMC_vrm-1.0". Each expression is a morph target: the shape set "vrm", four
 emotions, and ARKit's 52 shapes for programs with "perfect sync". The format requires a whole body,
@@ -8,7 +8,7 @@ so the head gets the bones of a body in T-pose without a mesh.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from kouxing.services.driver.head.morphs import EMOTIONS
+from kouxing.services.driver.head.morph_targets import EMOTIONS
 from kouxing.shared.face.shapes import ARKIT, VRM
 
 Position = tuple[float, float, float]
@@ -43,7 +43,7 @@ BONES: tuple[tuple[str, str, Position], ...] = (
 )
 
 
-def extension(
+def build_extension(
     name: str, nodes: Mapping[str, int], bindings: Bindings, eyes: Position, *, is_free: bool
 ) -> dict[str, Any]:
     """Return the contents of the extension for an avatar.

@@ -1,1 +1,1 @@
-"""Drawing a head."""
+"""Draws a head with OpenGL, and captions below it."""

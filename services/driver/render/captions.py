@@ -1,4 +1,4 @@
-"""Captions below a picture: what is spoken, with the current syllable or phone highlighted."""
+"""Draws captions of the speech below a picture, and highlights the current syllable or phone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _CURRENT_BOX, _CURRENT_TEXT = "#ffd23f", "#14171c"
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """One syllable or phone."""
+    """A syllable or phone to show."""
 
     start_s: float
     end_s: float
@@ -39,8 +39,8 @@ def _text_px(size_px: tuple[int, int]) -> float:
     return max(min(height_px * _TEXT_HEIGHT, width_px * _TEXT_WIDTH), _MIN_TEXT_PX)
 
 
-class Captions:
-    """Draws captions in a band below the picture, so that they hide nothing.
+class CaptionDrawer:
+    """Draws captions in a band below the picture, where they hide nothing.
 
     ``captions`` are sorted by time. ``size_px`` is the size of the picture with the band.
     """
@@ -85,7 +85,7 @@ class Captions:
             x = end
 
     def _line_at(self, time_s: float) -> Sequence[Caption]:
-        """Return the line of a time. The first line shows from the start, the last to the end."""
+        """Return the line at a time. The first is shown from the start, the last to the end."""
         shown: Sequence[Caption] = self._lines[0] if self._lines else ()
         for before, line in pairwise(self._lines):
             if time_s >= max(before[-1].end_s, line[0].start_s - _EARLY_S):

@@ -56,7 +56,7 @@ class Camera:
         return np.asarray(projection @ view, dtype=np.float32)
 
 
-def standalone_context() -> moderngl.Context:
+def create_offscreen_context() -> moderngl.Context:
     """Create an OpenGL 3.3 context without a display.
 
     Raises ``UserError`` if the GL libraries are missing or cannot create a context.
@@ -102,7 +102,7 @@ class Renderer:
         self.transparent = background is None
         self._background = background
         self._camera = camera or Camera()
-        self._context = context or standalone_context()
+        self._context = context or create_offscreen_context()
         self._own_context = context is None
         self._on_screen = on_screen
         self._samples = min(samples, self._context.max_samples)
@@ -141,7 +141,7 @@ class Renderer:
         for part in head.parts:
             indices = context.buffer(head.triangles[part.triangles].tobytes())
             self._arrays[part.name] = context.vertex_array(
-                self._program_of(part),
+                self._part_program(part),
                 [
                     (self._moving, "3f 3f", "in_position", "in_normal"),
                     (fixed_buffer, "2f 3f", "in_uv", "in_color"),
@@ -256,26 +256,26 @@ class Renderer:
         context.blend_func = factors
         # only hair hides what is behind it
         blended = [part for part in self.head.parts if part.transparent]
-        for part in sorted(blended, key=lambda part: part.name != shaders.HAIR):
-            target.depth_mask = part.name == shaders.HAIR
+        for part in sorted(blended, key=lambda part: part.name != shaders.HAIR_PART):
+            target.depth_mask = part.name == shaders.HAIR_PART
             self._draw_part(part)
         target.depth_mask = True
 
-    def _program_of(self, part: HeadPart) -> Any:
-        if part.name in shaders.EYES:
+    def _part_program(self, part: HeadPart) -> Any:
+        if part.name in shaders.EYE_PARTS:
             return self._eye_program
         return self._cutout_program if part.transparent else self._program
 
     def _draw_part(self, part: HeadPart) -> None:
-        program = self._program_of(part)
-        wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
+        program = self._part_program(part)
+        wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN_MATERIAL)
         for name, value in (
             ("wrap", wrap), ("gloss", gloss), ("shine", shine),
             ("two_sided", part.double_sided),
-            ("strands", part.name == shaders.HAIR),
-            ("cutoff", shaders.HAIR_CUTOFF if part.name == shaders.HAIR else shaders.CUTOFF),
-            ("cel", self.head.cel and part.name not in shaders.EYES),
-            ("share", self._mouth_light if part.name in shaders.IN_MOUTH else 1.0),
+            ("strands", part.name == shaders.HAIR_PART),
+            ("cutoff", shaders.HAIR_CUTOFF if part.name == shaders.HAIR_PART else shaders.CUTOFF),
+            ("cel", self.head.cel and part.name not in shaders.EYE_PARTS),
+            ("share", self._mouth_light if part.name in shaders.MOUTH_PARTS else 1.0),
         ):  # fmt: skip
             if name in program:
                 program[name] = value

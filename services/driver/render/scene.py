@@ -1,4 +1,4 @@
-"""The head, camera and background of a picture."""
+"""Chooses the head, camera and background of a picture."""
 
 import re
 from pathlib import Path
@@ -37,7 +37,9 @@ def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
     return Head.load(path, detail)
 
 
-def camera(head: Head, framing: Framing = Framing.FACE, yaw_deg: float | None = None) -> Camera:
+def place_camera(
+    head: Head, framing: Framing = Framing.FACE, yaw_deg: float | None = None
+) -> Camera:
     """Place the camera at an angle to the subject's left; by default the angle of ``framing``."""
     eyes = head.eye_centers.mean(axis=0)
     unit_m = float(head.eye_centers[0, 0] - head.eye_centers[1, 0])
@@ -53,7 +55,7 @@ def camera(head: Head, framing: Framing = Framing.FACE, yaw_deg: float | None = 
     return Camera(position=tuple(position.tolist()), target=tuple(target.tolist()))
 
 
-def background(text: str) -> Background:
+def parse_background(text: str) -> Background:
     """Parse a background: studio, transparent, the name of a color, or ``#rrggbb``.
 
     Raises ``UserError`` if the text is not a background.
@@ -82,7 +84,7 @@ def open_renderer(config: DriverConfig, context: moderngl.Context | None = None)
     return Renderer(
         head,
         *config.size_px,
-        background=background(config.background),
-        camera=camera(head, config.camera),
+        background=parse_background(config.background),
+        camera=place_camera(head, config.camera),
         context=context,
     )

@@ -86,9 +86,9 @@ void main() {
 }
 """
 
-EYES = ("eye_left", "eye_right")
-IN_MOUTH = ("teeth_upper", "teeth_lower", "tongue")  # receives light through the lips
-HAIR = "hair"  # vertical strands
+EYE_PARTS = ("eye_left", "eye_right")
+MOUTH_PARTS = ("teeth_upper", "teeth_lower", "tongue")  # receives light through the lips
+HAIR_PART = "hair"  # vertical strands
 HAIR_CUTOFF, CUTOFF = 0.30, 0.02  # texels with less alpha are not drawn, in hair and elsewhere
 
 # part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
@@ -105,4 +105,4 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "brows": ((0.5, 0.34, 0.29), 8.0, 0.0),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
 }
-PLAIN = ((0.3, 0.3, 0.3), 14.0, 0.08)  # other parts
+PLAIN_MATERIAL = ((0.3, 0.3, 0.3), 14.0, 0.08)  # other parts

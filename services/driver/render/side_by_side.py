@@ -1,4 +1,4 @@
-"""Several faces side by side in one picture, each with a caption."""
+"""Draws several faces side by side in one picture, each with a caption."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from kouxing.services.driver.render.renderer import Float32, Renderer, UInt8
 _CAPTION_FRACTION = 1 / 20  # height of the letters, as a fraction of the picture
 
 
-class SideBySide:
+class SideBySideRenderer:
     """Draws one face per caption, from left to right."""
 
     def __init__(self, renderer: Renderer, captions: Sequence[str]) -> None:

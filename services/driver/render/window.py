@@ -1,4 +1,4 @@
-"""Shows a head in a window."""
+"""Shows a head in a desktop window."""
 
 from collections.abc import Callable
 

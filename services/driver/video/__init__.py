@@ -1,1 +1,1 @@
-"""Videos and pictures of a head."""
+"""Writes videos and pictures of a head."""

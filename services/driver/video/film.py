@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.driver.render.captions import Captions
+from kouxing.services.driver.render.captions import CaptionDrawer
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.render.side_by_side import SideBySide
-from kouxing.services.driver.video.recording import Recording, interpolate
-from kouxing.services.driver.video.writer import write_picture
+from kouxing.services.driver.render.side_by_side import SideBySideRenderer
+from kouxing.services.driver.video.video_renderer import VideoRenderer, interpolate
+from kouxing.services.driver.video.video_writer import write_picture
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation
 from kouxing.shared.face.high_level_faps import expression_faps, viseme_faps
 
 # media time in seconds, and FAPs (68,); for faces side by side (num_faces, 68)
-Frame = tuple[float, NDArray[np.float32]]
+TimedFaps = tuple[float, NDArray[np.float32]]
 
 
-def expand_frames(animation: FapAnimation) -> list[Frame]:
+def expand_frames(animation: FapAnimation) -> list[TimedFaps]:
     """Return the frames of a FAP file, with FAP 1 and FAP 2 expanded into the other FAPs.
 
     A frame that defines a viseme or expression (``viseme_def``, ``expression_def``) already has the
@@ -39,8 +39,8 @@ def expand_frames(animation: FapAnimation) -> list[Frame]:
     return [(number / animation.frame_rate_hz, row) for number, row in enumerate(faps)]
 
 
-def stack_faces(faces: Sequence[list[Frame]]) -> list[Frame]:
-    """Combine the frames of several faces, at the same times, for ``SideBySide``."""
+def stack_faces(faces: Sequence[list[TimedFaps]]) -> list[TimedFaps]:
+    """Combine the frames of several faces, at the same times, for ``SideBySideRenderer``."""
     return [
         (frames[0][0], np.stack([faps for _, faps in frames]))
         for frames in zip(*faces, strict=True)
@@ -48,13 +48,13 @@ def stack_faces(faces: Sequence[list[Frame]]) -> list[Frame]:
 
 
 def render_video(
-    frames: list[Frame],
+    frames: list[TimedFaps],
     path: Path,
-    renderer: Renderer | SideBySide,
+    renderer: Renderer | SideBySideRenderer,
     *,
     frame_rate_hz: float,
     samples: NDArray[np.float32] | None,
-    captions: Captions | None = None,
+    captions: CaptionDrawer | None = None,
     on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> int:
     """Write a video or one picture per image; return the number of images.
@@ -65,7 +65,7 @@ def render_video(
 
     Raises ``UserError`` if the file cannot be written.
     """
-    recording = Recording(
+    video = VideoRenderer(
         path, renderer, frame_rate_hz, sound=samples is not None, captions=captions
     )
     sound = np.zeros(0, np.float32) if samples is None else samples
@@ -74,26 +74,26 @@ def render_video(
         if len(sound) / MEDIA_RATE_HZ > frames[-1][0]:
             frames = [*frames, (len(sound) / MEDIA_RATE_HZ, frames[-1][1])]
         for time_s, faps in frames:
-            recording.add_frame(time_s, faps)
-        while recording.step():
-            end = round(recording.duration_s * MEDIA_RATE_HZ)
-            recording.add_sound(num_sent, sound[num_sent:end])
+            video.add_frame(time_s, faps)
+        while video.step():
+            end = round(video.duration_s * MEDIA_RATE_HZ)
+            video.add_sound(num_sent, sound[num_sent:end])
             num_sent = min(end, len(sound))
-            on_progress(min(1.0, recording.duration_s / max(frames[-1][0], 1e-9)))
-        recording.add_sound(num_sent, sound[num_sent:])
+            on_progress(min(1.0, video.duration_s / max(frames[-1][0], 1e-9)))
+        video.add_sound(num_sent, sound[num_sent:])
     except BaseException:
-        recording.discard()
+        video.discard()
         raise
-    recording.close()
-    return recording.num_images
+    video.close()
+    return video.num_images
 
 
 def render_picture(
-    frames: list[Frame],
+    frames: list[TimedFaps],
     path: Path,
-    renderer: Renderer | SideBySide,
+    renderer: Renderer | SideBySideRenderer,
     at_s: float,
-    captions: Captions | None,
+    captions: CaptionDrawer | None,
 ) -> None:
     """Write the picture (PNG) at a time, with captions below it.
 

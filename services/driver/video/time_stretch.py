@@ -1,4 +1,4 @@
-"""Plays sound slower without changing its pitch, by FFmpeg's filter atempo."""
+"""Slows sound down without changing its pitch, with FFmpeg's filter atempo."""
 
 from fractions import Fraction
 
@@ -11,10 +11,10 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 Float32 = NDArray[np.float32]
 _MIN_TEMPO = 0.5  # minimum tempo of one filter
 _EARLY_S = 0.02  # atempo's output is this much earlier than its input
-_MIN_SAMPLES = 4096  # atempo returns nothing for less
+_MIN_SAMPLES = 4096  # atempo returns nothing for fewer samples
 
 
-def stretch(samples: Float32, speed: float) -> Float32:
+def stretch_time(samples: Float32, speed: float) -> Float32:
     """Return sound (n,), 16 kHz, at a speed of 0.25 to 1: (round(n / speed),)."""
     if speed == 1.0:
         return samples

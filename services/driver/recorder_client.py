@@ -1,4 +1,4 @@
-"""The videos of recorded sessions. A separate process draws and writes them."""
+"""Sends the frames and sound of recorded sessions to the process that writes their videos."""
 
 import contextlib
 import math
@@ -12,7 +12,7 @@ from typing import Any
 
 from kouxing.services.driver import recorder
 from kouxing.services.driver.config import DriverConfig
-from kouxing.services.driver.video.writer import remove_unfinished
+from kouxing.services.driver.video.video_writer import remove_unfinished
 from kouxing.shared.keys import MAX_KEY_SHARE
 
 MAX_QUEUED = 100_000  # unread commands
@@ -29,7 +29,7 @@ _SPAWN = multiprocessing.get_context("spawn")
 
 
 class _RecorderProcess:
-    """The process, and a thread that sends its commands, so that the driver never blocks."""
+    """The recorder's process. A thread sends its commands, so the driver never blocks."""
 
     def __init__(self, config: DriverConfig) -> None:
         self.connection, child_end = _SPAWN.Pipe()
@@ -51,7 +51,7 @@ class _RecorderProcess:
         self.commands.put(None)  # ends the thread
 
 
-class Recordings:
+class RecorderClient:
     """Passes each session's frames and sound to its video.
 
     ``on_written`` receives the session and its video's path. ``on_failed`` receives the session and

@@ -1,4 +1,4 @@
-"""Writes files of Rhubarb Lip Sync (TSV, XML or JSON), which say when each mouth is drawn.
+"""Formats files of Rhubarb Lip Sync (TSV, XML or JSON), which list when each mouth is drawn.
 
 Source: README of Rhubarb Lip Sync, "Output formats". Times have two decimals, and the end of the
 recording is truncated to them. A cue ends where the next one starts. The last line of a TSV is the
@@ -28,7 +28,7 @@ _Span: TypeAlias = tuple[str, str, str]  # start, end, and the mouth between the
 class CueKind:
     """A set of mouths, one of which is shown at a time."""
 
-    cues_of: Callable[[Frames], Iterator[Cue]]
+    find_cues: Callable[[Frames], Iterator[Cue]]
     rest: str
 
 
@@ -38,7 +38,7 @@ CUE_KINDS = {
 }
 
 
-def write_cues(
+def format_cues(
     suffix: str, cues: Iterable[Cue], rest: str, end_s: float, source: Path | None
 ) -> str:
     """Return the cues of a recording as a file, for a suffix in ``CUE_FORMATS``.
@@ -60,12 +60,12 @@ def write_cues(
     return CUE_FORMATS[suffix](spans or [("0.00", f"{end:.2f}", rest)], rest, source)
 
 
-def _tsv(spans: Sequence[_Span], rest: str, _: Path | None) -> str:
+def _format_tsv(spans: Sequence[_Span], rest: str, _: Path | None) -> str:
     lines = [f"{start}\t{mouth}\n" for start, _, mouth in spans]
     return "".join(lines) + f"{spans[-1][1]}\t{rest}\n"
 
 
-def _xml(spans: Sequence[_Span], _: str, source: Path | None) -> str:
+def _format_xml(spans: Sequence[_Span], _: str, source: Path | None) -> str:
     cues = "".join(
         f'    <mouthCue start="{start}" end="{end}">{mouth}</mouthCue>\n'
         for start, end, mouth in spans
@@ -78,7 +78,7 @@ def _xml(spans: Sequence[_Span], _: str, source: Path | None) -> str:
     )
 
 
-def _json(spans: Sequence[_Span], _: str, source: Path | None) -> str:
+def _format_json(spans: Sequence[_Span], _: str, source: Path | None) -> str:
     cues = ",\n".join(
         f'    {{ "start": {start}, "end": {end}, "value": "{mouth}" }}'
         for start, end, mouth in spans
@@ -95,7 +95,7 @@ def _name(source: Path | None) -> str:
 
 
 CUE_FORMATS: dict[str, Callable[[Sequence[_Span], str, Path | None], str]] = {
-    ".tsv": _tsv,
-    ".xml": _xml,
-    ".json": _json,
+    ".tsv": _format_tsv,
+    ".xml": _format_xml,
+    ".json": _format_json,
 }

@@ -1,4 +1,4 @@
-"""Normals of a surface whose vertices move."""
+"""Computes the normals of a surface whose vertices move."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class NormalUpdater:
-    """Normals of a deformable surface."""
+    """Updates the normals of a deformable surface where its vertices move."""
 
     rest: Float32  # (V, 3), normals of the neutral face
     triangles: NDArray[np.uint32]  # triangles that the basis deforms
@@ -29,7 +29,7 @@ class NormalUpdater:
         basis: sparse.csr_array,
         welds: NDArray[np.int64] | None = None,
     ) -> NormalUpdater:
-        """Find the parts of a ``Head`` that deform.
+        """Find the vertices of a ``Head`` whose normals change.
 
         ``welds`` (V,) is the vertex that shares its normal with each vertex, because several
         vertices have one position at texture seams. By default no normals are shared.
@@ -63,7 +63,7 @@ class NormalUpdater:
 
 
 def _cross(a: Float32, b: Float32) -> Float32:
-    """Cross products by columns; numpy's own function is several times slower on thin arrays."""
+    """Return cross products by columns. numpy's own function takes several times as long."""
     out = np.empty_like(a)
     out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]

@@ -1,4 +1,4 @@
-"""The newest pose of each followed session, and the choice of the session to show."""
+"""Keeps the newest pose of each followed session, and chooses the session to show."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,9 @@ class _Pose:
 
 
 class PoseStore:
-    """The newest FAPs of each session; shows the newest session, a named one, or the user's choice.
+    """Keeps the newest FAPs of each session, and chooses the session to show.
+
+        The shown session is the user's choice, a configured session, or the newest session.
 
     The user's choice is valid until that session closes, or until the user returns to the default.
     """
@@ -83,7 +85,7 @@ class PoseStore:
         return pose is not None and not pose.has_ended and now_s - pose.updated_s > STALL_S
 
     def faps(self, now_s: float) -> Faps:
-        """Return the FAPs (68,) to show; without new frames the face fades to rest.
+        """Return the FAPs (68,) to show. Without new frames, the face fades to rest.
 
         Times must not decrease.
         """

@@ -1,4 +1,4 @@
-"""Exporters of a face's curves: FAPs or blendshapes of every frame.
+"""Exports the curves of a face: FAPs or blendshapes of every frame.
 
 To add a format, write a subclass of ``CurveExporter`` and add its suffix to ``CURVE_EXPORTERS``.
 ``kouxing render`` and ``kouxing listen`` then write it. ``curve_reader`` reads tables.
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from kouxing.services.cli.cues import CUE_FORMATS, CUE_KINDS, write_cues
+from kouxing.services.cli.cue_files import CUE_FORMATS, CUE_KINDS, format_cues
 from kouxing.services.cli.options import CurveFormat, ExportOptions
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
@@ -37,16 +37,16 @@ if TYPE_CHECKING:
     from kouxing.services.cli.animation import FaceMotion
 
 Values = NDArray[np.float32]
-Row = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
+FrameRow = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
 _SHAPE_FORMS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
 _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
 
 
 @dataclass(frozen=True, slots=True)
-class Curves:
+class FrameStream:
     """The frames of a face, written as they arrive."""
 
-    rows: Iterable[Row]
+    rows: Iterable[FrameRow]
     frame_rate_hz: float | None = None  # None: estimated from the times of the frames
     phones: Sequence[Phone] | None = None  # spoken phones by onset; tables get a column for them
     source: Path | None = None  # recording
@@ -85,11 +85,11 @@ class CurveExporter(ABC):
         rows = ((time_s, number, faps) for number, (time_s, faps) in enumerate(motion.frames))
         duration_s = None if motion.samples is None else len(motion.samples) / MEDIA_RATE_HZ
         return self.write(
-            Curves(rows, motion.frame_rate_hz, motion.phones, motion.source, duration_s)
+            FrameStream(rows, motion.frame_rate_hz, motion.phones, motion.source, duration_s)
         )
 
     @abstractmethod
-    def write(self, curves: Curves) -> int:
+    def write(self, curves: FrameStream) -> int:
         """Write frames as they arrive and return their number.
 
         Raises ``UserError`` if the file cannot be written.
@@ -101,7 +101,7 @@ class CsvExporter(CurveExporter):
 
     forms = tuple(form for form in CurveFormat if form is not CurveFormat.RHUBARB)
 
-    def write(self, curves: Curves) -> int:
+    def write(self, curves: FrameStream) -> int:
         """Write each frame when it arrives."""
         if self._form is CurveFormat.LIVELINK:
             columns = _LIVE_LINK_COLUMNS
@@ -118,7 +118,7 @@ class JsonLinesExporter(CurveExporter):
 
     forms = (CurveFormat.FAPS, *_SHAPE_FORMS)
 
-    def write(self, curves: Curves) -> int:
+    def write(self, curves: FrameStream) -> int:
         """Write each frame when it arrives."""
         lines = (json_line(row, self._form, curves.phones) for row in curves.rows)
         return _write_lines(self._output, lines, curves)
@@ -129,7 +129,7 @@ class FapExporter(CurveExporter):
 
     forms = (CurveFormat.FAPS,)
 
-    def write(self, curves: Curves) -> int:
+    def write(self, curves: FrameStream) -> int:
         """Write the frames when the last one has arrived."""
         frames, frame_rate_hz = list(curves.rows), curves.frame_rate_hz
         if frame_rate_hz is None:
@@ -147,7 +147,7 @@ class GlbExporter(CurveExporter):
     options = CurveExporter.options | {"head"}
     forms = (CurveFormat.FAPS, CurveFormat.ARKIT)
 
-    def write(self, curves: Curves) -> int:
+    def write(self, curves: FrameStream) -> int:
         """Write the frames when the last one has arrived."""
         from kouxing.services.driver.head.glb_export import export_glb  # noqa: PLC0415 - slow
         from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
@@ -163,14 +163,14 @@ class CueExporter(CurveExporter):
 
     forms = tuple(CUE_KINDS)
 
-    def write(self, curves: Curves) -> int:
+    def write(self, curves: FrameStream) -> int:
         """Write the cues when the last frame has arrived."""
         kind = CUE_KINDS[self._form]
         frames = [(time_s, faps) for time_s, _, faps in curves.rows]
         end_s = curves.duration_s or (frames[-1][0] if frames else 0.0)
-        cues = kind.cues_of(frames)
+        cues = kind.find_cues(frames)
         suffix = self._output.suffix.lower()
-        text = write_cues(suffix, cues, kind.rest, end_s, curves.source)
+        text = format_cues(suffix, cues, kind.rest, end_s, curves.source)
         write_text(self._output, text)
         return len(frames)
 
@@ -184,7 +184,7 @@ CURVE_EXPORTERS: dict[str, type[CurveExporter]] = {
 }
 
 
-def json_line(row: Row, form: CurveFormat, phones: Sequence[Phone] | None = None) -> str:
+def json_line(row: FrameRow, form: CurveFormat, phones: Sequence[Phone] | None = None) -> str:
     """Return a JSON object for a frame: FAPs in the order of their numbers, or named shapes."""
     time_s, number, faps = row
     is_faps = form is CurveFormat.FAPS
@@ -202,13 +202,13 @@ def phone_at(phones: Sequence[Phone], time_s: float) -> str:
     return phones[index].symbol
 
 
-def _cells(row: Row, form: CurveFormat, phones: Sequence[Phone] | None) -> list[str]:
+def _cells(row: FrameRow, form: CurveFormat, phones: Sequence[Phone] | None) -> list[str]:
     time_s, _, faps = row
     cells = [f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, form))]
     return cells if phones is None else [*cells, phone_at(phones, time_s)]
 
 
-def _live_link_cells(row: Row) -> list[str]:
+def _live_link_cells(row: FrameRow) -> list[str]:
     time_s, _, faps = row
     face = FaceFrame(faps, time_s)
     weights = face.weights(CurveFormat.ARKIT)
@@ -233,7 +233,7 @@ _LIVE_LINK_COLUMNS = [
 ]
 
 
-def _write_lines(output: Path, lines: Iterable[str], curves: Curves) -> int:
+def _write_lines(output: Path, lines: Iterable[str], curves: FrameStream) -> int:
     """Write each line when it arrives; return their number. An error leaves only live frames."""
     count = 0
     guard = nullcontext() if curves.is_live else delete_on_error(output)

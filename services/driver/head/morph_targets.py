@@ -1,4 +1,4 @@
-"""The morph targets of an exported head: FAPs, shapes of ARKit, expressions of VRM."""
+"""The morph targets of an exported head: FAPs, ARKit's shapes and VRM's expressions."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ _MIN_SHIFT_M = 1.5e-4
 EMOTIONS = {"happy": "joy", "angry": "anger", "sad": "sadness", "surprised": "surprise"}
 
 
-class Morph(NamedTuple):
+class MorphTarget(NamedTuple):
     """A morph target to export."""
 
     name: str
@@ -31,19 +31,21 @@ def units_per_weight(fapu: str) -> float:
     return _ANGLE_UNITS_PER_WEIGHT if fapu == "AU" else FAP_UNITS_PER_FAPU
 
 
-def _of_faps() -> tuple[Morph, ...]:
+def _build_fap_morphs() -> tuple[MorphTarget, ...]:
     units = np.array([units_per_weight(fap.fapu) for fap in FAPS], np.float32)
     rows = np.eye(NUM_FAPS, dtype=np.float32) * units
     return tuple(
-        Morph(fap.name, row, _MIN_FAP_SHIFT_M, turns_eyes=False)
+        MorphTarget(fap.name, row, _MIN_FAP_SHIFT_M, turns_eyes=False)
         for fap, row in zip(FAPS, rows, strict=True)
     )
 
 
-FAP_MORPHS = _of_faps()
-ARKIT_MORPHS = tuple(Morph(name, faps) for name, faps in zip(ARKIT.names, ARKIT.basis, strict=True))
+FAP_MORPHS = _build_fap_morphs()
+ARKIT_MORPHS = tuple(
+    MorphTarget(name, faps) for name, faps in zip(ARKIT.names, ARKIT.basis, strict=True)
+)
 AVATAR_MORPHS = (
-    *(Morph(name, faps) for name, faps in zip(VRM.names, VRM.basis, strict=True)),
-    *(Morph(new, EXPRESSIONS[EXPRESSION_NAMES.index(old)]) for new, old in EMOTIONS.items()),
+    *(MorphTarget(name, faps) for name, faps in zip(VRM.names, VRM.basis, strict=True)),
+    *(MorphTarget(new, EXPRESSIONS[EXPRESSION_NAMES.index(old)]) for new, old in EMOTIONS.items()),
     *ARKIT_MORPHS,
 )

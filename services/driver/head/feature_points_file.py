@@ -1,4 +1,4 @@
-"""Reads the positions of MPEG-4 feature points on a mesh.
+"""Reads files with the positions of MPEG-4 feature points on a mesh.
 
 Two formats are accepted. Text files have lines ``point x y z``, in the mesh's own axes and unit, or
 ``point vertex``, counted from 0 in file order; ``#`` starts a comment. XfaceEd's ``.fdp`` files
@@ -22,14 +22,14 @@ from kouxing.shared.user_file import read_file
 MAX_BYTES = 4 * 1024 * 1024
 # ISO/IEC 14496-2, annex C: number of points per group
 _GROUP_SIZES = {2: 14, 3: 14, 4: 6, 5: 4, 6: 4, 7: 1, 8: 10, 9: 15, 10: 10, 11: 6}
-_LENGTHS = ("MNS", "MW", "ENS", "ES", "IRISD")
+_FAPU_LENGTHS = ("MNS", "MW", "ENS", "ES", "IRISD")
 
 Position = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class FeaturePoints:
-    """The contents of a file."""
+    """The contents of a file of feature points."""
 
     positions: dict[str, Position | tuple[str, int]]
     """coordinates (3,), or mesh name (may be empty) and vertex"""
@@ -43,20 +43,20 @@ def read_points(path: Path) -> FeaturePoints:
     possible.
     """
     text = read_file(path, MAX_BYTES).decode("utf-8-sig", "replace")
-    points = _from_xml(path, text) if text.lstrip().startswith("<") else _from_lines(path, text)
+    points = _parse_xml(path, text) if text.lstrip().startswith("<") else _parse_lines(path, text)
     if not points.positions:
         raise UserError(f"{path} has no feature points; write lines such as '2.1 0.0 -0.07 0.07'")
     return points
 
 
-def _from_lines(path: Path, text: str) -> FeaturePoints:
+def _parse_lines(path: Path, text: str) -> FeaturePoints:
     positions: dict[str, Position | tuple[str, int]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.partition("#")[0].split()
         if not words or (number == 1 and not words[0][0].isdigit()):
             continue  # empty line, or column names
         where = f"{path}, line {number}"
-        name = _known(words[0], where, positions)
+        name = _check_name(words[0], where, positions)
         try:
             values = [float(word) for word in words[1:]]
         except ValueError:
@@ -70,7 +70,7 @@ def _from_lines(path: Path, text: str) -> FeaturePoints:
     return FeaturePoints(positions)
 
 
-def _from_xml(path: Path, text: str) -> FeaturePoints:
+def _parse_xml(path: Path, text: str) -> FeaturePoints:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"{path}: .fdp files must not have a document type; remove it")
     try:
@@ -82,7 +82,7 @@ def _from_xml(path: Path, text: str) -> FeaturePoints:
         if "name" not in entry.attrib:
             continue
         where = f"{path}, <fdp name={entry.attrib['name']!r}>"
-        name = _known(entry.attrib["name"], where, positions)
+        name = _check_name(entry.attrib["name"], where, positions)
         try:
             number = int(entry.attrib["index"])
         except (KeyError, ValueError):
@@ -94,7 +94,7 @@ def _from_xml(path: Path, text: str) -> FeaturePoints:
         positions[name] = (entry.attrib.get("affects", ""), number)
     fapu = {}
     for entry in root.iter("fapu"):
-        for name in _LENGTHS:
+        for name in _FAPU_LENGTHS:
             try:
                 length = float(entry.attrib.get(f"{name}0", "nan"))
             except ValueError:
@@ -104,7 +104,7 @@ def _from_xml(path: Path, text: str) -> FeaturePoints:
     return FeaturePoints(positions, fapu)
 
 
-def _known(name: str, where: str, positions: dict[str, Position | tuple[str, int]]) -> str:
+def _check_name(name: str, where: str, positions: dict[str, Position | tuple[str, int]]) -> str:
     match = re.fullmatch(r"(\d+)\.(\d+)", name)
     if not match or not 1 <= int(match[2]) <= _GROUP_SIZES.get(int(match[1]), 0):
         raise UserError(f"{where}: {name!r} is not an MPEG-4 feature point, such as 2.1")

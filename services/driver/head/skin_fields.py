@@ -11,20 +11,20 @@ A field is the displacement by one FAP unit, m. FAPs of missing points have no e
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.driver.head.pieces import Fields
-from kouxing.services.driver.head.surface import Float, Geodesics, Index, smoothest
+from kouxing.services.driver.head.mesh_pieces import FapFields
+from kouxing.services.driver.head.surface import Float, Geodesics, Index, smoothest_fields
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS
 
-INNER = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
-OUTER = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")
+INNER_LIPS = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
+OUTER_LIPS = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")
 LOWER_LIP = ("2.3", "2.8", "2.9", "8.2", "8.7", "8.8")
 UPPER_LIP = ("2.2", "2.6", "2.7", "8.1", "8.5", "8.6")
-AXES = {
+DIRECTION_AXES = {
     "down": (1, -1.0), "up": (1, 1.0), "left": (0, 1.0), "right": (0, -1.0), "forward": (2, 1.0),
 }  # fmt: skip
 CORNER_SLOPE = 0.37  # slope of the lip curve near the corners, seen from above
 _LID_SLOPE = 0.15  # a closing lid moves forward around the eyeball
-_HINGE = 1.34  # distance from the chin back to the jaw's axis, eye distances
+_HINGE_DISTANCE = 1.34  # distance from the chin back to the jaw's axis, eye distances
 # FAP, feature point, radius that moves as a whole, and reach, in eye distances
 _ZONES = (
     (18, "2.10", 0.04, 0.47), (39, "5.1", 0.18, 0.72), (40, "5.2", 0.18, 0.72),
@@ -33,17 +33,17 @@ _ZONES = (
     (65, "10.1", 0.11, 0.58), (66, "10.2", 0.11, 0.58), (67, "10.3", 0.11, 0.58),
     (68, "10.4", 0.11, 0.58),
 )  # fmt: skip
-_FACE = (
-    *INNER, *OUTER, "2.1", "3.3", "3.4", "3.7", "3.8", "3.11", "3.12", "9.1", "9.2", "9.3", "9.4",
-    "9.5", "9.15",
+_FACE_POINTS = (
+    *INNER_LIPS, *OUTER_LIPS, "2.1", "3.3", "3.4", "3.7", "3.8", "3.11", "3.12", "9.1", "9.2",
+    "9.3", "9.4", "9.5", "9.15",
 )  # fmt: skip
 
 
 class SkinFields:
-    """The fields of a skin with vertices (V, 3), m, and triangles (F, 3).
+    """The displacement fields of a skin with vertices (V, 3), m, and triangles (F, 3).
 
-    ``points`` are the vertices of feature points, at least those in ``INNER`` and ``OUTER``, 2.1
-    and 2.10; ``eyes`` are the centers of the left and right eye (2, 3), m.
+    ``points`` are the vertices of feature points, at least those in ``INNER_LIPS`` and
+    ``OUTER_LIPS``, 2.1 and 2.10; ``eyes`` are the centers of the left and right eye (2, 3), m.
     """
 
     def __init__(
@@ -54,25 +54,25 @@ class SkinFields:
         eyes: Float,
         fapu: dict[str, float],
     ) -> None:
-        self.fields: Fields = {}
+        self.fields: FapFields = {}
         self._vertices, self._triangles = vertices, triangles
         self._points, self._eyes, self._fapu = points, eyes, fapu
         self._unit = fapu["ES"]
         self._geodesics = Geodesics(vertices, triangles)
-        self._mouth()
-        self._jaw()
-        self._lids()
-        self._brows()
-        self._zones()
+        self._add_mouth_fields()
+        self._add_jaw_fields()
+        self._add_lid_fields()
+        self._add_brow_fields()
+        self._add_zone_fields()
 
-    def jaw_fields(self, vertices: Float) -> Fields:
+    def jaw_fields(self, vertices: Float) -> FapFields:
         """Return the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
         lever = self._jaw_share(vertices[:, 2])
         full_weight = np.ones(len(vertices))
         moved = {3: lever, 14: full_weight, 15: lever}
         return {fap: self._axis_field(fap, weight) for fap, weight in moved.items()}
 
-    def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> Fields:
+    def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> FapFields:
         """Return the fields (R, 3) of a tongue, ``rows`` (R,) of a mesh, without the jaw's motion.
 
         ``tip`` and ``body`` are the vertices of the points 6.1 and, if known, 6.2.
@@ -101,19 +101,19 @@ class SkinFields:
     def _axis_field(self, fap: int, weight: Float) -> Float:
         """Return a field (V, 3) along the axis of a FAP."""
         entry = FAPS[fap - 1]
-        axis, sign = AXES[entry.direction]
+        axis, sign = DIRECTION_AXES[entry.direction]
         field = np.zeros((len(weight), 3))
         field[:, axis] = sign * weight * self._fapu[entry.fapu] / FAP_UNITS_PER_FAPU
         return field
 
-    def _add(self, fap: int, weight: Float) -> None:
+    def _add_field(self, fap: int, weight: Float) -> None:
         self.fields[fap] = self._axis_field(fap, weight)
 
-    def _smoothest(self, points: Index, fixed: NDArray[np.bool_]) -> Float:
+    def _smoothest_fields(self, points: Index, fixed: NDArray[np.bool_]) -> Float:
         held = np.setdiff1d(np.flatnonzero(fixed), points)
-        return smoothest(self._vertices, self._triangles, points, held)
+        return smoothest_fields(self._vertices, self._triangles, points, held)
 
-    def _mouth(self) -> None:
+    def _add_mouth_fields(self) -> None:
         x, y, z = self._vertices.T
         unit, width = self._unit, self._fapu["MW"]
         lips = self._point("2.2")
@@ -122,35 +122,35 @@ class SkinFields:
         nose = (
             y > self._point("8.1")[1] + 0.75 * (lips[1] + self._fapu["MNS"] - self._point("8.1")[1])
         ) & (np.abs(x - lips[0]) < 0.6 * width)
-        far = self._distance(*INNER, *OUTER) > 0.72 * width
+        far = self._distance(*INNER_LIPS, *OUTER_LIPS) > 0.72 * width
         fixed = far | nose | (y < self._point("2.10")[1]) | self._behind
-        names = INNER + OUTER
+        names = INNER_LIPS + OUTER_LIPS
         self._lip_y = dict(
-            zip(names, self._smoothest(self._points_named(*names), fixed).T, strict=True)
+            zip(names, self._smoothest_fields(self._points_named(*names), fixed).T, strict=True)
         )
         for fap in FAPS[2:]:
             if fap.direction in ("up", "down") and set(fap.feature_points) & set(names):
-                self._add(fap.number, self._lip_y[fap.feature_points[0]])
+                self._add_field(fap.number, self._lip_y[fap.feature_points[0]])
         # points halfway to a corner move half as far, so that a narrow mouth keeps its shape
         corners = ("2.4", "2.5", "8.3", "8.4")
         between = ("2.6", "2.8", "2.7", "2.9", "8.5", "8.7", "8.6", "8.8")
         middles = ("2.2", "2.3", "8.1", "8.2")
-        single = self._smoothest(self._points_named(*corners, *between, *middles), fixed)
+        single = self._smoothest_fields(self._points_named(*corners, *between, *middles), fixed)
         self._lip_x = {}
         for row, (fap_x, name) in enumerate(zip((6, 7, 53, 54), corners, strict=True)):
             half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
             self._lip_x[name] = single[:, row] + 0.45 * half
-            self._add(fap_x, self._lip_x[name])
+            self._add_field(fap_x, self._lip_x[name])
             # a corner slides along the curve of the lips: outward motion is also backward
             self.fields[fap_x][:, 2] = (
                 -CORNER_SLOPE * self._lip_x[name] * width / FAP_UNITS_PER_FAPU
             )
-        pushed = self._smoothest(self._points_named("2.3", "2.2", *corners), fixed)[:, :2]
+        pushed = self._smoothest_fields(self._points_named("2.3", "2.2", *corners), fixed)[:, :2]
         self._lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
-        self._add(16, self._lip_z["2.3"])
-        self._add(17, self._lip_z["2.2"])
+        self._add_field(16, self._lip_z["2.3"])
+        self._add_field(17, self._lip_z["2.2"])
 
-    def _jaw(self) -> None:
+    def _add_jaw_fields(self) -> None:
         _, y, z = self._vertices.T
         unit, lips, chin = self._unit, self._point("2.2"), self._point("2.1")
         inside = self._behind & (y > chin[1] + 0.1 * unit)
@@ -174,15 +174,17 @@ class SkinFields:
             left = motion / motion[self._points["2.1"]]
             for name, field in taken_out.items():
                 left = left - left[self._points[name]] * field
-            self._add(fap, left)
+            self._add_field(fap, left)
 
     def _jaw_share(self, z: Float) -> Float:
         """Return how far a depth follows the jaw rotation, 1 at the chin."""
         chin = self._point("2.1")[2]
-        lever: Float = np.maximum(z - chin + _HINGE * self._unit, 0) / (_HINGE * self._unit)
+        lever: Float = np.maximum(z - chin + _HINGE_DISTANCE * self._unit, 0) / (
+            _HINGE_DISTANCE * self._unit
+        )
         return lever
 
-    def _lids(self) -> None:
+    def _add_lid_fields(self) -> None:
         for upper, lower, corners, faps in (
             ("3.1", "3.3", ("3.7", "3.11"), (19, 21)),
             ("3.2", "3.4", ("3.8", "3.12"), (20, 22)),
@@ -192,13 +194,13 @@ class SkinFields:
                 still = self._points_named(*corners)
                 far = self._distance(*names) > 0.45 * self._unit
                 points = np.concatenate([self._points_named(*names), still])
-                weights = self._smoothest(points, far)
+                weights = self._smoothest_fields(points, far)
                 for name, weight in zip(names, weights.T, strict=False):
                     fap = faps[0] if name == upper else faps[1]
-                    self._add(fap, weight)
+                    self._add_field(fap, weight)
                     self.fields[fap][:, 2] = np.abs(self.fields[fap][:, 1]) * _LID_SLOPE
 
-    def _brows(self) -> None:
+    def _add_brow_fields(self) -> None:
         eyes, y = self._eyes.mean(axis=0)[1], self._vertices[:, 1]
         faps = {"4.1": 31, "4.2": 32, "4.3": 33, "4.4": 34, "4.5": 35, "4.6": 36}
         names = [name for name in faps if name in self._points]
@@ -207,26 +209,26 @@ class SkinFields:
         fixed = (y < eyes + 0.17 * self._unit) | (y > eyes + 1.13 * self._unit)
         fixed |= self._distance(*names) > 0.9 * self._unit
         for name, weight in zip(
-            names, self._smoothest(self._points_named(*names), fixed).T, strict=True
+            names, self._smoothest_fields(self._points_named(*names), fixed).T, strict=True
         ):
-            self._add(faps[name], weight)
+            self._add_field(faps[name], weight)
         if {"4.1", "4.2"} <= set(names):
             ends = self._points_named("4.1", "4.2", "4.5", "4.6")
-            squeezed = self._smoothest(ends, fixed)
-            self._add(37, squeezed[:, 0])
-            self._add(38, squeezed[:, 1])
+            squeezed = self._smoothest_fields(ends, fixed)
+            self._add_field(37, squeezed[:, 0])
+            self._add_field(38, squeezed[:, 1])
 
-    def _zones(self) -> None:
+    def _add_zone_fields(self) -> None:
         for fap, name, core, reach in _ZONES:
             if name in self._points:
                 # a zone ends at the other points of the face
-                others = [other for other in _FACE if other != name]
+                others = [other for other in _FACE_POINTS if other != name]
                 near = self._geodesics.distance(self._points_named(name))
                 fixed = np.union1d(
                     np.flatnonzero(near > reach * self._unit), self._points_named(*others)
                 )
                 moving = np.setdiff1d(np.flatnonzero(near <= core * self._unit), fixed)
                 moving = np.union1d(moving, self._points_named(name))
-                self._add(fap, self._geodesics.zone(moving, np.setdiff1d(fixed, moving)))
+                self._add_field(fap, self._geodesics.zone(moving, np.setdiff1d(fixed, moving)))
                 if name in ("5.1", "5.2"):  # a puffed cheek also moves forward
                     self.fields[fap][:, 2] = 0.5 * np.abs(self.fields[fap][:, 0])

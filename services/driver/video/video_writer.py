@@ -42,7 +42,7 @@ Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".webp")
-_NUMBER = re.compile(r"%0?\d?d")  # in the file name of a picture sequence
+_NUMBER_FIELD = re.compile(r"%0?\d?d")  # in the file name of a picture sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def open_writer(
 def check_name(path: Path) -> None:
     """Raise ``UserError`` if a path is not a valid output in an existing folder."""
     if path.suffix not in _FORMATS and (
-        not is_sequence(path) or len(_NUMBER.findall(path.name)) > 1
+        not is_sequence(path) or len(_NUMBER_FIELD.findall(path.name)) > 1
     ):
         raise UserError(
             f"{path}: use a name that ends in {', '.join(VIDEO_SUFFIXES)}, a folder,"
@@ -120,9 +120,9 @@ def check_name(path: Path) -> None:
 
 
 def is_sequence(path: Path) -> bool:
-    """Return whether a path means one picture per frame."""
+    """Return whether a path names a sequence of pictures, one per frame."""
     if path.suffix == ".png":
-        return _NUMBER.search(path.name) is not None
+        return _NUMBER_FIELD.search(path.name) is not None
     return path.is_dir() or not path.suffix
 
 
@@ -130,13 +130,15 @@ def picture_name(path: Path, number: int) -> Path:
     """Return the file of a picture in a sequence: a folder, or a name such as ``face%05d.png``."""
     if path.suffix != ".png":
         path /= "%05d.png"
-    return path.with_name(_NUMBER.sub(lambda match: match[0] % number, path.name, count=1))
+    return path.with_name(_NUMBER_FIELD.sub(lambda match: match[0] % number, path.name, count=1))
 
 
 def existing_pictures(path: Path) -> list[Path]:
     """Return the existing files of a sequence, in the order of their names."""
     first = picture_name(path, 0)
-    before, after = _NUMBER.split(path.name if path.suffix == ".png" else "%05d.png", maxsplit=1)
+    before, after = _NUMBER_FIELD.split(
+        path.name if path.suffix == ".png" else "%05d.png", maxsplit=1
+    )
     name = re.compile(f"{re.escape(before)} *([0-9]+){re.escape(after)}")
     files = sorted(first.parent.iterdir()) if first.parent.is_dir() else []
     matches = [(file, match) for file in files if (match := name.fullmatch(file.name))]

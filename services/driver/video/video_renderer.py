@@ -1,7 +1,7 @@
-"""The video of one session, written while its FAP frames and sound arrive.
+"""Renders the video of one session while its FAP frames and sound arrive.
 
-Images are interpolated between FAP frames by media time, at the video's own rate. The video is in
-sync at any rates and with late frames.
+Images are interpolated between FAP frames by media time, at the video's own rate, so the video is
+in sync at any rates, and with late frames.
 """
 
 from collections import deque
@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.driver.render.captions import Captions
+from kouxing.services.driver.render.captions import CaptionDrawer
 from kouxing.services.driver.render.renderer import Renderer
-from kouxing.services.driver.render.side_by_side import SideBySide
-from kouxing.services.driver.video.writer import open_writer
+from kouxing.services.driver.render.side_by_side import SideBySideRenderer
+from kouxing.services.driver.video.video_writer import open_writer
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
@@ -21,8 +21,10 @@ MAX_SILENCE_S = 600.0  # longest gap in the sound that is filled with silence
 Faps = NDArray[np.float32]
 
 
-class Recording:
-    """Writes images and sound to a video; the file appears when it is closed.
+class VideoRenderer:
+    """Renders FAP frames to images, and writes them and the sound to a video.
+
+        The file appears when the video is closed.
 
     A renderer with a transparent background makes a transparent video. Unless ``overwrite`` is set,
     ``close`` adds a number to the name of an existing file.
@@ -34,12 +36,12 @@ class Recording:
     def __init__(
         self,
         path: Path,
-        renderer: Renderer | SideBySide,
+        renderer: Renderer | SideBySideRenderer,
         frame_rate_hz: float,
         *,
         sound: bool = True,
         overwrite: bool = True,
-        captions: Captions | None = None,
+        captions: CaptionDrawer | None = None,
     ) -> None:
         self.path = path
         self.num_images = 0
@@ -67,7 +69,7 @@ class Recording:
         return len(self._frames)
 
     def add_frame(self, time_s: float, faps: Faps) -> None:
-        """Add a FAP frame; times do not decrease."""
+        """Add a FAP frame. Times must not decrease."""
         if not self._frames or time_s > self._frames[-1][0]:
             self._frames.append((time_s, faps))
 
@@ -117,7 +119,7 @@ class Recording:
 
 
 def interpolate(before: tuple[float, Faps], after: tuple[float, Faps], time_s: float) -> Faps:
-    """Interpolate the FAPs between two frames; outside, return the FAPs of the nearer frame."""
+    """Interpolate the FAPs between two frames. Outside, return the FAPs of the nearer frame."""
     (start_s, start), (end_s, end) = before, after
     if end_s <= start_s:
         return start

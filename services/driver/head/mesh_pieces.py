@@ -1,4 +1,4 @@
-"""The pieces of a mesh, and how they become the parts of a head."""
+"""Pieces of a mesh, and their conversion to the parts of a head."""
 
 import re
 from dataclasses import dataclass, field
@@ -16,12 +16,12 @@ _WHITE = np.full((2, 2, 3), 255, np.uint8)
 _NODES = ("kouxing", "body", "head")  # nodes of an exported GLB that are not parts
 _MAX_NAME_LENGTH = 60
 
-Fields = dict[int, Float64]  # FAP: displacements (V, 3) by one unit, m
+FapFields = dict[int, Float64]  # FAP: displacements (V, 3) by one unit, m
 
 
 @dataclass(slots=True)
-class Primitive:
-    """A primitive in scene axes."""
+class MeshPiece:
+    """A part of a mesh with one material (a glTF primitive), in scene axes."""
 
     name: str
     vertices: Float64
@@ -55,7 +55,7 @@ def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
     return welded
 
 
-def part_names(pieces: list[Primitive]) -> list[str]:
+def part_names(pieces: list[MeshPiece]) -> list[str]:
     """Return a unique name for each part; eyeballs get the names that the package uses."""
     names: list[str] = []
     taken, last = set(_NODES), dict[str, int]()
@@ -75,16 +75,16 @@ def part_names(pieces: list[Primitive]) -> list[str]:
     return names
 
 
-def pack(
-    pieces: list[Primitive],
+def pack_head(
+    pieces: list[MeshPiece],
     *,
-    fields: list[Fields],
+    fields: list[FapFields],
     head_weight: Float64,
     fapu: dict[str, float],
     feature_points: dict[str, int],
     eye_centers: Float64,
 ) -> dict[str, NDArray[Any]]:
-    """Convert pieces (in the head's axes, m) to the arrays of a head file, see ``head.assemble``.
+    """Convert pieces, in the head's axes, m, to the arrays of a head file (``assemble_head``).
 
     ``fields`` has the fields of each piece. For the other parameters, see ``Head``.
     """
