@@ -69,8 +69,8 @@ class ReliableSender:
             return 0
         self._progress_s = now_s
         oldest = list(islice(self.unacknowledged, MAX_RESENT))
-        for message in oldest:
-            self._socket.send(message)
+        for begin in range(0, len(oldest), MAX_TOGETHER):
+            self._socket.send(batch_messages(oldest[begin : begin + MAX_TOGETHER]))
         return len(oldest)
 
 

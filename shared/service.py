@@ -40,7 +40,7 @@ from kouxing.shared.wire.control import (
     EventName,
     Heartbeat,
     HeartbeatReply,
-    SessionInput,
+    SessionProgress,
 )
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, SessionFacts
@@ -133,7 +133,7 @@ class Service(MessageLoop):
             Error: self.on_error,
         }
 
-    def session_inputs(self) -> dict[str, SessionInput]:
+    def session_progress(self) -> dict[str, SessionProgress]:
         """Return the input progress of each session."""
         return {}
 
@@ -312,7 +312,7 @@ class Service(MessageLoop):
     def _send_heartbeat(self, *, all_sessions: bool = False) -> None:
         now_s = time.monotonic()
         self._sent_ns = now_ns()
-        sessions, load = self.session_inputs(), self.load_meter.load(now_s)
+        sessions, load = self.session_progress(), self.load_meter.load(now_s)
         is_idle = not sessions or self.kind.role != "worker"
         self._heartbeat_due_s = now_s + (IDLE_HEARTBEAT_S if is_idle else HEARTBEAT_S)
         parent_process.send_pulse(is_idle=is_idle)
@@ -344,7 +344,7 @@ class Service(MessageLoop):
             )
         )
 
-    def _next_sessions(self, sessions: dict[str, SessionInput]) -> dict[str, SessionInput]:
+    def _next_sessions(self, sessions: dict[str, SessionProgress]) -> dict[str, SessionProgress]:
         """Return the sessions for the next heartbeat, only some of them if a worker has many."""
         if self.kind.role != "worker" or len(sessions) <= SESSIONS_PER_HEARTBEAT:
             return sessions

@@ -34,7 +34,7 @@ class ServiceFollower(Follower):
             session_start.session,
             handlers.keys(),
             self._handle,
-            live=session_start.paced,
+            live=session_start.opening.paced,
             on_complete=lambda: service.session_started(self.session_start),
             on_new_epoch=on_new_epoch,
         )

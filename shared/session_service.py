@@ -45,10 +45,10 @@ class SessionService(Service):
                 SessionStarted(session=start.session, request=start.request, start=start)
             )
 
-    def session_started(self, start: StartSession, media_time: int = 0) -> None:
+    def session_started(self, start: StartSession, final_until: int = 0) -> None:
         """Report that this service serves a session, whose phones are final up to a media time."""
         self.send_to_control(
-            SessionStarted(session=start.session, request=start.request, media_time=media_time)
+            SessionStarted(session=start.session, request=start.request, final_until=final_until)
         )
 
     def report_skipped(self, session: str, skipped_s: float) -> None:

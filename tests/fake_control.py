@@ -27,7 +27,7 @@ from kouxing.shared.wire.session import (
     StatusRequest,
 )
 from kouxing.shared.wire.speech import Acknowledge
-from tests.samples import START
+from tests.samples import START, with_opening
 from tests.system import LIMIT_S, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -222,16 +222,15 @@ class FakeControl:
     def _start_message(
         self, session: str, *, epoch: int = EPOCH, record: bool = False
     ) -> StartSession:
+        face = FaceSettings(lip_model="dynamic-visemes")
         return replace(
-            START,
+            with_opening(START, record=record, face=face),
             session=session,
             epoch=epoch,
             request=f"start-{session}-{epoch}",
             token=TOKEN,
-            record=record,
             facts=FACTS,
             endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
-            face=FaceSettings(lip_model="dynamic-visemes"),
         )
 
     def _run(self) -> None:

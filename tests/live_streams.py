@@ -12,10 +12,10 @@ from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.session import SessionFacts
 from tests.samples import START as START_AT_16_KHZ
+from tests.samples import with_opening
 
 START = replace(
-    START_AT_16_KHZ,
-    sample_rate_hz=8000,
+    with_opening(START_AT_16_KHZ, sample_rate_hz=8000),
     facts=SessionFacts(language="mandarin", delay_ms=0.0),
 )
 RULE = OutputRuleConfig()

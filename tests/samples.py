@@ -2,15 +2,17 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from kouxing.shared.face.faps import MASK_BYTES
+from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import VERSION, Message
-from kouxing.shared.wire.session import SessionFacts
+from kouxing.shared.wire.session import OpenSession, SessionFacts
 
 FILE = Path(__file__).parents[1] / "proto" / "golden" / f"version{VERSION}.json"
 STORED = json.loads(FILE.read_text(encoding="utf-8"))
@@ -19,9 +21,14 @@ SAMPLES: dict[str, Message] = {
 }
 
 START = StartSession(
-    session="s", epoch=1, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
-    num_channels=1, record=False, paced=True, facts=SessionFacts(language="mandarin"), endpoints={},
+    session="s", epoch=1, request="r", token="t", opening=OpenSession(request="r"),
+    facts=SessionFacts(language="mandarin"), endpoints={},
 )  # fmt: skip
+
+
+def with_opening(start: StartSession, **fields: Any) -> StartSession:
+    """Return a start message whose client requested something else."""
+    return replace(start, opening=replace(start.opening, **fields))
 
 
 def fap_frame(session: str, number: int, values: bytes, epoch: int = 1) -> FapFrame:

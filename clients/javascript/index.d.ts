@@ -9,7 +9,7 @@ export interface SessionMessage {
   session: string | null;
   chosen: string;
   epoch: number;
-  lips: string;
+  lip_model: string;
   acoustic: string;
   sample: boolean;
 }
@@ -46,7 +46,8 @@ export interface ViewerHandlers {
   end?(message: { media_time: MediaTime }): void;
   error?(message: { code: string; text: string }): void;
   status?(message: { missing: string[] }): void;
-  lips?(message: { lips: string }): void;
+  /** The lip model of the session changed. */
+  face?(message: { lip_model: string }): void;
   /** The acoustic model of the session changed: "full" or "light". */
   acoustic?(message: { acoustic: string }): void;
 }
@@ -62,7 +63,7 @@ export class Viewer {
   readonly ready: Promise<void>;
   /** Show another session; "" for the newest. */
   follow(session: string): void;
-  /** Send a command of GATEWAY.md, such as { express: { joy: 0.5 } }. */
+  /** Send a command of GATEWAY.md, such as { expressions: { joy: 0.5 } }. */
   send(command: object): void;
   close(): void;
 }

@@ -83,7 +83,7 @@ export class Speaker {
   /** End the audio. The promise is resolved when all is spoken and the session is closed. */
   async finish() {
     this.#checkOpen();
-    this.#socket.send(JSON.stringify({ eof: 1 }));
+    this.#socket.send(JSON.stringify({ last: true }));
     await this.#closed;
   }
 

@@ -3,7 +3,7 @@
 import { ViewerSocket } from "./page/viewer-socket.js";
 
 const EVENTS = [
-  "session", "phone", "syllable", "speech", "end", "error", "status", "lips", "acoustic",
+  "session", "phone", "syllable", "speech", "end", "error", "status", "face", "acoustic",
 ];
 
 /**
@@ -57,7 +57,7 @@ export class Viewer {
     this.#socket.follow(session);
   }
 
-  /** Send a command, such as { express: { joy: 0.5 } }. */
+  /** Send a command, such as { expressions: { joy: 0.5 } }. */
   send(command) {
     this.#socket.send(command);
   }

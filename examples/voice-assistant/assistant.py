@@ -86,7 +86,7 @@ async def converse(face, lines):
         speaking = asyncio.create_task(speak(face, answer(line)))
     if speaking is not None:
         await speaking
-    await face.send_json({"eof": 1})
+    await face.send_json({"last": True})
 
 
 async def main(gateway):

@@ -299,7 +299,7 @@ class ControlService(Service):
                 continue  # the new worker is starting
             if record is None or not self._sessions.is_participant(record, heartbeat.instance):
                 self._commands.send(CloseSession(session=name), to=sender)
-            elif self._sessions.record_input(record, heartbeat) > self._idle_limit_s:
+            elif self._sessions.record_progress(record, heartbeat) > self._idle_limit_s:
                 self._lifecycle.end(record, f"no audio for {self._idle_limit_s:g} s")
 
     def _on_session_started(self, started: SessionStarted, instance: str) -> None:
@@ -311,7 +311,7 @@ class ControlService(Service):
                 text = f"{instance} may not report this session"
                 self.warn("no-takeover", text, started.session)
         elif record is not None and started.request == record.start_request:
-            deferred = self._sessions.record_started(record, instance, started.media_time)
+            deferred = self._sessions.record_started(record, instance, started.final_until)
             self._lifecycle.send_start(record, deferred)
             self._lifecycle.announce_if_started(record)
 

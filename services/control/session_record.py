@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from kouxing.services.control.placement import UNPACED_AUDIO
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import CurrentFace
@@ -42,7 +43,7 @@ class SessionRecord:
     speech_time: int = 0  # media time at which the newest speech started
     next_sequence: int = 1  # first audio message that a replacement recognizer would need
     resume_sequence: int | None = None  # first message to resend; None: same recognizer
-    media_time: int = 0  # phones are final up to this media time
+    final_until: int = 0  # media time up to which the phones are final
     lateness: Lateness | None = None  # lateness of the session's frames in the last 10 s
     skipped_s: dict[str, float] = field(default_factory=dict)  # by instance
 
@@ -74,20 +75,13 @@ class SessionRecord:
             epoch=self.epoch,
             request=self.start_request,
             token=self.token,
-            encoding=self.opening.encoding,
-            sample_rate_hz=self.opening.sample_rate_hz,
-            num_channels=self.opening.num_channels,
-            record=self.opening.record,
-            paced=self.opening.paced,
+            opening=replace(self.opening, face=self.face.at(now_s)),
             facts=self.facts,
             endpoints=self.endpoints,
-            face=self.face.at(now_s),
-            mouth_profile=self.opening.mouth_profile,
+            final_until=self.final_until,
+            speech_time=self.speech_time if self.speaking else None,
             client=self.client.address,
             client_key=self.client.key or None,
-            client_request=self.opening.request or None,
-            media_time=self.media_time,
-            speech_time=self.speech_time if self.speaking else None,
         )
 
     def opened_message(self, events: str) -> SessionOpened:

@@ -169,29 +169,20 @@ class SessionTable:
             name=start.session,
             number=next(self._numbers),
             token=start.token,
-            opening=OpenSession(
-                session=start.session,
-                request=start.client_request or "",
-                encoding=start.encoding,
-                sample_rate_hz=start.sample_rate_hz,
-                num_channels=start.num_channels,
-                record=start.record,
-                paced=start.paced,
-                mouth_profile=start.mouth_profile,
-            ),
+            opening=start.opening,
             client=Peer(start.client, start.client_key or ""),
             opened_s=now_s,
             started_s=now_s,
             workers=workers,
             endpoints=start.endpoints,
             facts=start.facts,
-            face=CurrentFace(start.face, now_s),
+            face=CurrentFace(start.opening.face, now_s),
             waiting_for=running,
             lost={*workers.values()} - running,
             epoch=start.epoch,
             announced=True,
             restored=True,
-            media_time=start.media_time,
+            final_until=start.final_until,
         )
         self._add(record, now_s)
         return record
@@ -206,23 +197,23 @@ class SessionTable:
 
     # --- reports of services -------------------------------------------------------------------
 
-    def record_input(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
+    def record_progress(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
         """Record a service's progress in a session; return the time without input."""
         state = heartbeat.sessions[record.name]
-        record.media_time = max(record.media_time, state.media_time)
+        record.final_until = max(record.final_until, state.final_until)
         if state.skipped_s:
             record.skipped_s[heartbeat.instance] = state.skipped_s
         if heartbeat.instance == record.workers["faps"]:
             record.lateness = state.lateness
         if heartbeat.instance != record.workers["audio"]:
             return 0.0
-        record.next_sequence = max(record.next_sequence, state.sequence + 1)
+        record.next_sequence = max(record.next_sequence, state.last_droppable_sequence + 1)
         return state.idle_s
 
-    def record_started(self, record: SessionRecord, instance: str, media_time: int) -> set[str]:
+    def record_started(self, record: SessionRecord, instance: str, final_until: int) -> set[str]:
         """Record that a service serves a session; return deferred services to notify now."""
         record.waiting_for.discard(instance)
-        record.media_time = max(record.media_time, media_time)
+        record.final_until = max(record.final_until, final_until)
         if record.missing_workers > record.deferred:
             return set()
         deferred, record.deferred = record.deferred, set()

@@ -28,7 +28,7 @@ from kouxing.shared.message_loop import Handler
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.control import EventName, SessionInput, StartSession
+from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, ErrorCode
@@ -84,23 +84,23 @@ class DriverService(SessionService):
         if session is not None and session.follower.session_start.token != start.token:
             self._unfollow(session)  # a different session with the same name
             session = None
-        if session is None and not start.record and not self.view.is_live:
+        if session is None and not start.opening.record and not self.view.is_live:
             return True
         if session is None:
             key = start.client_key or ""
-            if start.record and (reason := self.recorder.rejection_reason(key)):
+            if start.opening.record and (reason := self.recorder.rejection_reason(key)):
                 self._reject_session(start, reason)
                 return False
             handlers: dict[type[Message], Callable[[Any], None]] = {
                 FapFrame: self._on_frame,
                 EndOfFaps: self._on_end,
             }
-            if start.record:
+            if start.opening.record:
                 handlers[Sound] = self._on_sound
             session = _FollowedSession(ServiceFollower(self, start, handlers))
             self._sessions[start.session] = session
             self.poses.add(start.session, time.monotonic())
-            if start.record:
+            if start.opening.record:
                 self.recorder.begin(start.session, key)
         session.follower.session_start = start
         session.follower.follow()
@@ -154,9 +154,9 @@ class DriverService(SessionService):
         self.recorder.close()
         self.view.close()
 
-    def session_inputs(self) -> dict[str, SessionInput]:
+    def session_progress(self) -> dict[str, SessionProgress]:
         """Return the followed sessions; control answers which of them no longer exist."""
-        return dict.fromkeys(self._sessions, SessionInput())
+        return dict.fromkeys(self._sessions, SessionProgress())
 
     # --- sessions ------------------------------------------------------------------------------
 

@@ -48,9 +48,9 @@ class AudioSession:
         """Interrupt: drop audio whose face is not shown yet."""
         await self._session.flush()
 
-    async def set_lip_model(self, lip_model: str) -> None:
-        """Change the lip model."""
-        await self._session.set_face(lip_model=lip_model)
+    async def set_face(self, **settings: object) -> None:
+        """Change settings of the face."""
+        await self._session.set_face(**settings)  # type: ignore[arg-type]
 
     def take_errors(self) -> list[Refused]:
         """Return the recognizer's errors since the last call.

@@ -8,21 +8,13 @@ import base64
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 
 from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, RATES_HZ, PcmFormat, check_text
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.expressions import (
-    DEFAULT_HOLD_S,
-    MAX_EXPRESSIVENESS,
-    MIN_EXPRESSIVENESS,
-    check_amount,
-    check_expressions,
-)
-from kouxing.shared.face.lip_constants import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
-from kouxing.shared.name_rules import is_name
+from kouxing.shared.face.expressions import DEFAULT_HOLD_S, check_expressions
+from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.speech import AcousticModelName
@@ -36,6 +28,9 @@ REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at
 
 MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
+# What a browser can change; the query of its address selects shapes.
+FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
+_RENAMED = {"lips": "lip_model", "express": "expressions", "eof": "last"}  # since version 0.1.0
 
 
 def binary(message_type: int, epoch: int, media_time: int, payload: bytes) -> bytes:
@@ -105,9 +100,9 @@ class MicrophoneCommand:
     """A command between the chunks of a browser's microphone."""
 
     flush: bool  # interrupt: drop audio whose face is not shown yet
-    eof: bool  # no more audio follows
+    last: bool  # no more audio follows
     num_skipped: int  # samples per channel that the client skipped
-    lip_model: str  # the new lip model; empty: no change
+    face: dict[str, object]  # settings to change
 
 
 def parse_command(message: str, pcm_format: PcmFormat | None = None) -> MicrophoneCommand:
@@ -124,53 +119,33 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
     num_skipped = fields.get("skip", 0)
     if type(num_skipped) is not int or not 0 <= num_skipped <= MAX_SKIPPED:
         raise UserError(f"skip must be an integer from 0 to {MAX_SKIPPED}")
+    face = parse_face_settings(fields)
     return MicrophoneCommand(
         flush=bool(fields.get("flush")),
-        eof=bool(fields.get("eof")),
+        last=bool(fields.get("last")),
         num_skipped=num_skipped,
-        lip_model=_parse_lip_model(fields),
+        face={name: getattr(face, name) for name in FACE_SETTINGS} if face else {},
     )
 
 
-def _parse_lip_model(fields: Mapping[str, object]) -> str:
-    lip_model = fields.get("lips", "")
-    if not isinstance(lip_model, str) or (lip_model and not LIP_MODEL_NAME.fullmatch(lip_model)):
-        raise UserError("lips must be the name of a lip model")
-    return lip_model
-
-
 def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
-    """Return the face settings of a viewer's command; None if it contains none.
+    """Return the face settings of a command; None if it contains none.
 
-    Raises ``UserError`` if a name is unknown or a number is out of range.
+    Raises ``UserError`` if a name is unknown or a value is out of range.
     """
-    expressions, hold_s = fields.get("express"), fields.get("hold_s", DEFAULT_HOLD_S)
-    settings: dict[str, Any] = {}
-    if lip_model := _parse_lip_model(fields):
-        settings["lip_model"] = lip_model
-    if expressions is not None:
-        if not isinstance(expressions, dict):
-            raise UserError("express must be an object that maps names to strengths")
-        check_expressions(expressions, hold_s)
-        settings.update(expressions=expressions, hold_s=hold_s)
-    if (acoustic := fields.get("acoustic")) is not None:
-        if acoustic not in [*AcousticModelName]:
-            raise UserError("acoustic must be full or light")
-        settings["acoustic"] = acoustic
-    limits = {"expressiveness": (MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS), "feeling": (0.0, 1.0)}
-    for name, (lowest, highest) in limits.items():
-        if (amount := fields.get(name)) is not None:
-            settings[name] = check_amount(name, amount, lowest, highest)
-    for name in ("still", "eye_contact", "listening"):
-        if (value := fields.get(name)) is not None:
-            if not isinstance(value, bool):
-                raise UserError(f"{name} must be true or false")
-            settings[name] = value
-    if (listen_to := fields.get("listen_to")) is not None:
-        if not isinstance(listen_to, str) or (listen_to and not is_name(listen_to)):
-            raise UserError("listen_to must be the name of a session, or empty")
-        settings["listen_to"] = listen_to
-    return FaceSettings(**settings) if settings else None
+    for name, new_name in _RENAMED.items():
+        if name in fields:
+            raise UserError(f"{name!r} is now called {new_name!r}")
+    given = {name: fields[name] for name in FACE_SETTINGS if fields.get(name) is not None}
+    if isinstance(expressions := given.get("expressions"), dict):
+        check_expressions(expressions, given.get("hold_s", DEFAULT_HOLD_S))
+    try:
+        settings = msgspec.convert(given, FaceSettings)
+    except msgspec.ValidationError as error:
+        raise UserError(str(error)) from None
+    if settings.acoustic not in (None, *AcousticModelName):
+        raise UserError("acoustic must be full or light")
+    return settings if given.keys() - {"hold_s"} else None
 
 
 def parse_object(message: str | bytes) -> dict[str, object]:

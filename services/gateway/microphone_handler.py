@@ -100,9 +100,9 @@ class MicrophoneHandler:
                 session.skip(command.num_skipped)
                 if command.flush:
                     await audio_input.flush()
-                if command.lip_model:
-                    await session.set_lip_model(command.lip_model)
-                if command.eof:
+                if command.face:
+                    await session.set_face(**command.face)
+                if command.last:
                     await audio_input.end()
             for error in session.take_errors():
                 await browser.send_str(error_text(error))

@@ -73,7 +73,7 @@ class SampleSentence:
                     break
                 if lip_model != self.lip_model:
                     lip_model = self.lip_model
-                    await session.set_lip_model(lip_model)
+                    await session.set_face(lip_model=lip_model)
                 session.send((block * 32767).astype("<i2").tobytes(), len(block))
                 due_s += len(block) / source.sample_rate_hz
                 await asyncio.sleep(due_s - loop.time())

@@ -33,7 +33,6 @@ from kouxing.services.gateway.whip_handler import WhipHandler
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
-from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
@@ -42,7 +41,7 @@ from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.control import SessionInput, StartSession
+from kouxing.shared.wire.control import SessionProgress, StartSession
 from kouxing.shared.wire.events import message_to_phone
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
@@ -200,7 +199,7 @@ class GatewayService(SessionService):
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)
         session.follower.session_start = start
-        self._viewers.add_session(start.session, start.epoch, start.face.lip_model or "")
+        self._viewers.add_session(start.session, start.epoch, start.opening.face.lip_model or "")
         is_needed = start.session in self._needed_sessions() or self._audio_client.num_opening
         if session.follower.is_following or is_needed:
             session.follower.follow()
@@ -238,13 +237,13 @@ class GatewayService(SessionService):
         session = self._sessions.get(message.session)
         if session is not None and message.face.lip_model is not None:
             start = session.follower.session_start
-            face = start.face.merged_with(message.face)
-            session.follower.session_start = replace(start, face=face)
+            face = start.opening.face.merged_with(message.face)
+            session.follower.session_start = start.with_face(face)
             self._viewers.set_lip_model(message.session, message.face.lip_model)
 
-    def session_inputs(self) -> dict[str, SessionInput]:
+    def session_progress(self) -> dict[str, SessionProgress]:
         """Return the subscribed sessions, so that control can report ended ones."""
-        return dict.fromkeys(self._sessions, SessionInput())
+        return dict.fromkeys(self._sessions, SessionProgress())
 
     def on_tick(self, now_s: float) -> float:
         """Follow sessions, move the face at rest, and request the status of the services."""
@@ -314,7 +313,9 @@ class GatewayService(SessionService):
         """Restart a session for its viewers. It continues in a new epoch."""
         session.syllables.reset()
         start = session.follower.session_start
-        self._viewers.add_session(start.session, session.follower.epoch, start.face.lip_model or "")
+        self._viewers.add_session(
+            start.session, session.follower.epoch, start.opening.face.lip_model or ""
+        )
 
     def _on_frame(self, frame: FapFrame) -> None:
         now_s = time.monotonic()

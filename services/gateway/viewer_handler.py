@@ -85,7 +85,9 @@ class ViewerHandler:
         """Announce that the lip model of a session has changed."""
         if session in self._sessions:
             self._sessions[session].lip_model = lip_model
-            self.forward(session, MessageKind.TEXT, browser_messages.text("lips", lips=lip_model))
+            self.forward(
+                session, MessageKind.TEXT, browser_messages.text("face", lip_model=lip_model)
+            )
 
     def set_acoustic(self, session: str, model: str) -> None:
         """Announce the acoustic model of a session, if it has changed."""
@@ -210,7 +212,7 @@ class ViewerHandler:
                 viewer.chosen_session = self._sample.session
             elif lip_model:
                 if not self._sample.session or viewer.chosen_session != self._sample.session:
-                    raise UserError("a viewer can choose lips only for the sample sentence")
+                    raise UserError("a viewer can set lip_model only for the sample sentence")
                 self._sample.lip_model = lip_model
             elif settings is not None:
                 if viewer.shown_session is None and settings.expressions is None:
@@ -222,11 +224,8 @@ class ViewerHandler:
                 viewer.shape_encoder = parse_avatar(command)
                 self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.header_message())
             else:
-                raise UserError(
-                    "expected 'follow' with a session's name, 'avatar', 'play', 'lips', "
-                    "'acoustic', 'express', 'expressiveness', 'feeling', 'still', 'eye_contact', "
-                    "'listen_to' or 'listening'"
-                )
+                names = ", ".join(("follow", "play", "avatar", *browser_messages.FACE_SETTINGS))
+                raise UserError(f"the message has none of these fields: {names}")
         except UserError as error:
             self._put(viewer, MessageKind.TEXT, browser_messages.error_text(str(error)))
         self._notify_viewer(viewer)
@@ -256,7 +255,7 @@ class ViewerHandler:
                 session=name if session else None,
                 chosen=viewer.chosen_session,
                 epoch=session.epoch if session else 0,
-                lips=session.lip_model if session else "",
+                lip_model=session.lip_model if session else "",
                 acoustic=session.acoustic if session else "",
                 sample=session is not None
                 and name == viewer.chosen_session == self._sample.session,

@@ -209,8 +209,8 @@ class WhipHandler:
                 command = browser_messages.parse_command(message)
                 if command.flush:
                     await session.flush()
-                if command.lip_model:
-                    await session.set_lip_model(command.lip_model)
+                if command.face:
+                    await session.set_face(**command.face)
             except (UserError, KouxingError) as error:
                 if channel.readyState == "open":
                     channel.send(error_text(error))

@@ -6,7 +6,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings
 
@@ -53,7 +52,7 @@ class PendingSessions:
     def set_face(self, session: str, face: FaceSettings) -> None:
         """Change the face of a session, if it is queued."""
         if (start := self._starts.get(session)) is not None:
-            self._starts[session] = replace(start, face=start.face.merged_with(face))
+            self._starts[session] = start.with_face(start.opening.face.merged_with(face))
 
     def take_ready(self) -> list[StartSession]:
         """Remove and return the sessions whose model is loaded."""

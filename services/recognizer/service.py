@@ -2,8 +2,8 @@
 
 Handles: audio-chunk (clients), start-session, close-session, flush-session, set-face (control),
 acknowledge (synthesizer).
-Sends: phone, lip-positions, speech, progress (synthesizer, acknowledged), the same without progress
-but with the audio itself (subscribers), speech (control), acknowledge, error (clients).
+Sends: results (synthesizer, acknowledged), phone, lip-positions, speech, acoustic, sound
+(subscribers), speech (control), acknowledge, error (clients).
 """
 
 import math
@@ -31,7 +31,6 @@ from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
 from kouxing.shared.clock import to_samples
-from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
@@ -40,7 +39,7 @@ from kouxing.shared.phones.events import Progress, Waveform
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import EventName, SessionInput, StartSession
+from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
@@ -143,7 +142,7 @@ class RecognizerService(SessionService):
         """Return the current state of the sessions, for a restarted control."""
         now_s = time.monotonic()
         for session in self._sessions.values():
-            yield replace(session.start, face=session.face.at(now_s))
+            yield session.start.with_face(session.face.at(now_s))
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
         self._pending.set_face(message.session, message.face)
@@ -160,7 +159,7 @@ class RecognizerService(SessionService):
         session = self._sessions.get(start.session)
         is_new = session is None or session.start.token != start.token
         if session is None or is_new:
-            socket = self._audio if start.paced else self._unpaced_audio
+            socket = self._audio if start.opening.paced else self._unpaced_audio
             session = RecognizerSession(
                 start,
                 self._recognizer,
@@ -191,7 +190,7 @@ class RecognizerService(SessionService):
     def flush_session(self, session: str) -> None:
         """Drop the current speech; the next audio starts a new segment."""
         if (flushed := self._sessions.get(session)) is not None:
-            if flushed.start.paced:
+            if flushed.is_paced:
                 self._live.decode_all([flushed])
             flushed.audio.clear()
             flushed.link.forget()
@@ -222,7 +221,7 @@ class RecognizerService(SessionService):
                 self.publish_event(EventName.ERROR, session.name, f"{ErrorCode.NO_LINK}: {text}")
             self.report_skipped(session.name, session.audio.skip_policy.take_report_s(now_s))
             if session.link.is_full:
-                blocked.add(session.start.paced)
+                blocked.add(session.is_paced)
         self._is_live_blocked = True in blocked or self._queued_s(paced=True) > MAX_QUEUED_S
         self._is_unpaced_blocked = False in blocked
         self.pause(self._audio, paused=self._is_live_blocked)
@@ -249,13 +248,13 @@ class RecognizerService(SessionService):
             self._finish(session)
         return all(session.link.backlog == 0 for session in sessions)
 
-    def session_inputs(self) -> dict[str, SessionInput]:
+    def session_progress(self) -> dict[str, SessionProgress]:
         """Return the input progress of each session."""
         read_s = {True: time.monotonic(), False: self._last_unpaced_read_s}  # by paced
         return {
-            name: SessionInput(
-                idle_s=max(0.0, read_s[session.start.paced] - session.last_audio_s),
-                sequence=session.replay_window.last_droppable_sequence,
+            name: SessionProgress(
+                idle_s=max(0.0, read_s[session.is_paced] - session.last_audio_s),
+                last_droppable_sequence=session.replay_window.last_droppable_sequence,
                 skipped_s=session.audio.skip_policy.skipped_s,
             )
             for name, session in self._sessions.items()
@@ -280,7 +279,7 @@ class RecognizerService(SessionService):
 
     def _on_chunk(self, session: RecognizerSession, chunk: Chunk) -> None:
         session.audio.append(chunk, time.monotonic())
-        if not session.start.paced:
+        if not session.is_paced:
             self._limit_unpaced()
 
     def _on_end(self, session: RecognizerSession) -> None:
@@ -288,7 +287,7 @@ class RecognizerService(SessionService):
             self._finish(session)
 
     def _select_sessions(self, *, paced: bool) -> list[RecognizerSession]:
-        return [one for one in self._sessions.values() if one.start.paced == paced]
+        return [one for one in self._sessions.values() if one.is_paced == paced]
 
     def _queued_s(self, *, paced: bool) -> float:
         """Duration of the paced or unpaced audio that is not decoded yet."""
@@ -297,11 +296,11 @@ class RecognizerService(SessionService):
     @property
     def _has_live_audio(self) -> bool:
         sessions = self._sessions.values()
-        return any(one.start.paced and one.can_accept for one in sessions)
+        return any(one.is_paced and one.can_accept for one in sessions)
 
     @property
     def _has_unpaced_audio(self) -> bool:
-        return any(one.audio and not one.start.paced for one in self._sessions.values())
+        return any(one.audio and not one.is_paced for one in self._sessions.values())
 
     @property
     def _is_live_waiting(self) -> bool:
@@ -329,7 +328,7 @@ class RecognizerService(SessionService):
             self._send_results(session)
             self.metrics.count("audio_gaps", session.stream.num_gaps - session.num_gaps_counted)
             session.num_gaps_counted = session.stream.num_gaps
-            if session.start.paced:
+            if session.is_paced:
                 self.metrics.observe("chunk_ms", 1e3 * (time.monotonic() - session.accepted_s))
             if session.end is not None and not session.is_decoding:
                 self._finish(session)

@@ -72,34 +72,36 @@ class RecognizerSession:
         self.start = start
         self.replay = ReplayingPublisher(publisher, now_s)
         self.first_epoch = start.epoch
-        self.face = CurrentFace(start.face, now_s)
+        opening = start.opening
+        self.is_paced = opening.paced
+        self.face = CurrentFace(opening.face, now_s)
         self.socket = socket
         self.mouth_profile_error = ""  # why the profile is not used; empty once reported
-        if start.mouth_profile is not None:
+        if opening.mouth_profile is not None:
             try:
                 if lip_predictor is None:
                     raise UserError("this recognizer runs without a lip predictor")
-                lip_predictor = lip_predictor.with_mouth_profile(start.mouth_profile)
+                lip_predictor = lip_predictor.with_mouth_profile(opening.mouth_profile)
             except UserError as error:
                 self.mouth_profile_error = f"the mouth profile is not used: {error}"
         face_delay_s = (start.facts.delay_ms or 0.0) / 1e3
         self.stream = recognizer.create_stream(
-            sample_rate_hz=start.sample_rate_hz,
-            num_channels=start.num_channels,
+            sample_rate_hz=opening.sample_rate_hz,
+            num_channels=opening.num_channels,
             lip_predictor=lip_predictor,
             face_delay_s=face_delay_s,
             speech_time=start.speech_time or 0,
             language=start.facts.language,
         )
         self.resume_filter: ResumeFilter | None = None  # after a lost recognizer
-        if start.media_time:
+        if start.final_until:
             silence = recognizer.model.inventory.silence
-            self.resume_filter = ResumeFilter(to_seconds(start.media_time), silence)
+            self.resume_filter = ResumeFilter(to_seconds(start.final_until), silence)
         skip_policy = SkipPolicy(
-            max_lag_s if start.paced else math.inf,
+            max_lag_s if opening.paced else math.inf,
             now_s + CATCH_UP_S if start.epoch > 1 else now_s,
         )
-        self.audio = AudioQueue(start.sample_rate_hz, skip_policy)  # not decoded yet
+        self.audio = AudioQueue(opening.sample_rate_hz, skip_policy)  # not decoded yet
         self.waits_for_network = False  # waits for the block network's thread
         self.is_scoring = False  # on the block network's thread
         self.accepted_s = now_s  # when the stream last took audio, except during scoring
@@ -118,8 +120,8 @@ class RecognizerSession:
         self.is_laughing = False  # whether the speaker laughs
         self._published_acoustic = AcousticModelName.FULL
         self._sound_packets = SoundPackets(face_delay_s)
-        is_checked = start.encoding == "s16le" and start.epoch <= 1
-        self._encoding = EncodingCheck(start.num_channels) if is_checked else None
+        is_checked = opening.encoding == "s16le" and start.epoch <= 1
+        self._encoding = EncodingCheck(opening.num_channels) if is_checked else None
         self.output_sequence = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
@@ -183,17 +185,16 @@ class RecognizerSession:
 
         Raises ``AudioRejected`` if the audio is not valid, or too early.
         """
-        rate_hz, media_time = self.start.sample_rate_hz, chunk.media_time
+        opening, media_time = self.start.opening, chunk.media_time
+        rate_hz = opening.sample_rate_hz
         try:
-            samples = decode_pcm(chunk.pcm, self.start.encoding, self.start.num_channels)
+            samples = decode_pcm(chunk.pcm, opening.encoding, opening.num_channels)
             if self._encoding is not None:
                 self._encoding.check(chunk.pcm)
         except (BadAudio, UserError) as error:
             raise AudioRejected(ErrorCode.BAD_AUDIO, str(error)) from None
         duration_s = len(samples) / rate_hz
-        if self.start.paced and not self._lead_limit.allows(
-            to_seconds(media_time), duration_s, now_s
-        ):
+        if self.is_paced and not self._lead_limit.allows(to_seconds(media_time), duration_s, now_s):
             text = (
                 f"the audio is more than {MAX_LEAD_S:g} s ahead of the clock; to send faster than "
                 "real time, open the session with paced = false"
@@ -239,19 +240,19 @@ class RecognizerSession:
     def check_stalled(self, tick_s: float, now_s: float) -> None:
         """Count time in which no audio arrived; report a live client that has now stalled."""
         before_s, self.silent_s = self.silent_s, self.silent_s + tick_s
-        is_live = self.start.paced and not self.is_finished
+        is_live = self.is_paced and not self.is_finished
         if is_live and before_s <= STALLED_AFTER_S < self.silent_s:
             self._report(AudioState.STALLED, now_s)
 
     def on_new_audio(self, now_s: float) -> None:
         """Record that audio arrived; the face must not return to rest until it is processed."""
-        if self.start.paced and self.silent_s > STALLED_AFTER_S:
+        if self.is_paced and self.silent_s > STALLED_AFTER_S:
             self._report(AudioState.RESUMED, now_s)
             self.audio.skip_policy.resume()
         self.last_audio_s, self.silent_s = now_s, 0.0
 
     def _report(self, state: AudioState, now_s: float) -> None:
-        media_time = max(self.stream.media_time, self.start.media_time)
+        media_time = max(self.stream.media_time, self.start.final_until)
         self.link.send(Progress(media_time=media_time, state=state), now_s)
 
     def request_acknowledgement(self, now_s: float, *, at_once: bool) -> None:

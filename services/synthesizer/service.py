@@ -1,7 +1,6 @@
 """The synthesizer service: receives phones and lip frames, sends FAP frames.
 
-Handles: results, phone, lip-positions, speech, progress (recognizer), start-session, close-session,
-flush-session, set-face (control).
+Handles: results (recognizer), start-session, close-session, flush-session, set-face (control).
 Sends: fap-frame, end-of-faps (subscribers), acknowledge (recognizer).
 
 Processed audio, not the wall clock, drives the frames. Load, or audio faster than real time,
@@ -42,9 +41,8 @@ from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.session_service import SessionService
-from kouxing.shared.wire.control import EventName, SessionInput, StartSession
+from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.events import (
-    SPEECH_MESSAGES,
     SpeechMessage,
     is_state_report,
     message_to_event,
@@ -93,9 +91,7 @@ class SynthesizerService(SessionService):
             "faps": config.advertised_endpoint(self._faps.endpoint),
         }
         load_lip_model(name=config.lips)  # so that the first session does not wait
-        handlers: dict[type[Message], Handler] = dict.fromkeys(SPEECH_MESSAGES, self._on_input)
-        handlers[Results] = self._on_results
-        self.register(self._input, handlers)
+        self.register(self._input, {Results: self._on_results})
         self.register(self._faps, {})
 
     def control_handlers(self) -> dict[type[Message], Handler]:
@@ -106,7 +102,7 @@ class SynthesizerService(SessionService):
         """Create a face at rest. A session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
-            settings = self._known_settings(start.session, start.face)
+            settings = self._known_settings(start.session, start.opening.face)
             face = self._new_face(start, settings)
             session = SynthesizerSession(
                 start, face, self._input, self._faps, self._config.max_lag_s
@@ -192,7 +188,7 @@ class SynthesizerService(SessionService):
             return math.inf
         if now_s >= self._last_check_s + CHECK_INTERVAL_S:
             self._last_check_s = now_s
-            live = [name for name, session in self._sessions.items() if session.start.paced]
+            live = [name for name, session in self._sessions.items() if session.is_paced]
             self._faps.disconnect_stalled((FapFrame,), live)
             for session in self._sessions.values():
                 session.lateness.measure(now_s)
@@ -200,7 +196,7 @@ class SynthesizerService(SessionService):
         for name, session in self._sessions.items():
             due_s = min(due_s, session.receiver.tick(now_s))
             self.report_skipped(name, session.skip_policy.take_report_s(now_s))
-            if session.start.paced and not session.is_finished and not session.events:
+            if session.is_paced and not session.is_finished and not session.events:
                 self._relax(session, now_s)
                 due_s = min(due_s, session.relax_at_s + 1.0 / self.frame_rate_hz)
         busy = [session for session in self._sessions.values() if session.events]
@@ -212,11 +208,11 @@ class SynthesizerService(SessionService):
                 break
         return now_s if busy else due_s
 
-    def session_inputs(self) -> dict[str, SessionInput]:
+    def session_progress(self) -> dict[str, SessionProgress]:
         """Return each session's progress: end of its final phones, lateness and skipped time."""
         return {
-            name: SessionInput(
-                media_time=to_samples(session.final_time.time_s),
+            name: SessionProgress(
+                final_until=to_samples(session.final_time.time_s),
                 lateness=session.lateness.newest,
                 skipped_s=session.skip_policy.skipped_s,
             )
@@ -327,7 +323,7 @@ class SynthesizerService(SessionService):
             duration_s = max(0.0, event.time_s - session.newest_event_s)
             session.skip_policy.add(duration_s, now_s, has_waiting=len(session.events) > 1)
             session.newest_event_s = max(session.newest_event_s, event.time_s)
-        if session.start.paced and session.skip_policy.is_late(now_s, for_s=MAX_LATE_FOR_S):
+        if session.is_paced and session.skip_policy.is_late(now_s, for_s=MAX_LATE_FOR_S):
             return  # newer events may have arrived
         if len(session.events) == 1:
             self._make_frames(session)
@@ -335,7 +331,7 @@ class SynthesizerService(SessionService):
     def _make_frames(self, session: SynthesizerSession) -> None:
         """Publish the frames of queued events, up to ``MAX_BURST_S``."""
         num_left = max(1, round(MAX_BURST_S * self.frame_rate_hz))
-        if session.start.paced:
+        if session.is_paced:
             session.skip_if_behind(time.monotonic())
         while session.events:
             event = session.events[0]
@@ -344,7 +340,7 @@ class SynthesizerService(SessionService):
             started_s = time.perf_counter()
             frames = list(itertools.islice(session.pending_frames, num_left))
             self._publish(session, frames)
-            if session.start.paced and not isinstance(event, EndOfSound):
+            if session.is_paced and not isinstance(event, EndOfSound):
                 session.lateness.add((time_s for time_s, _ in frames), time.monotonic())
             if isinstance(event, events.Progress):
                 self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)

@@ -37,6 +37,7 @@ class SynthesizerSession:
         max_lag_s: float,
     ) -> None:
         self.start = start
+        self.is_paced = start.opening.paced
         self.replay = ReplayingPublisher(publisher, time.monotonic())
         self.face = face
         self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledgement)

@@ -39,12 +39,5 @@ def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
         raise UserError(f"hold_s is {hold_s}; it must be from 0 to {MAX_HOLD_S:g} seconds")
 
 
-def check_amount(name: str, amount: object, lowest: float, highest: float) -> float:
-    """Return the amount of a face setting; ``UserError`` if it is out of range."""
-    if not _is_number(amount, highest, lowest):
-        raise UserError(f"{name} is {amount}; it must be from {lowest:g} to {highest:g}")
-    return float(amount)  # type: ignore[arg-type]
-
-
-def _is_number(value: object, highest: float, lowest: float = 0.0) -> bool:
-    return type(value) in (int, float) and lowest <= value <= highest  # type: ignore[operator]
+def _is_number(value: object, highest: float) -> bool:
+    return type(value) in (int, float) and 0.0 <= value <= highest  # type: ignore[operator]

@@ -1,10 +1,13 @@
 """Messages between control and the services, and the events that control publishes."""
 
+from __future__ import annotations
+
 from enum import StrEnum
 from typing import Annotated
 
 from msgspec import Meta, Struct, field
 
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import MAX_KEYS, MAX_ROLES
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import (
@@ -19,13 +22,10 @@ from kouxing.shared.wire.message import (
     Text,
 )
 from kouxing.shared.wire.session import (
-    Encoding,
     Lateness,
     MetricMap,
-    MouthProfile,
-    NumChannels,
+    OpenSession,
     Role,
-    SampleRate,
     ServiceStatus,
     SessionFacts,
 )
@@ -49,12 +49,12 @@ class EventName(StrEnum):
     SPEECH_STOP = "speech-stop"
 
 
-class SessionInput(Struct, frozen=True, kw_only=True):
-    """Progress of a service in the input of one session."""
+class SessionProgress(Struct, frozen=True, kw_only=True):
+    """Progress of a service in one session."""
 
     idle_s: Seconds = 0.0  # since the session's last input
-    sequence: Count = 0  # last audio message that a replacement recognizer does not need
-    media_time: Samples = 0  # the session's phones are final up to here
+    last_droppable_sequence: Count = 0  # newest audio that a replacement recognizer does not need
+    final_until: Samples = 0  # media time up to which the session's phones are final
     lateness: Lateness | None = None  # lateness of a synthesizer's frames; None: no live frames
     skipped_s: Seconds = 0.0  # total duration of the audio skipped by a slow service
 
@@ -78,7 +78,7 @@ class Heartbeat(Message, frozen=True, kw_only=True):
     build: Text = ""  # version of kouxing
     load: Probability = 0.0  # fraction of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)
-    sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(
+    sessions: Annotated[dict[SessionName, SessionProgress], Meta(max_length=10000)] = field(
         default_factory=dict
     )  # sessions of the service
 
@@ -103,35 +103,28 @@ class HeartbeatReply(Message, frozen=True, kw_only=True):
 
 
 class StartSession(Message, frozen=True, kw_only=True):
-    """Control asks a service to serve a session; again with a greater epoch after a move.
-
-    Phones whose middle is before ``media_time`` are already known.
-    """
+    """Control asks a service to serve a session; again with a greater epoch after a move."""
 
     request: Name
     token: Name
-    encoding: Encoding
-    sample_rate_hz: SampleRate
-    num_channels: NumChannels
-    record: bool
-    paced: bool
+    opening: OpenSession  # the client's request, with the face settings in effect now
     facts: SessionFacts
     endpoints: EndpointMap  # the session's workers: audio, phones, phone_input, faps, ...
-    face: FaceSettings = field(default_factory=FaceSettings)
-    mouth_profile: MouthProfile | None = None
+    final_until: Samples = 0  # media time before which all phones are known
     speech_time: Samples | None = None  # start of the speech in progress; None: silence, or unknown
     client: Annotated[bytes, Meta(max_length=255)] = b""  # its routing id at control
     client_key: Name | None = None  # its public key; None: the system is insecure
-    client_request: Name | None = None  # request of the client's open-session
+
+    def with_face(self, face: FaceSettings) -> StartSession:
+        """Return this message with other face settings."""
+        return replace(self, opening=replace(self.opening, face=face))
 
 
 class SessionStarted(Message, frozen=True, kw_only=True):
-    """A service serves a session.
-
-    The session's phones are final up to ``media_time``; 0 if the service has no phones.
-    """
+    """A service serves a session."""
 
     request: Name  # request of the start-session
+    final_until: Samples = 0  # synthesizer: media time up to which the session's phones are final
     start: StartSession | None = None  # for a restarted control, which does not have the session
 
 

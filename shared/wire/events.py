@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from operator import attrgetter
-from typing import TypeAlias, get_args
+from typing import TypeAlias
 
 import numpy as np
 
@@ -11,9 +11,7 @@ from kouxing.shared.phones import events
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AudioState, LipPositions, Phone, Progress, Results, Speech
 
-# From the recognizer to the synthesizer
-SpeechMessage: TypeAlias = Phone | LipPositions | Speech | Progress
-SPEECH_MESSAGES: tuple[type[SpeechMessage], ...] = get_args(SpeechMessage)
+SpeechMessage: TypeAlias = Phone | LipPositions | Speech | Progress  # the parts of `results`
 
 
 def is_state_report(message: Message) -> bool:
@@ -24,14 +22,11 @@ def is_state_report(message: Message) -> bool:
     )
 
 
-def batch_messages(messages: Sequence[Message]) -> Message:
+def batch_messages(messages: Sequence[Message]) -> Results:
     """Return one message with these messages of a session, at most ``MAX_TOGETHER``."""
-    first = messages[0]
-    if len(messages) == 1:
-        return first
     return Results(
-        session=first.session,
-        epoch=first.epoch,
+        session=messages[0].session,
+        epoch=messages[0].epoch,
         phones=[message for message in messages if isinstance(message, Phone)],
         lip_positions=[message for message in messages if isinstance(message, LipPositions)],
         speech=[message for message in messages if isinstance(message, Speech)],
@@ -40,7 +35,7 @@ def batch_messages(messages: Sequence[Message]) -> Message:
 
 
 def split_batch(results: Results) -> list[SpeechMessage]:
-    """Return the messages of a combined message in order."""
+    """Return the messages of a batch in order."""
     messages: list[SpeechMessage] = [*results.phones, *results.lip_positions]
     messages += [*results.speech, *results.progress]
     return sorted(messages, key=attrgetter("sequence"))
@@ -62,7 +57,7 @@ def event_to_message(event: events.SoundEvent) -> SpeechMessage:
             return LipPositions(
                 media_time=to_samples(event.time_s),
                 values=event.faps.astype("<f4").tobytes(),
-                delay=duration_to_samples(event.delay_s),
+                delay_samples=duration_to_samples(event.delay_s),
                 closure=event.closure,
                 lip_to_teeth=event.lip_to_teeth,
             )
@@ -106,7 +101,7 @@ def message_to_event(message: SpeechMessage) -> events.SoundEvent:
         case LipPositions():
             return events.LipPositions(
                 time_s=time_s,
-                delay_s=to_seconds(message.delay),
+                delay_s=to_seconds(message.delay_samples),
                 faps=np.frombuffer(message.values, "<f4"),
                 closure=message.closure,
                 lip_to_teeth=message.lip_to_teeth,

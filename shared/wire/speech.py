@@ -73,7 +73,7 @@ class LipPositions(Message, frozen=True, kw_only=True):
     published_at: ClassVar[str | None] = "phones"
 
     values: LipValues  # float32, little-endian, FAP units, in the order of MOUTH_FAPS
-    delay: LipDelay  # how much audio after media_time the model has used; below 0: it predicts
+    delay_samples: LipDelay  # audio after media_time that the model used; below 0: it predicts
     closure: Probability  # probability that the lips touch
     lip_to_teeth: Probability  # probability that the lower lip touches the teeth
 

@@ -15,8 +15,7 @@ from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import AllowedKey, EventName, SessionInput
-from kouxing.shared.wire.events import SPEECH_MESSAGES
+from kouxing.shared.wire.control import AllowedKey, EventName, SessionProgress
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
@@ -43,7 +42,7 @@ STRUCTURES: dict[str, type[Any]] = {
     **MESSAGES,
     "service-state": ServiceState,
     "session-state": SessionState,
-    "session-input": SessionInput,
+    "session-progress": SessionProgress,
     "allowed-key": AllowedKey,
     "face-settings": FaceSettings,
     "newest-frame": NewestFrame,
@@ -188,7 +187,7 @@ def test_the_document_has_every_answer() -> None:
     assert asked - {"joined", "request"} == from_clients | {
         "heartbeat",
         "start-session",
-        *(cls.kind for cls in (Results, *SPEECH_MESSAGES)),
+        Results.kind,
     }
     assert answers < set(MESSAGES)
     assert errors - {"request"} < {*ErrorCode}

@@ -20,7 +20,7 @@ class LipPositions(Result, frozen=True, kw_only=True):
     kind: ClassVar[str] = "lip-positions"
 
     values: Floats
-    delay: int
+    delay_samples: int
     closure: float
     lip_to_teeth: float
 

@@ -131,7 +131,7 @@ def lip_frames_of(streamed: StreamedSession) -> list[speech.LipPositions]:
         speech.LipPositions(
             media_time=lips.media_time,
             values=lips.values.tobytes(),
-            delay=lips.delay,
+            delay_samples=lips.delay_samples,
             closure=lips.closure,
             lip_to_teeth=lips.lip_to_teeth,
         )

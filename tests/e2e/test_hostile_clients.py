@@ -18,7 +18,8 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import add_key, key_folder, load_key, load_user_key, revoke_key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, SessionInput
+from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, SessionProgress
+from kouxing.shared.wire.events import batch_messages
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
@@ -74,7 +75,7 @@ def test_only_its_worker_reports_a_session_as_idle(
 ) -> None:
     with Bus(load_key("driver", ("service:driver",))) as bus:
         stranger = bus.connect_dealer(system.control)
-        idle = {witness.name: SessionInput(idle_s=1e9)}
+        idle = {witness.name: SessionProgress(idle_s=1e9)}
         stranger.send(replace(HEARTBEAT, sessions=idle))
         wait_until(lambda: "a-false-one" in instances(client))
         assert witness.name in {item.session for item in client.status().sessions}
@@ -116,9 +117,8 @@ def test_only_the_sessions_recognizer_moves_its_face(
     with Bus(load_key("driver", ("service:driver",))) as bus:
         stranger = bus.connect_dealer(endpoint)
         for number, message in enumerate(forged, start=1):
-            stranger.send(
-                replace(message, session=witness.name, epoch=1, sequence=number, media_time=123_200)
-            )
+            header = {"session": witness.name, "epoch": 1, "sequence": number}
+            stranger.send(batch_messages([replace(message, **header, media_time=123_200)]))
         witness.push(samples_of_file(DEMO / "hello-female.wav")[:16000])
         frames: list[FapFrame] = []
         wait_until(lambda: len(frames) >= 30, step=lambda: frames.extend(output.available(0.1)))

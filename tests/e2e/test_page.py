@@ -360,9 +360,9 @@ def test_settings_apply_at_once_and_to_later_sessions(
 ) -> None:
     control.received.clear()
     first = turn_on_microphone(control, page)
-    page.wait_for(f"{STATE}.lips === 'dynamic-visemes'")
+    page.wait_for(f"{STATE}.lipModel === 'dynamic-visemes'")
     choose(page, "lips", "ferguson")
-    page.wait_for(f"{STATE}.lips === 'ferguson'")
+    page.wait_for(f"{STATE}.lipModel === 'ferguson'")
     assert control.messages_of(OpenSession)[-1].language == "zh"
     choose(page, "expressiveness", 0.7)
     wait_until(lambda: len(slider_amounts(control)) == 1)
@@ -375,10 +375,10 @@ def test_settings_apply_at_once_and_to_later_sessions(
     page.open(gateway.page)
     assert page.evaluate("document.getElementById('lips').value") == "ferguson"
     second = turn_on_microphone(control, page)
-    page.wait_for(f"{STATE}.lips === 'ferguson'")
+    page.wait_for(f"{STATE}.lipModel === 'ferguson'")
     wait_until(lambda: len(slider_amounts(control)) == 2)
     choose(page, "lips", "learned")
-    page.wait_for(f"{STATE}.lips === 'learned'")
+    page.wait_for(f"{STATE}.lipModel === 'learned'")
     turn_off_microphone(page)
     assert [(name, face.lip_model) for name, face in face_changes(control) if face.lip_model] == [
         (first, "ferguson"),

@@ -24,11 +24,12 @@ from kouxing.shared.wire.message import MAX_AUDIO_BYTES
 from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
+from tests.samples import with_opening
 from tests.system import free_port, wait_until
 
-RATE_HZ = START.sample_rate_hz
+RATE_HZ = START.opening.sample_rate_hz
 PHONE_INPUT = {"phone_input": f"tcp://127.0.0.1:{free_port()}"}
-UNPACED = replace(START, paced=False, endpoints=PHONE_INPUT)
+UNPACED = replace(with_opening(START, paced=False), endpoints=PHONE_INPUT)
 
 
 class Recognizer(RecognizerService):
@@ -55,7 +56,7 @@ class Recognizer(RecognizerService):
     def warn(self, reason: str, text: str, session: str = "", level: int = 0) -> None:
         self.warned.append((reason, text))
 
-    def session_started(self, start: StartSession, media_time: int = 0) -> None:
+    def session_started(self, start: StartSession, final_until: int = 0) -> None:
         self.started.append(start.session)
 
     def send_heartbeat_if_due(self) -> None:
@@ -95,7 +96,7 @@ def chunk(number: int, num_bytes: int, session: str = "s") -> AudioChunk:
 def test_decodes_a_long_chunk_in_parts_with_heartbeats_between(
     service: Recognizer, paced: bool
 ) -> None:
-    service.start_session(replace(UNPACED, paced=paced))
+    service.start_session(with_opening(UNPACED, paced=paced))
     service.receive(chunk(0, MAX_AUDIO_BYTES))
     service.decode_all()
     steps = [after - before for before, after in pairwise(service.media_times)]
@@ -106,7 +107,7 @@ def test_decodes_a_long_chunk_in_parts_with_heartbeats_between(
 
 def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
     service.start_session(UNPACED)
-    service.start_session(replace(UNPACED, session="live", paced=True))
+    service.start_session(replace(with_opening(UNPACED, paced=True), session="live"))
     live, other = (service._sessions[name].stream for name in ("live", "s"))
     num_long, num_short = 12, 100
     with Bus() as bus:
@@ -135,7 +136,7 @@ def test_skips_audio_that_arrived_while_the_process_was_stopped(
     now_s = time.monotonic()
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
     monkeypatch.setattr(service, "resync_with_control", lambda: None)  # which does not answer
-    service.start_session(replace(UNPACED, paced=True))
+    service.start_session(with_opening(UNPACED, paced=True))
     for number in range(150):  # of 20 ms
         now_s += 0.02
         service.receive(chunk(number, 320))
@@ -147,7 +148,7 @@ def test_skips_audio_that_arrived_while_the_process_was_stopped(
     service.on_tick(now_s)
     assert service._sessions["s"].stream.next_media_time == 320 * 250
     assert service.events == [("audio-skipped", "s", "1.98 s")]
-    assert service.session_inputs()["s"].skipped_s == pytest.approx(1.98)
+    assert service.session_progress()["s"].skipped_s == pytest.approx(1.98)
 
 
 def test_other_sessions_continue_while_a_model_is_loaded(
@@ -162,7 +163,7 @@ def test_other_sessions_continue_while_a_model_is_loaded(
 
     monkeypatch.setattr(pending_sessions, "load_model_for_language", load_slowly)
     german = replace(UNPACED, session="de", facts=SessionFacts(language="german"))
-    live = replace(UNPACED, session="live", paced=True)
+    live = replace(with_opening(UNPACED, paced=True), session="live")
     for start in (live, german, replace(german, session="closed")):
         service._on_start_session(start, Peer())
     service.receive(chunk(0, 3200, "live"))

@@ -162,15 +162,15 @@ test("reduced quality and the head's rotation are described", () => {
 });
 
 test("sessions restart, end and lose their connection", () => {
-  const [session, state] = [{ session: "one", epoch: 1, sample: false, lips: "learned" }, new GatewayState()];
+  const [session, state] = [{ session: "one", epoch: 1, sample: false, lip_model: "learned" }, new GatewayState()];
   state.setConnected(false);
   assert.deepEqual([state.isRefused, state.wasConnected], [true, false], "the first connection failed");
   state.setConnected(true);
   assert.deepEqual(state.setSession(session), { isOther: true, isRestart: false });
   assert.deepEqual(state.setSession({ ...session, epoch: 2 }), { isOther: false, isRestart: true });
   assert.deepEqual(state.setSession({ ...session, session: "two" }), { isOther: true, isRestart: false });
-  state.setSession({ session: null, epoch: 0, sample: false, lips: "" });
-  assert.deepEqual([state.session, state.lips], [null, "learned"]);
+  state.setSession({ session: null, epoch: 0, sample: false, lip_model: "" });
+  assert.deepEqual([state.session, state.lipModel], [null, "learned"]);
   state.setSession(session);
   state.setConnected(false);
   assert.deepEqual([state.isRefused, state.wasConnected, state.session], [false, true, null]);

@@ -13,7 +13,7 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import add_key, load_user_key, read_key, revoke_key
 from kouxing.shared.wire.codec import encode
-from kouxing.shared.wire.control import SessionInput
+from kouxing.shared.wire.control import SessionProgress
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
 from kouxing.shared.wire.speech import Speech
@@ -148,7 +148,7 @@ def test_a_session_with_audio_is_not_opened_again(
     record = harness.control._sessions.find("mine")
     recognizer = replace(
         harness.control._registry["recognizer"].heartbeat,
-        sessions={"mine": SessionInput(sequence=1)},
+        sessions={"mine": SessionProgress(last_droppable_sequence=1)},
     )
     endpoints = dict.fromkeys(recognizer.endpoints, "tcp://127.0.0.1:1")
     harness.services[0].send(replace(recognizer, endpoints=endpoints))

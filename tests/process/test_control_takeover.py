@@ -5,7 +5,7 @@ import pytest
 from kouxing.services.control import restart_recovery, session_lifecycle
 from kouxing.shared.fast_record import replace
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
+from kouxing.shared.wire.control import SessionProgress, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import (
     CloseSession,
@@ -34,9 +34,11 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session_lifecycle, "START_TIMEOUT_S", 60.0)
 
 
-def report(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:
+def report(
+    endpoints: dict[str, str] = PLACED, face: FaceSettings = START.opening.face
+) -> SessionStarted:
     """Return the report of a session that an earlier control has placed on these services."""
-    start = replace(START, session="mine", epoch=4, endpoints=endpoints, **fields)
+    start = replace(START.with_face(face), session="mine", epoch=4, endpoints=endpoints)
     return SessionStarted(session="mine", request="r", start=start)
 
 
@@ -50,7 +52,7 @@ def test_control_restores_a_session_unchanged(harness: ControlHarness, client: S
         (start,) = harness.receive(service)
         assert isinstance(start, StartSession)
         assert (start.session, start.epoch, start.token) == ("mine", 4, "t")
-        assert start.face == face
+        assert start.opening.face == face
     client.send(CloseSession(session="mine", token="t", request="1"))
     assert harness.receive(client) == [Done(session="mine", request="1")]
 
@@ -98,7 +100,7 @@ def test_moves_a_session_without_synthesizer_at_the_deadline(harness: ControlHar
 def test_stops_unknown_sessions_only_after_the_deadline(harness: ControlHarness) -> None:
     recognizer, _ = harness.services
     harness.receive(recognizer)
-    serving = make_heartbeat("recognizer", sessions={"mine": SessionInput()})
+    serving = make_heartbeat("recognizer", sessions={"mine": SessionProgress()})
     recognizer.send(serving)
     (seen,) = harness.receive(recognizer)
     assert not isinstance(seen, CloseSession)

@@ -14,7 +14,7 @@ from kouxing.services.driver import pose_store, recorder_client
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.service import DriverService
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.wire.control import Event, SessionInput, SessionStarted
+from kouxing.shared.wire.control import Event, SessionProgress, SessionStarted
 from kouxing.shared.wire.face import EndOfFaps
 from kouxing.shared.wire.session import Error
 from tests.fake_control import FakeControl
@@ -127,7 +127,7 @@ def test_shows_one_session_while_recording_another(
     assert recorded.session == "filmed"
     assert harness.num_images() == 26  # of 0 to 1 s at 25 Hz
     assert Path(recorded.detail).is_file()
-    harness.step_until(lambda: harness.driver.session_inputs() == {"other": SessionInput()})
+    harness.step_until(lambda: harness.driver.session_progress() == {"other": SessionProgress()})
     assert harness.events("error") == []
 
 
@@ -231,6 +231,6 @@ def test_a_stopping_driver_saves_the_finished_part_of_a_video(
 def test_follows_only_sessions_that_it_shows_or_records(harness: DriverHarness) -> None:
     harness.is_live = False
     harness.start("heard")
-    assert not harness.driver.session_inputs()
+    assert not harness.driver.session_progress()
     harness.start("filmed", record=True)
-    assert [*harness.driver.session_inputs()] == ["filmed"]
+    assert [*harness.driver.session_progress()] == ["filmed"]

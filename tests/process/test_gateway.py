@@ -116,7 +116,9 @@ async def test_viewers_receive_their_session(control: FakeControl, gateway: Gate
         await receive_json(newest, "status", missing=[])
         control.start("one")
         publish_all(control, "one")
-        await receive_json(newest, "session", session="one", lips="dynamic-visemes", sample=False)
+        await receive_json(
+            newest, "session", session="one", lip_model="dynamic-visemes", sample=False
+        )
         messages = [await receive_session_message(newest) for _ in range(5)]
         binary = {m.data[0]: m.data for m in messages if m.type is aiohttp.WSMsgType.BINARY}
         texts = [json.loads(m.data) for m in messages if m.type is aiohttp.WSMsgType.TEXT]
@@ -185,10 +187,10 @@ async def test_a_viewer_sets_the_expressions_of_its_face(
         assert "no session is shown" in (await receive_json(viewer, "error"))["text"]
         control.start("seen")
         await receive_json(viewer, "session", session="seen")
-        await viewer.send_json({"express": {"glee": 0.5}})
+        await viewer.send_json({"expressions": {"glee": 0.5}})
         assert "use joy, sadness," in (await receive_json(viewer, "error"))["text"]
-        await viewer.send_json({"express": {"joy": 0.5, "squint": 1}, "hold_s": 7})
-        await viewer.send_json({"express": {}})
+        await viewer.send_json({"expressions": {"joy": 0.5, "squint": 1}, "hold_s": 7})
+        await viewer.send_json({"expressions": {}})
         await viewer.send_json({"expressiveness": 2})
         await wait_until_async(lambda: len(control.messages_of(SetFace)) == 3)
     faces = [message.face for message in control.messages_of(SetFace)]
@@ -210,10 +212,10 @@ async def test_an_expression_shows_on_the_face_at_rest(
 
     async with open_websockets(gateway.page, "viewer?session=none") as (viewer,):
         assert await watch(viewer) == 0
-        await viewer.send_json({"express": {"smile": 1}, "hold_s": 600})
+        await viewer.send_json({"expressions": {"smile": 1}, "hold_s": 600})
         while await watch(viewer) < 30:
             pass
-        await viewer.send_json({"express": {}})
+        await viewer.send_json({"expressions": {}})
         while await watch(viewer) > 1:
             pass
     assert {*control.sessions_of(SetFace)} == {""}
@@ -327,8 +329,8 @@ async def test_bad_audio_is_refused_with_a_reason(control: FakeControl, gateway:
 
 MALFORMED: list[str | bytes] = [
     "", "{", "null", "[]", "5", '"x"', '{"type": "x"}', '{"a":' * 1000, "\0", "人" * 1000,
-    '{"sample_rate_hz": "x"}', '{"encoding": []}', '{"session": {}}', '{"lips": 1}',
-    '{"flush": "x"}', '{"express": {"joy": NaN}}', '{"mouth_profile": "%%"}', '{"eof": 1}',
+    '{"sample_rate_hz": "x"}', '{"encoding": []}', '{"session": {}}', '{"lip_model": 1}',
+    '{"flush": "x"}', '{"expressions": {"joy": NaN}}', '{"mouth_profile": "%%"}', '{"last": 1}',
     b"", b"\0", b"\xff" * 7, bytes(20_000), b"RIFF" + bytes(60),
 ]  # fmt: skip
 
@@ -380,18 +382,16 @@ async def test_microphone_and_sample_choose_their_lips(
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
         for lips in ("learned", "dynamic-visemes"):
-            await microphone.send_json({"lips": lips})
-            await receive_json(viewer, "lips", lips=lips)
-        await viewer.send_json({"play": "sample", "lips": 1})
-        assert (
-            "lips must be the name of a lip model" in (await receive_json(viewer, "error"))["text"]
-        )
-        await viewer.send_json({"lips": "learned"})
+            await microphone.send_json({"lip_model": lips})
+            await receive_json(viewer, "face", lip_model=lips)
+        await viewer.send_json({"play": "sample", "lip_model": 1})
+        assert "at `$.lip_model`" in (await receive_json(viewer, "error"))["text"]
+        await viewer.send_json({"lip_model": "learned"})
         assert "only for the sample sentence" in (await receive_json(viewer, "error"))["text"]
-        await viewer.send_json({"play": "sample", "lips": "learned"})
+        await viewer.send_json({"play": "sample", "lip_model": "learned"})
         await wait_until_async(lambda: len(control.messages_of(SetFace)) == 3)
         await receive_json(viewer, "session", sample=True)
-        await viewer.send_json({"lips": "dynamic-visemes"})
+        await viewer.send_json({"lip_model": "dynamic-visemes"})
         await wait_until_async(lambda: len(control.messages_of(SetFace)) == 4)
         control.stop_session(control.sessions_of(SetFace)[3])
         await receive_json(viewer, "session", sample=False)

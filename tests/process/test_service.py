@@ -25,7 +25,7 @@ from kouxing.shared.service import (
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.control import Heartbeat, SessionInput, SessionStarted
+from kouxing.shared.wire.control import Heartbeat, SessionProgress, SessionStarted
 from kouxing.shared.wire.speech import Progress, Speech
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
@@ -157,8 +157,8 @@ class Worker(SessionService):
     def stop_session(self, session: str) -> None:
         self.happened.append(f"stop {session}")
 
-    def session_inputs(self) -> dict[str, SessionInput]:
-        return dict.fromkeys(self.names, SessionInput())
+    def session_progress(self) -> dict[str, SessionProgress]:
+        return dict.fromkeys(self.names, SessionProgress())
 
 
 @pytest.fixture

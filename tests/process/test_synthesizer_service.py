@@ -52,7 +52,7 @@ class RecordingSynthesizer(SynthesizerService):
 def service() -> Iterator[RecordingSynthesizer]:
     service = RecordingSynthesizer()
     for name in ("gap", "other"):
-        service.start_session(replace(START, session=name, face=FaceSettings()))
+        service.start_session(replace(START.with_face(FaceSettings()), session=name))
     yield service
     service.bus.close()
 
@@ -124,7 +124,7 @@ def test_a_slow_synthesizer_skips_frames_and_reports_it(
     first, newest = service.frames("gap")[before], service.frames("gap")[-1]
     newest_s = 20.0 - SynthesizerConfig().delay_ms / 1e3
     assert first.media_time == newest.media_time == to_samples(newest_s)
-    assert service.session_inputs()["gap"].skipped_s == pytest.approx(14.7)
+    assert service.session_progress()["gap"].skipped_s == pytest.approx(14.7)
     assert events == [("audio-skipped", "gap", "14.70 s")]
 
 

@@ -26,19 +26,18 @@ from kouxing.shared.service import Service
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
-from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession
+from kouxing.shared.wire.control import SessionProgress, SessionStarted, StartSession
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
 from tests.control_harness import ENDPOINTS_BY_SERVICE, LOCAL, make_heartbeat
-from tests.samples import SAMPLES
+from tests.samples import SAMPLES, with_opening
 from tests.system import free_port
 
 NO_CONTROL = f"tcp://127.0.0.1:{free_port()}"
 MAX_SESSIONS = 4
 WORKERS = [replace(make_heartbeat(kind), instance=f"{kind}-1") for kind in ENDPOINTS_BY_SERVICE]
 START = replace(
-    cast(StartSession, SAMPLES["start-session"]),
-    paced=False,
+    with_opening(cast(StartSession, SAMPLES["start-session"]), paced=False),
     endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
 )
 
@@ -56,7 +55,7 @@ DATA = st.one_of(
 )
 MAPS = st.dictionaries(
     st.one_of(TEXTS, st.sampled_from(["audio", "phones", "faps", "phone_input"])),
-    st.one_of(TEXTS, REALS, st.builds(SessionInput, idle_s=REALS, sequence=NUMBERS)),
+    st.one_of(TEXTS, REALS, st.builds(SessionProgress, idle_s=REALS, final_until=NUMBERS)),
     max_size=4,
 )
 

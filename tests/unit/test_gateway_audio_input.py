@@ -77,7 +77,7 @@ def test_rejects_audio_in_text_messages() -> None:
     for text in ("AAAAAQACAAMABAAFAAYABwAIAAkA", "data:audio/wav;base64,UklGRiQAAABXQVZF"):
         with pytest.raises(UserError, match="this text looks like base64"):
             check_text(text)
-    check_text('{"eof" : 1}')
+    check_text('{"last" : 1}')
 
 
 class FakeSession:

@@ -70,13 +70,16 @@ def test_parses_microphone_commands() -> None:
     browser_messages.parse_command('{"sample_rate_hz": 16000, "encoding": "s16le"}', pcm_format)
     with pytest.raises(UserError, match="sample_rate_hz cannot change during a session"):
         browser_messages.parse_command('{"sample_rate_hz": 48000}', pcm_format)
-    assert browser_messages.parse_command('{"lips": "ferguson"}').lip_model == "ferguson"
+    assert browser_messages.parse_command('{"last": true}').last
+    command = browser_messages.parse_command('{"lip_model": "ferguson"}')
+    assert FaceSettings(**command.face) == FaceSettings(lip_model="ferguson")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
-        *(({"lips": lips}, "lips must be the name") for lips in ("no name", 1)),
+        ({"lip_model": 1}, r"Expected `str \| null`, got `int` - at `\$.lip_model`"),
+        ({"eof": 1}, "'eof' is now called 'last'"),
         *(
             ({"skip": n}, "skip must be an integer")
             for n in (-1, 1.5, True, browser_messages.MAX_SKIPPED + 1)
@@ -91,13 +94,13 @@ def test_rejects_bad_microphone_commands(fields: object, error: str) -> None:
 def test_parses_face_settings() -> None:
     assert browser_messages.parse_face_settings({"follow": "one"}) is None
     settings = browser_messages.parse_face_settings(
-        {"express": {"joy": 1}, "hold_s": 7, "expressiveness": 2}
+        {"expressions": {"joy": 1}, "hold_s": 7, "expressiveness": 2}
     )
     assert settings == FaceSettings(expressions={"joy": 1}, hold_s=7, expressiveness=2)
     manner: dict[str, Any] = {"feeling": 0, "still": True, "eye_contact": False, "listen_to": "bob"}
     assert browser_messages.parse_face_settings(manner) == FaceSettings(**manner)
-    assert browser_messages.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
-    assert browser_messages.parse_face_settings({"lips": "learned"}) == FaceSettings(
+    assert browser_messages.parse_face_settings({"expressions": {}}) == FaceSettings(expressions={})
+    assert browser_messages.parse_face_settings({"lip_model": "learned"}) == FaceSettings(
         lip_model="learned"
     )
     assert browser_messages.parse_face_settings({"acoustic": "light"}) == FaceSettings(
@@ -108,14 +111,14 @@ def test_parses_face_settings() -> None:
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
-        ({"express": {"glee": 0.5}}, "glee"),
-        ({"express": {"joy": 2}}, "joy: strength 2"),
-        ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
-        ({"express": "joy"}, "names to strengths"),
-        ({"expressiveness": 3}, "expressiveness is 3"),
-        ({"feeling": -1}, "feeling is -1; it must be from 0 to 1"),
-        ({"still": "yes"}, "still must be true or false"),
-        ({"listen_to": "a b"}, "listen_to must be the name of a session"),
+        ({"expressions": {"glee": 0.5}}, "glee"),
+        ({"expressions": {"joy": 2}}, "joy: strength 2"),
+        ({"expressions": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
+        ({"expressions": "joy"}, r"Expected `object \| null`, got `str` - at `\$.expressions`"),
+        ({"expressiveness": 3}, r"Expected `float` <= 2.0 - at `\$.expressiveness`"),
+        ({"feeling": -1}, r"Expected `float` >= 0.0 - at `\$.feeling`"),
+        ({"still": "yes"}, r"got `str` - at `\$.still`"),
+        ({"listen_to": "a b"}, r"at `\$.listen_to`"),
         ({"acoustic": "heavy"}, "acoustic must be full or light"),
     ],
 )

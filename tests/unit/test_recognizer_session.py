@@ -26,16 +26,18 @@ from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import Acknowledge, AcousticModelName, AudioState, Progress
 from tests.live_streams import START
+from tests.samples import with_opening
 from tests.system import VOWELS_FILE, samples_of_file
 
-RATE_HZ = START.sample_rate_hz
+RATE_HZ = START.opening.sample_rate_hz
 SOCKET, OTHER_SOCKET = (cast(Socket, object()) for _ in range(2))
 RECOGNIZER = Recognizer(load_model())
 LIPS = load_lip_predictor()
 
 
-def make_session(**changes: Any) -> RecognizerSession:
-    return RecognizerSession(replace(START, **changes), RECOGNIZER, LIPS, SOCKET, SOCKET, 0.0)
+def make_session(epoch: int = 1, **opening: Any) -> RecognizerSession:
+    start = with_opening(replace(START, epoch=epoch), **opening)
+    return RecognizerSession(start, RECOGNIZER, LIPS, SOCKET, SOCKET, 0.0)
 
 
 def chunk(

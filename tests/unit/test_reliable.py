@@ -12,8 +12,9 @@ from kouxing.shared.reliable import (
     ReliableReceiver,
     ReliableSender,
 )
+from kouxing.shared.wire.events import split_batch
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress
+from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
 
 PEER = Peer(b"peer")
 FRAME = NewestFrame(sequence=2, media_time=320, values=bytes(272))
@@ -51,9 +52,9 @@ class ReliablePair:
     def deliver(self, *, lose: tuple[int, ...] = ()) -> None:
         """Deliver what was sent, except messages of some numbers."""
         while self.dealer.sent:
-            message = self.dealer.sent.popleft()
-            if message.sequence not in lose and self.receiver.receive(message, PEER):
-                self.received.append(message.sequence)
+            for message in split_batch(cast(Results, self.dealer.sent.popleft())):
+                if message.sequence not in lose and self.receiver.receive(message, PEER):
+                    self.received.append(message.sequence)
 
     def acknowledge(self) -> None:
         self.receiver.tick(math.inf)

@@ -14,7 +14,7 @@ from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.control import Heartbeat, SessionInput
+from kouxing.shared.wire.control import Heartbeat, SessionProgress
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import OpenSession, SessionFacts
 
@@ -37,7 +37,7 @@ def worker(service: str, instance: str, state: str = "ready") -> Heartbeat:
         endpoints={name: f"tcp://{instance}:{name}" for name in PROVIDES[service]},
         needs=NEEDS[service],
         facts=FACTS[service],
-        sessions={"mine": SessionInput()},
+        sessions={"mine": SessionProgress()},
     )
 
 
@@ -71,8 +71,8 @@ class System:
     def report(self, record: SessionRecord, instance: str, **fields: Any) -> None:
         """Record a heartbeat about a session."""
         heartbeat = worker(instance.partition("-")[0], instance)
-        sessions = {record.name: SessionInput(**fields)}
-        self.sessions.record_input(record, replace(heartbeat, sessions=sessions))
+        sessions = {record.name: SessionProgress(**fields)}
+        self.sessions.record_progress(record, replace(heartbeat, sessions=sessions))
 
 
 @pytest.fixture
@@ -137,8 +137,8 @@ def test_the_client_and_the_services_get_the_endpoints_and_facts(system: System)
     start = record.start_message(0.0)
     assert start.endpoints["phone_input"] == "tcp://synthesizer-1:phone_input"
     assert start.facts == opened.facts
-    assert start.mouth_profile == b"a profile"
-    assert (start.client, start.client_key, start.client_request) == (b"client", "its key", "r")
+    assert start.opening.mouth_profile == b"a profile"
+    assert (start.client, start.client_key, start.opening.request) == (b"client", "its key", "r")
 
 
 @pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
@@ -202,26 +202,26 @@ def test_limits_the_sessions_in_total_and_per_key() -> None:
 
 def test_a_new_worker_gets_the_face_as_it_is_now(system: System) -> None:
     record = system.open(face=FaceSettings(shapes=["vrm", "vrm"]))
-    assert record.start_message(0.0).face.lip_model == "dynamic-visemes", (
+    assert record.start_message(0.0).opening.face.lip_model == "dynamic-visemes", (
         "the synthesizer's default"
     )
     record.face.change(FaceSettings(expressions={"joy": 0.5}, hold_s=10.0), 0.0)
     record.face.change(FaceSettings(expressiveness=1.8, lip_model="learned", shapes=["arkit"]), 2.0)
-    face = record.start_message(4.0).face
+    face = record.start_message(4.0).opening.face
     assert (face.lip_model, face.expressiveness, face.shapes) == ("learned", 1.8, ["vrm", "arkit"])
     assert (face.expressions, face.hold_s) == ({"joy": 0.5}, 6.0)
-    assert record.start_message(11.0).face.expressions is None
+    assert record.start_message(11.0).opening.face.expressions is None
     system.lose("synthesizer-1")
     facts = SessionFacts(delay_ms=40.0, lip_model="ferguson")
     system.add(replace(worker("synthesizer", "synthesizer-2"), facts=facts))
     assert system.sessions.move(record, 12.0)
     start = record.start_message(12.0)
-    assert (start.facts.delay_ms, start.face.lip_model) == (40.0, "learned")
+    assert (start.facts.delay_ms, start.opening.face.lip_model) == (40.0, "learned")
 
 
 def test_a_session_moves_to_another_recognizer_and_resumes_where_it_was(system: System) -> None:
     record = system.open()
-    system.report(record, "recognizer-1", sequence=120)
+    system.report(record, "recognizer-1", last_droppable_sequence=120)
     system.lose("recognizer-1")
     assert record.lost == {"recognizer-1"}
     assert not system.sessions.move(record, 1.0), "there is no other recognizer"
@@ -234,8 +234,8 @@ def test_a_session_moves_to_another_recognizer_and_resumes_where_it_was(system: 
     moved = record.moved_message()
     assert (moved.epoch, moved.next_sequence) == (2, 121)
     assert (moved.audio, moved.faps) == ("tcp://other:audio", "tcp://synthesizer-1:faps")
-    heartbeat = replace(worker("recognizer", "other"), sessions={record.name: SessionInput()})
-    system.sessions.record_input(record, heartbeat)
+    heartbeat = replace(worker("recognizer", "other"), sessions={record.name: SessionProgress()})
+    system.sessions.record_progress(record, heartbeat)
     assert record.next_sequence == 121, "the new recognizer has no audio yet"
 
 
@@ -251,7 +251,7 @@ def test_the_recognizer_starts_last_and_learns_up_to_where_phones_are_final(
     system: System, lost: tuple[str, ...], reported: int, last: str
 ) -> None:
     record = system.open()
-    system.report(record, "synthesizer-1", media_time=32_000)
+    system.report(record, "synthesizer-1", final_until=32_000)
     for instance in lost:
         system.lose(instance)
         system.add(worker(instance.partition("-")[0], instance.replace("1", "2")))
@@ -261,7 +261,7 @@ def test_the_recognizer_starts_last_and_learns_up_to_where_phones_are_final(
     assert record.waiting_for - record.deferred == {synthesizer}
     assert system.sessions.record_started(record, "lamp-1", 0) == set()
     assert system.sessions.record_started(record, synthesizer, reported) == {last}
-    assert record.start_message(1.0).media_time == max(32_000, reported)
+    assert record.start_message(1.0).final_until == max(32_000, reported)
     assert system.sessions.record_started(record, last, 0) == set()
 
 

@@ -23,7 +23,7 @@ const viewer = new Viewer(
   { session: speaker.session, shapes: "arkit" },
 );
 await viewer.ready;
-viewer.send({ express: { joy: 0.5 } });
+viewer.send({ expressions: { joy: 0.5 } });
 viewer.close();
 
 const [[time, values]] = readRecording("").frames;

@@ -28,9 +28,9 @@ const gateway = new GatewayState();
 const settings = new Settings(preferences, offers, {
   heads: (name) => stage.load(name),
   speechLanguage: () => speech.restart(),
-  lipModel: (name) => (gateway.isSample ? socket.send({ lips: name }) : speech.microphone.chooseLipModel(name)),
+  lipModel: (name) => (gateway.isSample ? socket.send({ lip_model: name }) : speech.microphone.chooseLipModel(name)),
   faceSettings: sendFaceSettings,
-  expressions: (strengths) => socket.send({ express: strengths }),
+  expressions: (strengths) => socket.send({ expressions: strengths }),
 });
 const caption = new Caption(preferences);
 const sound = new Sound(() => speech.showSound());
@@ -96,8 +96,8 @@ function handleMessage(message) {
     syllable: () => caption.add(message),
     phone: () => caption.add(message),
     error: showError,
-    lips() {
-      gateway.lips = message.lips;
+    face() {
+      gateway.lipModel = message.lip_model;
       showLipModel();
     },
     acoustic() {
@@ -148,7 +148,7 @@ function chosenLipModel() {
 }
 
 function showLipModel() {
-  if (isOwnSession() && gateway.lips !== null) settings.showLipModel(gateway.lips);
+  if (isOwnSession() && gateway.lipModel !== null) settings.showLipModel(gateway.lipModel);
 }
 
 function chooseAcousticModel(acoustic) {
@@ -216,7 +216,7 @@ window.kouxing = {
       soundSamplesPlayed: sound.numPlayed,
       soundMinusImageMs: player.soundMinusImageMs,
       microphone: speech.state === "on",
-      lips: gateway.lips,
+      lipModel: gateway.lipModel,
       acoustic: gateway.acoustic,
       caption: caption.text,
       mouthProfile: mouthProfiles.current?.profile ?? "",
@@ -228,8 +228,8 @@ window.kouxing = {
 };
 
 element("sample").onclick = () => {
-  const lips = chosenLipModel();
-  socket.send(lips === null ? { play: "sample" } : { play: "sample", lips });
+  const name = chosenLipModel();
+  socket.send(name === null ? { play: "sample" } : { play: "sample", lip_model: name });
   speech.unblockSound();
 };
 element("learn").onclick = () => lesson.open();

@@ -46,7 +46,7 @@ export class Microphone {
 
   /** Change the lip model of its session. */
   chooseLipModel(name) {
-    if (this.#uplink) this.#socket.send(JSON.stringify({ lips: name }));
+    if (this.#uplink) this.#socket.send(JSON.stringify({ lip_model: name }));
   }
 
   start() {
@@ -139,8 +139,8 @@ export class Microphone {
     this.#handlers.session(session);
     this.#handlers.state("on");
     this.#fileSpeech?.play(() => setTimeout(() => this.#endFile(), TAIL_MS));
-    const lips = this.#handlers.lipModel();
-    if (lips !== null) this.chooseLipModel(lips);
+    const name = this.#handlers.lipModel();
+    if (name !== null) this.chooseLipModel(name);
   }
 
   #endFile() {

@@ -15,7 +15,7 @@ export class GatewayState {
   session = null; // name of the session that is shown
   epoch = 0; // epoch of the session; it increases with each restart
   isSample = false; // whether the session is the sample sentence that this page asked for
-  lips = null; // lip model of the session; null: unknown
+  lipModel = null; // lip model of the session; null: unknown
   acoustic = ""; // acoustic model of the session: full or light
   missing = []; // services that are not running
 
@@ -35,14 +35,14 @@ export class GatewayState {
   }
 
   /** Process a "session" message; return { isRestart, isOther }: whether the epoch or session changed. */
-  setSession({ session, epoch, sample, lips, acoustic }) {
+  setSession({ session, epoch, sample, lip_model, acoustic }) {
     const isOther = session !== this.session;
     const isRestart = !isOther && session !== null && epoch > this.epoch;
     this.session = session;
     this.epoch = epoch;
     this.isSample = sample;
     this.acoustic = acoustic;
-    if (session !== null) this.lips = lips || null; // a session that has ended is still visible
+    if (session !== null) this.lipModel = lip_model || null; // a session that has ended is still visible
     return { isOther, isRestart };
   }
 }
