@@ -60,9 +60,9 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "clock": (clock, "MEDIA_RATE_HZ"),
     "closures": (
         closure_rule,
-        "_MIN_PROBABILITY _MAX_PROBABILITY _HOLD_S _LATE_HOLD_S _MAX_LATE_S _EDGE_S _PARTED "
-        "_WIDE_APART _ROUNDED _INNER_UPPER _INNER_LOWER _LEFT_CORNER _RIGHT_CORNER _UPPER "
-        "_LOWER _LOWER_OUTER _INNER _OUTER _BOTH",
+        "_MIN_PROBABILITY _MAX_PROBABILITY _HOLD_S _EDGE_S _PARTED _WIDE_APART _ROUNDED "
+        "_INNER_UPPER _INNER_LOWER _LEFT_CORNER _RIGHT_CORNER _UPPER _LOWER _LOWER_OUTER "
+        "_INNER _OUTER _BOTH",
     ),
     "decoder": (
         frame_search,

@@ -124,6 +124,13 @@ def test_prediction_and_phone_decide_a_closure_together(
     assert height < 10.0 if shuts else height > 190.0
 
 
+def test_a_phone_that_is_known_too_late_closes_nothing() -> None:
+    sound = closing_lips(0.1, end_s=0.7)
+    frames = run(speaking_face(), 0.0, 1.0, sound, [(0.64, phone("p", 0.46))])
+    shown = [faps[HEIGHTS] for time_s, faps in frames if 0.4 < time_s < 0.9]
+    assert np.abs(shown).max(axis=1).min() > 190.0
+
+
 def test_dynamic_visemes_move_the_mouth_without_lip_frames() -> None:
     phones = [(0.4, phone("d", 0.35, index=0)), (0.5, phone("a", 0.42, index=1))]
     learned, visemes = (

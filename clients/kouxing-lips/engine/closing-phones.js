@@ -5,7 +5,7 @@ export class ClosingPhones {
   #constants;
   #rule;
   #symbols;
-  #phones = new Map(); // by index: { phone, knownS }
+  #phones = new Map(); // by index
 
   constructor({ constants, closureRule, phones }, viseme) {
     this.#constants = constants.closures;
@@ -13,30 +13,29 @@ export class ClosingPhones {
     this.#symbols = new Set(phones.closing[viseme]);
   }
 
-  /** Add a phone or a revision; `nowS` is the time of the last frame. */
-  add(phone, nowS) {
+  /** Add a phone or a revision. */
+  add(phone) {
     const known = this.#phones.get(phone.index);
     this.#phones.delete(phone.index);
-    const newest = known?.phone.isFinal && !phone.isFinal ? known.phone : phone;
+    const newest = known?.isFinal && !phone.isFinal ? known : phone;
     if (!this.#symbols.has(newest.symbol)) return;
-    this.#phones.set(phone.index, { phone: newest, knownS: known?.knownS ?? nowS });
+    this.#phones.set(phone.index, newest);
   }
 
   /** Forget phones that started before a time. */
   forgetBefore(timeS) {
-    for (const [index, { phone }] of this.#phones) if (phone.onsetS < timeS) this.#phones.delete(index);
+    for (const [index, phone] of this.#phones) if (phone.onsetS < timeS) this.#phones.delete(index);
   }
 
   /** Return the log odds of a closure that the phones add at a time. */
   logOddsAt(timeS) {
-    return [...this.#phones.values()].reduce((highest, known) => Math.max(highest, this.#logOddsOf(known, timeS)), 0);
+    return [...this.#phones.values()].reduce((highest, phone) => Math.max(highest, this.#logOddsOf(phone, timeS)), 0);
   }
 
-  #logOddsOf({ phone, knownS }, timeS) {
-    const { HOLD_S, MAX_LATE_S, LATE_HOLD_S, EDGE_S } = this.#constants;
+  #logOddsOf(phone, timeS) {
+    const { HOLD_S, EDGE_S } = this.#constants;
     const highest = Math.min(logOddsOf(Math.max(phone.confidence, 0.5), this.#constants), this.#rule.phone);
-    let endS = phone.onsetS + Math.min(phone.durationS, HOLD_S);
-    if (knownS < phone.onsetS + MAX_LATE_S) endS = Math.max(endS, knownS + LATE_HOLD_S);
+    const endS = phone.onsetS + Math.min(phone.durationS, HOLD_S);
     const outsideS = Math.max(phone.onsetS - timeS, timeS - endS, 0);
     return highest * Math.max(0, 1 - outsideS / EDGE_S);
   }

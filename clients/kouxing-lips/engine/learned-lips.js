@@ -42,7 +42,7 @@ export class LearnedLips {
   addEvent(event) {
     this.#resting.addEvent(event);
     if (event.type === "speech") this.#isSpeaking = event.active;
-    else if (event.type === "phone") for (const phones of [this.#bilabials, this.#labiodentals]) phones.add(event.phone, this.#timeS);
+    else if (event.type === "phone") for (const phones of [this.#bilabials, this.#labiodentals]) phones.add(event.phone);
     else if (event.type === "lips") {
       this.#queue.push(event);
       this.#hasLipFrames = true;

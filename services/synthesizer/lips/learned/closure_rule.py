@@ -25,9 +25,8 @@ from kouxing.shared.phones.inventory import PhoneInventory
 Array = NDArray[np.float64]
 
 _MIN_PROBABILITY, _MAX_PROBABILITY = 0.002, 0.998  # probabilities are clipped to this range
-_HOLD_S = 0.08  # maximum duration of a closure after the onset of its phone
-_LATE_HOLD_S = 0.04  # minimum duration after the phone is known
-_MAX_LATE_S = 0.1  # phones known later than this after their onset are not held longer
+# maximum duration of a closure after the onset of its phone; a phone known later closes nothing
+_HOLD_S = 0.08
 _EDGE_S = 0.02  # rise and fall time of a phone's evidence
 _MIDDLE = 0.3  # half width of a vowel's middle, as a fraction of its duration
 _PARTED, _WIDE_APART = 100.0, 300.0  # opening, FAP units
@@ -82,11 +81,11 @@ class ClosingPhones:
         self._symbols = {
             symbol for symbol, visemes in inventory.visemes.items() if visemes[0][0] == viseme
         }
-        self._phones: dict[int, tuple[Phone, float]] = {}  # by index, with the time of recognition
+        self._phones: dict[int, Phone] = {}  # by index
 
-    def add(self, phone: Phone, now_s: float) -> None:
-        """Add a phone or a revision; ``now_s`` is the time of the next frame."""
-        known, known_s = self._phones.pop(phone.index, (None, now_s))
+    def add(self, phone: Phone) -> None:
+        """Add a phone or a revision."""
+        known = self._phones.pop(phone.index, None)
         if known is not None and known.final and not phone.final:
             phone = known
         counts = not phone.is_withdrawn and (
@@ -94,12 +93,12 @@ class ClosingPhones:
             or (self._rule.other > 0.0 and phone.symbol != self._silence)
         )
         if counts and math.isfinite(phone.onset_s + phone.duration_s):
-            self._phones[phone.index] = (phone, known_s)
+            self._phones[phone.index] = phone
 
     def forget_before(self, time_s: float) -> None:
         """Forget phones that started before a time."""
         self._phones = {
-            index: known for index, known in self._phones.items() if known[0].onset_s >= time_s
+            index: phone for index, phone in self._phones.items() if phone.onset_s >= time_s
         }
 
     def clear(self) -> None:
@@ -108,16 +107,14 @@ class ClosingPhones:
 
     def log_odds(self, time_s: float) -> float:
         """Return the log odds of a closure that the phones add at a time."""
-        closing = [known for known in self._phones.values() if known[0].symbol in self._symbols]
-        added = max(
-            (self._closing_phone_log_odds(*known, time_s) for known in closing), default=0.0
-        )
+        closing = [phone for phone in self._phones.values() if phone.symbol in self._symbols]
+        added = max((self._closing_phone_log_odds(phone, time_s) for phone in closing), default=0.0)
         if added > 0.0 or self._rule.other == 0.0:
             return added
         return -max(
             (
                 self._open_phone_log_odds(phone, time_s)
-                for phone, _ in self._phones.values()
+                for phone in self._phones.values()
                 if phone.symbol not in self._symbols
                 and phone.onset_s <= time_s < phone.onset_s + phone.duration_s
             ),
@@ -136,14 +133,14 @@ class ClosingPhones:
 
     def _is_between_closures(self, phone: Phone) -> bool:
         neighbors = (self._phones.get(phone.index + step) for step in (-1, 1))
-        return all(known is not None and known[0].symbol in self._symbols for known in neighbors)
+        return all(
+            neighbor is not None and neighbor.symbol in self._symbols for neighbor in neighbors
+        )
 
-    def _closing_phone_log_odds(self, phone: Phone, known_s: float, time_s: float) -> float:
+    def _closing_phone_log_odds(self, phone: Phone, time_s: float) -> float:
         """Return the log odds that a closing phone adds."""
         maximum = min(log_odds_of(max(phone.confidence, 0.5)), self._rule.phone)
         end_s = phone.onset_s + min(phone.duration_s, _HOLD_S)
-        if known_s < phone.onset_s + _MAX_LATE_S:
-            end_s = max(end_s, known_s + _LATE_HOLD_S)
         outside_s = max(phone.onset_s - time_s, time_s - end_s, 0.0)
         return maximum * max(0.0, 1.0 - outside_s / _EDGE_S)
 

@@ -132,7 +132,7 @@ class LearnedStream:
                 self._add_lip_frame(event)
             case Phone():
                 for phones in (self._bilabials, self._labiodentals):
-                    phones.add(event, self._time_s)
+                    phones.add(event)
             case SpeechChange():
                 self._flushed_until_s = -np.inf
                 self._is_speaking = event.active
