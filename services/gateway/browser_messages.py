@@ -30,7 +30,8 @@ MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
 # What a browser can change; the query of its address selects shapes.
 FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
-_RENAMED = {"lips": "lip_model", "express": "expressions", "eof": "last"}  # since version 0.1.0
+# names in version 0.1.0, which are still accepted
+_OLD_NAMES = {"lips": "lip_model", "express": "expressions", "eof": "last"}
 
 
 def binary(message_type: int, epoch: int, media_time: int, payload: bytes) -> bytes:
@@ -112,7 +113,7 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
     describes audio of another format than ``pcm_format``.
     """
     check_text(message)
-    fields = parse_object(message)
+    fields = parse_command_fields(message)
     for name in ("sample_rate_hz", "num_channels", "encoding"):
         if name in fields and pcm_format and fields[name] != getattr(pcm_format, name):
             raise UserError(f"{name} cannot change during a session; open another connection")
@@ -131,11 +132,8 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
 def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     """Return the face settings of a command; None if it contains none.
 
-    Raises ``UserError`` if a name is unknown or a value is out of range.
+    Raises ``UserError`` if a value is out of range.
     """
-    for name, new_name in _RENAMED.items():
-        if name in fields:
-            raise UserError(f"{name!r} is now called {new_name!r}")
     given = {name: fields[name] for name in FACE_SETTINGS if fields.get(name) is not None}
     if isinstance(expressions := given.get("expressions"), dict):
         check_expressions(expressions, given.get("hold_s", DEFAULT_HOLD_S))
@@ -146,6 +144,11 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     if settings.acoustic not in (None, *AcousticModelName):
         raise UserError("acoustic must be full or light")
     return settings if given.keys() - {"hold_s"} else None
+
+
+def parse_command_fields(message: str) -> dict[str, object]:
+    """Return the fields of a command; raises ``UserError`` as :func:`parse_object`."""
+    return {_OLD_NAMES.get(name, name): value for name, value in parse_object(message).items()}
 
 
 def parse_object(message: str | bytes) -> dict[str, object]:

@@ -203,7 +203,7 @@ class ViewerHandler:
 
     def _handle_command(self, viewer: Viewer, message: str) -> None:
         try:
-            command = browser_messages.parse_object(message)
+            command = browser_messages.parse_command_fields(message)
             session = command.get("follow")
             settings = browser_messages.parse_face_settings(command)
             lip_model = settings.lip_model if settings is not None else None

@@ -71,6 +71,7 @@ def test_parses_microphone_commands() -> None:
     with pytest.raises(UserError, match="sample_rate_hz cannot change during a session"):
         browser_messages.parse_command('{"sample_rate_hz": 48000}', pcm_format)
     assert browser_messages.parse_command('{"last": true}').last
+    assert browser_messages.parse_command('{"eof": 1}').last  # as in version 0.1.0
     command = browser_messages.parse_command('{"lip_model": "ferguson"}')
     assert FaceSettings(**command.face) == FaceSettings(lip_model="ferguson")  # type: ignore[arg-type]
 
@@ -79,7 +80,6 @@ def test_parses_microphone_commands() -> None:
     ("fields", "error"),
     [
         ({"lip_model": 1}, r"Expected `str \| null`, got `int` - at `\$.lip_model`"),
-        ({"eof": 1}, "'eof' is now called 'last'"),
         *(
             ({"skip": n}, "skip must be an integer")
             for n in (-1, 1.5, True, browser_messages.MAX_SKIPPED + 1)
