@@ -56,6 +56,10 @@ def train(
     ] = False,
 ) -> None:
     """Train the models."""
+    if any_license and context.invoked_subcommand in ("phone-lm", "heads"):
+        raise UserError(
+            f"--any-license does not apply to {context.invoked_subcommand}; leave it out"
+        )
     context.obj = any_license
 
 

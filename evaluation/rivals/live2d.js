@@ -35,7 +35,7 @@ const coreModel = {
 };
 const sync = new MotionSync({ coreModel, motionManager: { update() {} } }); // the core supports only a few instances
 await sync.loadDefaultMotionSync();
-await sync.runBlocks({ getAudioTracks: () => [null] });
+await sync.play({ getAudioTracks: () => [null] });
 console.log = log;
 
 export async function computeCurves(samples) {

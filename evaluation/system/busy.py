@@ -255,8 +255,8 @@ def _read_usage(process_id: int) -> tuple[float, int]:
             for thread in (_PROC / str(process_id) / "task").iterdir()
         ]
     except OSError as error:
-        speech = f"cannot read the processor time of a service: {error}; run this command on Linux"
-        raise UserError(speech) from None
+        message = f"cannot read the processor time of a service: {error}; run this command on Linux"
+        raise UserError(message) from None
     wake_ups = sum(
         int(line.split()[1])
         for state in states

@@ -179,7 +179,7 @@ class Page:
 
     def __init__(self, browser: Chromium, server: MosServer) -> None:
         self._browser = browser
-        self._served = server
+        self._server = server
         self._address = f"http://127.0.0.1:{server.port}/"
         browser.command("Emulation.setUserAgentOverride", userAgent="test", acceptLanguage="en-GB")
 
@@ -202,7 +202,7 @@ class Page:
         assert browser.evaluate("document.documentElement.lang") == "zh"
         browser.evaluate("for (let n = 0; n < 2; n++) document.getElementById('begin').click()")
         browser.wait_for("document.getElementById('task').checkVisibility()")
-        places = places_of_judge(0, load_study(self._served.folder))
+        places = places_of_judge(0, load_study(self._server.folder))
         for place, (_, condition) in places.items():
             self._wait_for_place(place)
             assert not browser.evaluate("document.getElementById('sync-4').matches(':enabled')")

@@ -109,8 +109,8 @@ class ControlProxy:
 @pytest.fixture
 def proxy(harness: ControlHarness) -> Iterator[ControlProxy]:
     port = harness.control.endpoints["commands"].partition(" ")[0].rpartition(":")[2]
-    with contextlib.closing(ControlProxy(int(port))) as new_harness:
-        yield new_harness
+    with contextlib.closing(ControlProxy(int(port))) as new_proxy:
+        yield new_proxy
 
 
 def disconnect_before_the_answer(
