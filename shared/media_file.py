@@ -134,8 +134,8 @@ class MediaSound:
             raise UserError(f"{self._name}: {why_unreadable(begin, 'no audio')}")
         if not tracks or len(self._container.streams) > _MAX_STREAMS:
             kinds = {stream.type for stream in self._container.streams}
-            only = " and ".join(sorted(kinds))
-            raise UserError(f"{self._name}: the file has {only} but no audio track")
+            kind = "video" if "video" in kinds else min(kinds)
+            raise UserError(f"{self._name}: the file has {kind} but no audio track")
         listing = "; ".join(f"{number} {_describe(one)}" for number, one in enumerate(tracks, 1))
         if track is not None and not 1 <= track <= len(tracks):
             raise UserError(f"{self._name}: there is no track {track}; the tracks are: {listing}")
