@@ -1,6 +1,6 @@
 // Sends speech into a new session.
 
-import { socketUrl } from "./viewer.js";
+import { checkWebSocket, socketUrl } from "./viewer.js";
 
 const MESSAGE_BYTES = 32000;
 const MAX_BUFFERED_BYTES = 1 << 18; // above it, push() waits
@@ -37,12 +37,13 @@ export class Speaker {
    * @param options { sampleRateHz, numChannels, encoding: "s16le" or "f32le", ahead: whether audio may
    *   come faster than real time, mouthProfile: in base64, language, token, closed: called with an
    *   error or null when the session has ended }
-   * @returns a promise of a Speaker; it is rejected if the gateway refuses the session
+   * @returns a promise of a Speaker; it is rejected if the gateway is not running or refuses the session
    */
-  static open(gateway, options = {}) {
+  static async open(gateway, options = {}) {
     const { sampleRateHz = 16000, numChannels = 1, encoding = "s16le", token = "" } = options;
     const { ahead = false, mouthProfile, language, closed = () => {} } = options;
     const format = { sample_rate_hz: sampleRateHz, num_channels: numChannels, encoding };
+    checkWebSocket();
     const socket = new WebSocket(socketUrl(gateway, "/microphone", { token }));
     return new Promise((resolve, reject) => {
       socket.onopen = () => socket.send(JSON.stringify({ ...format, ahead, mouth_profile: mouthProfile, language }));
@@ -51,8 +52,9 @@ export class Speaker {
         if (type === "opened") resolve(new Speaker(socket, session, encoding, closed));
         else reject(new Error(text));
       };
-      socket.onclose = () => {
-        reject(new Error(`cannot connect to ${gateway}; start it with: kouxing run`));
+      // Node 22 reports a failed connection only as an error.
+      socket.onerror = socket.onclose = () => {
+        reject(new Error(`no gateway at ${gateway}; start it with: kouxing run`));
       };
     });
   }

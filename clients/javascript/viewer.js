@@ -20,6 +20,13 @@ export function socketUrl(gateway, path, fields) {
   return url.href;
 }
 
+/** Throw an error if the program has no WebSockets. */
+export function checkWebSocket() {
+  if (typeof WebSocket === "undefined") {
+    throw new Error("kouxing-client needs Node 22 or newer, or a global WebSocket");
+  }
+}
+
 /** Follows one session, or always the newest. Reconnects by itself until it is closed. */
 export class Viewer {
   #socket;
@@ -31,6 +38,7 @@ export class Viewer {
    *   addition to FAP frames; token: the gateway's token }
    */
   constructor(gateway, handlers, { session = "", shapes = "", token = "" } = {}) {
+    checkWebSocket();
     let names = [];
     let resolveReady = null;
     /** Resolved when a session is shown. The viewer misses nothing from then on. */

@@ -85,10 +85,10 @@ public sealed class KouxingStream : IDisposable
     // {"type":"avatar","set":"arkit","targets":[[0,3],[0,17], ...]}
     void ReadText(string text)
     {
-        if (text.Contains("\"avatar\""))
+        if (text.StartsWith("{\"type\":\"avatar\"", StringComparison.Ordinal))
             Targets = Target.Matches(text).Cast<Match>().Select(match => match.Groups)
                 .Select(groups => new[] { int.Parse(groups[1].Value), int.Parse(groups[2].Value) }).ToArray();
-        else if (text.Contains("\"error\"") && Targets.Length == 0)
+        else if (text.StartsWith("{\"type\":\"error\"", StringComparison.Ordinal) && Targets.Length == 0)
             Error = Regex.Unescape(ErrorText.Match(text).Groups[1].Value);
     }
 

@@ -5,16 +5,25 @@ Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media t
 """
 
 import base64
+import json
+import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import msgspec
 
 from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, RATES_HZ, PcmFormat, check_text
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.expressions import DEFAULT_HOLD_S, check_expressions
+from kouxing.shared.face.expressions import (
+    DEFAULT_HOLD_S,
+    MAX_EXPRESSIVENESS,
+    MAX_HOLD_S,
+    MIN_EXPRESSIVENESS,
+    check_expressions,
+)
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.name_rules import NAME_RULE
 from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.speech import AcousticModelName
@@ -28,8 +37,25 @@ REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at
 
 MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
-# What a browser can change; the query of its address selects shapes.
-FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
+MAX_SHOWN = 40  # letters of a client's text in an error
+_LIP_MODEL = re.compile("[a-z0-9-]{1,64}")
+# The face settings that a browser can change, and their values in words; the query of its address
+# selects shapes.
+FACE_SETTINGS = {
+    "lip_model": "the name of a lip model, such as learned",
+    "acoustic": " or ".join(AcousticModelName),
+    "expressiveness": f"a number from {MIN_EXPRESSIVENESS:g} to {MAX_EXPRESSIVENESS:g}",
+    "feeling": "a number from 0 to 1",
+    "still": "true or false",
+    "eye_contact": "true or false",
+    "listen_to": f'the name of a session, or "" for none; {NAME_RULE}',
+    "listening": "true or false",
+    "expressions": "an object that maps names to strengths from 0 to 1",
+    "hold_s": f"a number from 0 to {MAX_HOLD_S:g}",
+}
+_FORMAT_FIELDS = ("sample_rate_hz", "num_channels", "encoding")
+OPTIONS = (*_FORMAT_FIELDS, "ahead", "mouth_profile", "language")  # of a microphone
+COMMANDS = ("skip", "flush", "last", *FACE_SETTINGS)  # of a microphone
 # names in version 0.1.0, which are still accepted
 _OLD_NAMES = {"lips": "lip_model", "express": "expressions", "eof": "last"}
 
@@ -58,6 +84,7 @@ class MicrophoneOptions:
     is_ahead: bool  # audio may arrive faster than real time
     mouth_profile: bytes  # profile of the speaker; empty: average speaker
     language: str  # spoken language; empty: language of the recognizer
+    problem: str  # error about unknown fields, which are ignored; empty: all are known
 
 
 def parse_microphone_options(message: str) -> MicrophoneOptions:
@@ -66,8 +93,11 @@ def parse_microphone_options(message: str) -> MicrophoneOptions:
     Raises ``UserError`` if a field is missing or out of range; the text names the field.
     """
     fields = parse_object(message)
+    problem = find_unknown(fields, OPTIONS)
+    if fields.get("sample_rate_hz") is None:
+        raise UserError("; ".join(filter(None, ("sample_rate_hz is missing", problem))))
     pcm_format = PcmFormat(
-        sample_rate_hz=fields.get("sample_rate_hz"),  # type: ignore[arg-type] # checked there
+        sample_rate_hz=fields["sample_rate_hz"],  # type: ignore[arg-type] # checked there
         num_channels=fields.get("num_channels", 1),  # type: ignore[arg-type]
         encoding=fields.get("encoding", "s16le"),  # type: ignore[arg-type]
     )
@@ -76,6 +106,7 @@ def parse_microphone_options(message: str) -> MicrophoneOptions:
         is_ahead=bool(fields.get("ahead")),
         mouth_profile=_parse_mouth_profile(fields.get("mouth_profile", "")),
         language=_parse_language(fields.get("language", "")),
+        problem=problem,
     )
 
 
@@ -104,6 +135,7 @@ class MicrophoneCommand:
     last: bool  # no more audio follows
     num_skipped: int  # samples per channel that the client skipped
     face: dict[str, object]  # settings to change
+    problem: str  # error about unknown fields, which are ignored; empty: all are known
 
 
 def parse_command(message: str, pcm_format: PcmFormat | None = None) -> MicrophoneCommand:
@@ -114,7 +146,7 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
     """
     check_text(message)
     fields = parse_command_fields(message)
-    for name in ("sample_rate_hz", "num_channels", "encoding"):
+    for name in _FORMAT_FIELDS:
         if name in fields and pcm_format and fields[name] != getattr(pcm_format, name):
             raise UserError(f"{name} cannot change during a session; open another connection")
     num_skipped = fields.get("skip", 0)
@@ -126,24 +158,55 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
         last=bool(fields.get("last")),
         num_skipped=num_skipped,
         face={name: getattr(face, name) for name in FACE_SETTINGS} if face else {},
+        problem=find_unknown([name for name in fields if name not in _FORMAT_FIELDS], COMMANDS),
     )
 
 
 def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     """Return the face settings of a command; None if it contains none.
 
-    Raises ``UserError`` if a value is out of range.
+    Null and an empty ``lip_model`` do not count. Raises ``UserError`` if a value is invalid; the
+    text names the field, its value and the allowed values.
     """
     given = {name: fields[name] for name in FACE_SETTINGS if fields.get(name) is not None}
+    if given.get("lip_model") == "":
+        del given["lip_model"]
+    if given.keys() == {"hold_s"}:
+        raise UserError("hold_s is how long expressions last; send it with expressions")
     if isinstance(expressions := given.get("expressions"), dict):
         check_expressions(expressions, given.get("hold_s", DEFAULT_HOLD_S))
+    for name, value in given.items():
+        if not _is_setting(name, value):
+            shown = _shorten(json.dumps(value, ensure_ascii=False))
+            raise UserError(f"{name} is {shown}; it must be {FACE_SETTINGS[name]}")
+    return msgspec.convert(given, FaceSettings) if given else None
+
+
+def _is_setting(name: str, value: object) -> bool:
+    """Return whether a face setting can have this value."""
+    if name == "lip_model":
+        return isinstance(value, str) and _LIP_MODEL.fullmatch(value) is not None
+    if name == "acoustic":
+        return value in [*AcousticModelName]
     try:
-        settings = msgspec.convert(given, FaceSettings)
-    except msgspec.ValidationError as error:
-        raise UserError(str(error)) from None
-    if settings.acoustic not in (None, *AcousticModelName):
-        raise UserError("acoustic must be full or light")
-    return settings if given.keys() - {"hold_s"} else None
+        msgspec.convert({name: value}, FaceSettings)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def find_unknown(fields: Collection[str], known: Collection[str]) -> str:
+    """Return an error about a message's unknown fields; empty if all are known."""
+    unknown = [name for name in fields if name not in known]
+    if not unknown:
+        return ""
+    noun = "field" if len(unknown) == 1 else "fields"
+    return f"unknown {noun} {_shorten(', '.join(unknown))}; use {', '.join(known)}"
+
+
+def _shorten(text: str) -> str:
+    """Return a client's text, shortened for an error."""
+    return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 1] + "…"
 
 
 def parse_command_fields(message: str) -> dict[str, object]:
@@ -160,7 +223,8 @@ def parse_object(message: str | bytes) -> dict[str, object]:
         raise UserError(f"a JSON message is longer than {MAX_OBJECT_BYTES >> 10} KiB; shorten it")
     try:
         fields = parse_json(message)
-    except ValueError:
+        json.dumps(fields, ensure_ascii=False).encode()  # an error can contain any of its texts
+    except (ValueError, RecursionError):
         fields = None
     if not isinstance(fields, dict):
         raise UserError("expected a JSON object")

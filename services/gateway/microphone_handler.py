@@ -78,6 +78,8 @@ class MicrophoneHandler:
             self._session_names[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})
             await browser.send_str(browser_messages.text("opened", session=session.name))
+            if options.problem:
+                await browser.send_str(browser_messages.error_text(options.problem))
             audio_input = AudioInput(session, options.pcm_format, is_ahead=options.is_ahead)
             try:
                 async with audio_input.running():
@@ -97,6 +99,8 @@ class MicrophoneHandler:
                 await audio_input.push(message.data)
             elif message.type is WSMsgType.TEXT:
                 command = browser_messages.parse_command(message.data, pcm_format)
+                if command.problem:
+                    await browser.send_str(browser_messages.error_text(command.problem))
                 session.skip(command.num_skipped)
                 if command.flush:
                     await audio_input.flush()

@@ -25,6 +25,7 @@ from kouxing.shared.wire.speech import AcousticModelName
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
 SEND_BUFFER_BYTES = 32 * 1024  # in the kernel; about half a second for a slow viewer
+COMMANDS = ("follow", "play", "avatar", "format", *browser_messages.FACE_SETTINGS)
 PAUSE_S = 0.2  # after this time without a frame, a viewer receives the face at rest
 
 
@@ -42,7 +43,8 @@ class Viewer:
     chosen_session: str  # the requested session; empty: the newest
     shape_encoder: ShapeEncoder | None  # encodes frames as blendshapes, in addition to FAPs
     queue: ViewerQueue = field(default_factory=ViewerQueue)
-    shown_session: tuple[str, int] | None = None  # session and epoch last announced to the viewer
+    shown_session: tuple[str, int] | None = None  # session and epoch
+    announced: tuple[str, int] | str = ""  # the last one; a name: this session does not exist
     has_resting_face: bool = False  # whether it has the face at rest, from which its player starts
     last_frame_s: float = -math.inf  # when the newest frame was sent
 
@@ -194,16 +196,21 @@ class ViewerHandler:
         rate_limit = RealTimeLimit()
         try:
             async for message in browser:
+                if message.type is WSMsgType.ERROR:
+                    break  # the connection is closed; the data is an exception
                 if message.type is WSMsgType.TEXT:
-                    self._handle_command(viewer, message.data)
+                    self.handle_command(viewer, message.data)
                 num_kib = len(message.data) >> 10  # long names of an avatar take time to find
                 await rate_limit.wait(COMMAND_S * (1 + num_kib))
         finally:
             writer.cancel()
 
-    def _handle_command(self, viewer: Viewer, message: str) -> None:
+    def handle_command(self, viewer: Viewer, message: str) -> None:
+        """Execute a viewer's command, or send the viewer an error."""
         try:
             command = browser_messages.parse_command_fields(message)
+            if problem := browser_messages.find_unknown(command, COMMANDS):
+                self._put(viewer, MessageKind.TEXT, browser_messages.error_text(problem))
             session = command.get("follow")
             settings = browser_messages.parse_face_settings(command)
             lip_model = settings.lip_model if settings is not None else None
@@ -223,9 +230,12 @@ class ViewerHandler:
             elif "avatar" in command:
                 viewer.shape_encoder = parse_avatar(command)
                 self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.header_message())
-            else:
-                names = ", ".join(("follow", "play", "avatar", *browser_messages.FACE_SETTINGS))
-                raise UserError(f"the message has none of these fields: {names}")
+            elif "follow" in command:
+                raise UserError(f'follow must be the name of a session, or ""; {NAME_RULE}')
+            elif "play" in command:
+                raise UserError('play must be "sample"')
+            elif not problem:
+                raise UserError(f"the message changes nothing; use {', '.join(COMMANDS)}")
         except UserError as error:
             self._put(viewer, MessageKind.TEXT, browser_messages.error_text(str(error)))
         self._notify_viewer(viewer)
@@ -244,12 +254,14 @@ class ViewerHandler:
             self._notify_viewer(viewer)
 
     def _notify_viewer(self, viewer: Viewer) -> None:
-        """Announce the session that the viewer sees, if it has changed."""
+        """Announce the session that the viewer sees, or that none exists, if it has changed."""
         name = viewer.chosen_session or self.newest_session
         session = self._sessions.get(name)
         shown_session = (name, session.epoch) if session else None
-        if shown_session != viewer.shown_session:
-            viewer.shown_session = shown_session
+        viewer.shown_session = shown_session
+        announced = shown_session or viewer.chosen_session
+        if announced != viewer.announced:
+            viewer.announced = announced
             message = browser_messages.text(
                 "session",
                 session=name if session else None,

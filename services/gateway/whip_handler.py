@@ -211,6 +211,8 @@ class WhipHandler:
                     await session.flush()
                 if command.face:
                     await session.set_face(**command.face)
+                if command.problem:
+                    raise UserError(command.problem)
             except (UserError, KouxingError) as error:
                 if channel.readyState == "open":
                     channel.send(error_text(error))

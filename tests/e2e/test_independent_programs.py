@@ -277,7 +277,7 @@ def test_the_csharp_program_follows_through_the_gateway(system: System, tmp_path
     subprocess.run(["mcs", "--parse", *STREAM.parent.glob("*.cs")], check=True)
     subprocess.run(["mcs", f"-out:{program}", FOLDER / "Follow.cs", STREAM], check=True)
     address = system.page.replace("http", "ws").rstrip("/")
-    name, jaw, samples = "followed-by-c-sharp", 0.0, SAMPLES
+    name, jaw, samples = "avatar", 0.0, SAMPLES  # also the type of a message
     with (
         Client(system.control) as client,
         subprocess.Popen(

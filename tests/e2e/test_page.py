@@ -516,10 +516,14 @@ def test_a_file_without_sound_is_explained_in_both_languages(
 
 def test_reading_of_a_file_is_shown_and_can_be_stopped(page: Browser, tmp_path: Path) -> None:
     write_tone(tmp_path / "tone.wav")
+    (tmp_path / "empty.wav").touch()
+    choose_file(page, tmp_path / "empty.wav")
+    page.wait_for(f"{NOTICE}.includes('empty.wav')")
     page.evaluate("window.realFetch = fetch; void (window.fetch = () => new Promise(() => {}))")
     choose_file(page, tmp_path / "tone.wav")
     busy = "[...document.querySelectorAll('[aria-busy=true]')].map(({ id }) => id).join()"
     page.wait_for(f"{busy} === 'open-file'")
+    assert page.evaluate(f"{NOTICE} === ''"), "the error was about another file"
     page.click("open-file")
     page.wait_for(f"{busy} === ''")
     page.evaluate("void (window.fetch = window.realFetch)")

@@ -5,7 +5,9 @@ import socket
 from collections.abc import Iterator
 
 import pytest
+from aiohttp import WSCloseCode, WSMsgType
 
+from tests.process.web_clients import async_test, open_websockets
 from tests.system import LIMIT_S, Gateway, port_of
 
 UPGRADE = (
@@ -78,6 +80,21 @@ def test_answers_to_bad_requests_have_no_version(
     assert "cross-origin-resource-policy: same-origin" in head.lower()
     assert "server:" not in head.lower()
     assert "python" not in head.lower()
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [(b"a" * 200_000, WSCloseCode.MESSAGE_TOO_BIG), (b"\xff", WSCloseCode.INVALID_TEXT)],
+)
+@async_test
+async def test_an_invalid_message_closes_the_connection(
+    gateway: Gateway, message: bytes, code: WSCloseCode
+) -> None:
+    async with open_websockets(gateway.page, "viewer?token=secret") as (viewer,):
+        await viewer._writer.send_frame(message, WSMsgType.TEXT)  # send_str encodes UTF-8
+        while (closing := await viewer.receive(LIMIT_S)).type is not WSMsgType.CLOSE:
+            assert closing.type in (WSMsgType.TEXT, WSMsgType.BINARY)
+    assert closing.data == code
 
 
 @pytest.mark.parametrize("length", [b"Content-Length: 99999999", b"Transfer-Encoding: chunked"])

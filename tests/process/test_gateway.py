@@ -381,11 +381,14 @@ async def test_microphone_and_sample_choose_their_lips(
     async with open_websockets(gateway.page, "viewer", "microphone") as (viewer, microphone):
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
+        await microphone.send_json({"stop": True})
+        text = (await receive_json(microphone, "error"))["text"]
+        assert text.startswith("unknown field stop; use skip, flush, last, lip_model, ")
         for lips in ("learned", "dynamic-visemes"):
             await microphone.send_json({"lip_model": lips})
             await receive_json(viewer, "face", lip_model=lips)
         await viewer.send_json({"play": "sample", "lip_model": 1})
-        assert "at `$.lip_model`" in (await receive_json(viewer, "error"))["text"]
+        assert "lip_model is 1; it must be" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"lip_model": "learned"})
         assert "only for the sample sentence" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"play": "sample", "lip_model": "learned"})

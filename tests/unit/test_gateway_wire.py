@@ -41,13 +41,15 @@ def test_hello_describes_the_audio() -> None:
         '{"sample_rate_hz": 8000, "mouth_profile": "YWJj", "language": "de"}'
     )
     assert hello.language == "de"
+    assert hello.problem == ""
     assert hello.mouth_profile == b"abc"
 
 
 @pytest.mark.parametrize(
     ("fields", "field"),
     [
-        ({}, "sample_rate_hz"),
+        ({}, "^sample_rate_hz is missing$"),
+        ({"sample_rate": 16000}, "is missing; unknown field sample_rate; use sample_rate_hz, num"),
         ({"sample_rate_hz": True}, "sample_rate_hz"),
         ({"sample_rate_hz": 96000}, "sample_rate_hz"),
         ({"sample_rate_hz": 16000, "num_channels": 3}, "num_channels"),
@@ -72,14 +74,17 @@ def test_parses_microphone_commands() -> None:
         browser_messages.parse_command('{"sample_rate_hz": 48000}', pcm_format)
     assert browser_messages.parse_command('{"last": true}').last
     assert browser_messages.parse_command('{"eof": 1}').last  # as in version 0.1.0
+    for message in ('{"lips": ""}', '{"lip_model": null}'):
+        assert browser_messages.parse_command(message).face == {}
     command = browser_messages.parse_command('{"lip_model": "ferguson"}')
+    assert command.problem == ""
     assert FaceSettings(**command.face) == FaceSettings(lip_model="ferguson")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
-        ({"lip_model": 1}, r"Expected `str \| null`, got `int` - at `\$.lip_model`"),
+        ({"lip_model": 1}, "lip_model is 1; it must be the name of a lip model"),
         *(
             ({"skip": n}, "skip must be an integer")
             for n in (-1, 1.5, True, browser_messages.MAX_SKIPPED + 1)
@@ -91,7 +96,19 @@ def test_rejects_bad_microphone_commands(fields: object, error: str) -> None:
         browser_messages.parse_command(json.dumps(fields))
 
 
+def test_names_the_unknown_fields_of_a_microphone() -> None:
+    command = browser_messages.parse_command('{"stop": true, "flush": true, "encoding": "s16le"}')
+    assert command.flush
+    assert command.problem.startswith("unknown field stop; use skip, flush, last, lip_model, ")
+    command = browser_messages.parse_command(json.dumps(dict.fromkeys(["x" * 30, "y" * 30])))
+    assert command.problem.startswith(f"unknown fields {'x' * 30}, yyyyyyy…; use ")
+    options = '{"sample_rate_hz": 16000, "channels": 2}'
+    problem = browser_messages.parse_microphone_options(options).problem
+    assert problem.startswith("unknown field channels; use sample_rate_hz, num_channels, ")
+
+
 def test_parses_face_settings() -> None:
+    assert {*browser_messages.FACE_SETTINGS} == {*FaceSettings.__struct_fields__} - {"shapes"}
     assert browser_messages.parse_face_settings({"follow": "one"}) is None
     settings = browser_messages.parse_face_settings(
         {"expressions": {"joy": 1}, "hold_s": 7, "expressiveness": 2}
@@ -114,12 +131,21 @@ def test_parses_face_settings() -> None:
         ({"expressions": {"glee": 0.5}}, "glee"),
         ({"expressions": {"joy": 2}}, "joy: strength 2"),
         ({"expressions": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
-        ({"expressions": "joy"}, r"Expected `object \| null`, got `str` - at `\$.expressions`"),
-        ({"expressiveness": 3}, r"Expected `float` <= 2.0 - at `\$.expressiveness`"),
-        ({"feeling": -1}, r"Expected `float` >= 0.0 - at `\$.feeling`"),
-        ({"still": "yes"}, r"got `str` - at `\$.still`"),
-        ({"listen_to": "a b"}, r"at `\$.listen_to`"),
-        ({"acoustic": "heavy"}, "acoustic must be full or light"),
+        ({"expressions": "joy"}, 'expressions is "joy"; it must be an object that maps names'),
+        ({"expressions": [1]}, r"expressions is \[1\]; it must be an object that maps names"),
+        ({"expressiveness": 3}, "expressiveness is 3; it must be a number from 0.5 to 2"),
+        ({"expressiveness": True}, "expressiveness is true; it must be a number from 0.5 to 2"),
+        ({"feeling": -1}, "feeling is -1; it must be a number from 0 to 1"),
+        ({"still": "yes"}, 'still is "yes"; it must be true or false'),
+        ({"listen_to": "a b"}, 'listen_to is "a b"; it must be the name of a session, or "" for'),
+        ({"acoustic": "heavy"}, 'acoustic is "heavy"; it must be full or light'),
+        ({"acoustic": [1]}, r"acoustic is \[1\]; it must be full or light"),
+        ({"lip_model": "X Y!"}, 'lip_model is "X Y!"; it must be the name of a lip model'),
+        (
+            {"lip_model": ["a"] * 9999},
+            r'lip_model is \["a", .*, "a"…; it must be the name of a lip',
+        ),
+        ({"hold_s": 3}, "hold_s is how long expressions last; send it with expressions"),
     ],
 )
 def test_rejects_bad_face_settings(fields: dict[str, object], error: str) -> None:
@@ -127,7 +153,7 @@ def test_rejects_bad_face_settings(fields: dict[str, object], error: str) -> Non
         browser_messages.parse_face_settings(fields)
 
 
-@pytest.mark.parametrize("message", ["", "{", "[" * 100_000, "null", '"text"'])
+@pytest.mark.parametrize("message", ["", "{", "[" * 100_000, "null", '"text"', r'{"\ud800": 1}'])
 def test_rejects_messages_that_are_not_objects(message: str) -> None:
     with pytest.raises(UserError, match="JSON object"):
         browser_messages.parse_object(message)
@@ -183,10 +209,51 @@ def binary_types(viewer: Viewer) -> list[int]:
     return [message[0] for message in drain(viewer.queue) if isinstance(message, bytes)]
 
 
+def make_viewers() -> ViewerHandler:
+    return ViewerHandler(OpenWebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED)
+
+
+def texts(viewer: Viewer) -> list[dict[str, Any]]:
+    """Return the queued JSON messages, without the status."""
+    messages = [json.loads(text) for text in drain(viewer.queue) if isinstance(text, str)]
+    return [message for message in messages if message["type"] != "status"]
+
+
+def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
+    viewers = make_viewers()
+    with viewers.connect_viewer("", None) as viewer:
+        assert texts(viewer) == []
+    with viewers.connect_viewer("talk", None) as viewer:
+        (message,) = texts(viewer)
+        assert (message["session"], message["chosen"]) == (None, "talk")
+        viewers.add_session("other", 1, "learned")
+        assert texts(viewer) == []
+        viewers.add_session("talk", 1, "learned")
+        assert [message["session"] for message in texts(viewer)] == ["talk"]
+        viewers.remove_session("talk")
+        assert [message["session"] for message in texts(viewer)] == [None]
+
+
+@pytest.mark.parametrize(
+    ("command", "error"),
+    [
+        ({"stop": True}, "unknown field stop; use follow, play, avatar, "),
+        ({"follow": "a b"}, 'follow must be the name of a session, or ""'),
+        ({"play": "song"}, 'play must be "sample"'),
+        ({"lip_model": ""}, "the message changes nothing; use follow, play, avatar, "),
+        ({}, "the message changes nothing; use follow, play, avatar, "),
+    ],
+)
+def test_answers_commands_of_viewers_without_effect(command: dict[str, object], error: str) -> None:
+    viewers = make_viewers()
+    with viewers.connect_viewer("", None) as viewer:
+        viewers.handle_command(viewer, json.dumps(command))
+        (message,) = texts(viewer)
+        assert message["text"].startswith(error)
+
+
 def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
-    viewers = ViewerHandler(
-        OpenWebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, UNUSED
-    )
+    viewers = make_viewers()
     face = RestingFace(seed=0)
     frame = np.zeros(68, "<f4").tobytes()
     viewers.add_session("talk", 1, "learned")

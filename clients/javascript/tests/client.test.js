@@ -55,5 +55,22 @@ test("speech returns as frames, shapes, phones and sound", async () => {
 
 test("a refused session is rejected with the reason", async () => {
   await assert.rejects(Speaker.open(GATEWAY, { sampleRateHz: 1000 }), /sample_rate_hz must be/);
-  await assert.rejects(Speaker.open("http://127.0.0.1:1"), /cannot connect/);
+  await assert.rejects(Speaker.open("http://127.0.0.1:1"), /no gateway at .*kouxing run/);
+});
+
+test("older versions of Node get an error", async () => {
+  const { WebSocket } = globalThis;
+  try {
+    globalThis.WebSocket = class {
+      constructor() {
+        queueMicrotask(() => this.onerror()); // as in Node 22, without onclose
+      }
+    };
+    await assert.rejects(Speaker.open(GATEWAY), /no gateway at .*kouxing run/);
+    globalThis.WebSocket = undefined; // as in Node 20
+    await assert.rejects(Speaker.open(GATEWAY), /needs Node 22 or newer/);
+    assert.throws(() => new Viewer(GATEWAY, {}), /needs Node 22 or newer/);
+  } finally {
+    globalThis.WebSocket = WebSocket;
+  }
 });

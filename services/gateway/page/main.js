@@ -40,6 +40,7 @@ const speech = new SpeechControls(sound, {
   lipModel: chosenLipModel,
   level: (value) => meter.raise(value),
   error: showError,
+  fileStarted: () => notice.clear(), // an error about the file before it
   fileEnded(file) {
     const isShown = gateway.session !== null && gateway.session === speech.session;
     if (isShown && !caption.hasSpeech) showNews(translate("noSpeech", { file }));

@@ -15,8 +15,7 @@ export class SpeechControls {
   /**
    * @param {Sound} sound the session's sound
    * @param handlers { mouthProfile(), language(), lipModel(), level(rms), fileEnded(name), error({ code, text }): as
-   *   of Microphone,
-   *   news(text), session(name): the microphone's session, null when it ends }
+   *   of Microphone, fileStarted(), news(text), session(name): the microphone's session, null when it ends }
    */
   constructor(sound, handlers) {
     this.#sound = sound;
@@ -84,6 +83,7 @@ export class SpeechControls {
 
   #speakFile(file) {
     this.unblockSound();
+    this.#handlers.fileStarted();
     this.microphone.startFile(file);
   }
 

@@ -207,6 +207,13 @@ export class Notice {
     showNotice(text, kind);
   }
 
+  /** Remove news and errors. */
+  clear() {
+    clearTimeout(this.#newsTimer);
+    this.#newsTimer = null;
+    this.showHint("");
+  }
+
   /** Show a hint unless news is shown; "" shows no hint. */
   showHint(text) {
     if (this.#newsTimer === null) showNotice(text, "hint");

@@ -41,7 +41,7 @@ export class ViewerSocket {
   /** Disconnect and stop reconnecting. */
   close() {
     clearTimeout(this.#retryTimer);
-    this.#socket.onclose = null;
+    this.#socket.onclose = this.#socket.onerror = null;
     this.#socket.close();
     this.#handlers.state(false);
   }
@@ -54,7 +54,9 @@ export class ViewerSocket {
       this.#handlers.state(true);
     };
     socket.onmessage = (event) => this.#receive(event.data);
-    socket.onclose = () => {
+    // Node 22 reports a failed connection only as an error.
+    socket.onclose = socket.onerror = () => {
+      socket.onclose = socket.onerror = null;
       this.#handlers.state(false);
       this.#retryTimer = setTimeout(() => this.#connect(), this.#retryMs);
       this.#retryMs = Math.min(RETRY_MS.max, this.#retryMs * 2);
