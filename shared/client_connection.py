@@ -16,11 +16,13 @@ def connect_client(
     """Connect to control; on leaving, raise a ``KouxingError`` as a ``UserError``.
 
     ``control`` is the address and, with encryption, control's public key, as ``control_endpoint``
-    returns it. If ``key`` is None, the user's key is used.
+    returns it. If ``key`` is None, the user's key is used. Control may start within ``timeout_s``.
     """
     try:
         insecure = " " not in control
-        with Client(control, key=key, insecure=insecure, timeout_s=timeout_s) as client:
+        with Client(
+            control, key=key, insecure=insecure, timeout_s=timeout_s, start_s=timeout_s
+        ) as client:
             yield client
     except Refused as refusal:
         raise UserError(refusal.text) from refusal

@@ -243,11 +243,16 @@ class Supervisor:
 
 
 def _console_text(line: bytes) -> str:
-    """Return what the console shows of a log line: warnings, errors, and text that is not JSON."""
+    """Return what the console shows of a log line: warnings, errors, and text that is not JSON.
+
+    The text of a warning or an error names its session.
+    """
     try:
         entry = json.loads(line)
         if entry["level"] not in ("warning", "error", "critical"):
             return ""
-        return "\n".join(str(entry[key]) for key in ("message", "traceback") if key in entry)
+        text = "\n".join(str(entry[key]) for key in ("message", "traceback") if key in entry)
+        session = entry.get("session", "")
+        return text if not session or repr(session) in text else f"session {session!r}: {text}"
     except (ValueError, KeyError, TypeError):
         return line.decode("utf-8", "replace").rstrip()

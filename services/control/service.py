@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from kouxing.services.control.config import ControlConfig
+from kouxing.services.control.face_check import check_face
 from kouxing.services.control.fault_log import FaultLog
 from kouxing.services.control.kind import KIND
 from kouxing.services.control.placement import Placement
@@ -165,6 +166,7 @@ class ControlService(Service):
                 known = None
         if known is not None and not known.announced:
             return None  # the services are starting
+        check_face(message.face)
         record = self._sessions.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})
         self._lifecycle.send_start(record, record.waiting_for)
@@ -182,6 +184,7 @@ class ControlService(Service):
         return _done(message)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
+        check_face(message.face)
         if message.session == "":  # the face at rest, which only observers show
             self._resting_face.change(message.face, time.monotonic())
             for instance in self._registry.observers():

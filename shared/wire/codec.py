@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from kouxing.shared.field_errors import describe_field_error
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import DOCUMENT, VERSION, Message, Version
 
@@ -75,7 +76,7 @@ def decode(parts: Sequence[bytes]) -> Message:
         message: Message = decoder.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         _check_version(kind, _read_version(body))
-        raise BadMessage("body", f"{kind}: {error}") from None
+        raise BadMessage("body", f"{kind}: {describe_field_error(error)}") from None
     _check_version(kind, message.version)
     if message.session != session:
         raise BadMessage("topic", "topic and body name different sessions")

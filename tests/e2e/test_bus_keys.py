@@ -207,8 +207,12 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
 @pytest.mark.parametrize(
     ("endpoint", "is_plain", "error_text"),
     [
-        ("tcp://127.0.0.1:1", False, "only the service at .* has insecure"),
-        ("tcp://127.0.0.1:1 " + "a" * 40, True, "only this process has insecure"),
+        ("tcp://127.0.0.1:1", False, "tcp://127.0.0.1:1 uses no encryption, but this program does"),
+        (
+            "tcp://127.0.0.1:1 " + "a" * 40,
+            True,
+            "tcp://127.0.0.1:1 uses encryption, but this program does not",
+        ),
         ("tcp://-:1", True, "is not an endpoint"),
         ("tcp://127.0.0.1:0 short", False, "cannot connect"),
         ("udp://127.0.0.1:1", True, "is not an endpoint"),

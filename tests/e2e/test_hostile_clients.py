@@ -196,6 +196,16 @@ def test_rejects_nan_and_accepts_empty_chunks_silence_and_clipping(
     assert np.isfinite(streamed.faps).all()
 
 
+def test_the_results_report_audio_of_another_encoding(client: Client) -> None:
+    samples = samples_of_file(DEMO / "hello-female.wav")
+    with client.open_session(paced=False) as session:
+        frames = session.frames()
+        session.push(samples.tobytes())
+        session.finish()
+        with pytest.raises(Refused, match=r"bad-audio: .* perhaps 32-bit float samples"):
+            list(frames)
+
+
 def test_the_error_names_an_unknown_session(client: Client, bus: Bus, witness: Session) -> None:
     audio = bus.connect_dealer(witness.info["audio"])
     audio.send(AudioChunk(session="nobody", token="t", sequence=1, pcm=b""))

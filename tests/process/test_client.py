@@ -8,12 +8,15 @@ import os
 import socket
 from array import array
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from kouxing_client import (
     AsyncClient,
+    AsyncResults,
     Client,
     FapFrame,
     KouxingError,
@@ -23,7 +26,7 @@ from kouxing_client import (
     find_key,
 )
 
-from kouxing.shared.keys import load_user_key
+from kouxing.shared.keys import add_key, load_user_key
 from kouxing.shared.wire import face, speech
 from kouxing.shared.wire.control import Event
 from kouxing.shared.wire.face import SetFace
@@ -111,8 +114,7 @@ def test_refusals_of_requests_and_of_audio_are_reported(
     session = client.open_session("s")
     session.push(CHUNK)
     wait_until(lambda: control.audio_messages)
-    error = Error(session="s", code="bad-audio", text="x")
-    control.run_job(lambda: control.audio.send(error, to=control.audio_sender))
+    send_audio_error(control)
     wait_until(lambda: session._core.errors)
     with pytest.raises(Refused, match="bad-audio: x"):
         session.push(CHUNK)
@@ -121,6 +123,94 @@ def test_refusals_of_requests_and_of_audio_are_reported(
     with pytest.raises(Refused, match="no-service: start one") as caught:
         client.open_session()
     assert caught.value.code == "no-service"
+
+
+def send_audio_error(control: FakeControl) -> None:
+    """Let the recognizer report an error about the audio of the session ``s``."""
+    error = Error(session="s", code="bad-audio", text="x")
+    control.run_job(lambda: control.audio.send(error, to=control.audio_sender))
+
+
+def test_the_results_report_rejected_audio_that_no_push_has_reported(
+    control: FakeControl, client: Client
+) -> None:
+    session = client.open_session("s")
+    frames = session.frames()
+    session.push(CHUNK)
+    session.finish()
+    wait_until(lambda: control.audio_messages and control.audio_messages[-1].last)
+    send_audio_error(control)
+    wait_until(lambda: session._core.errors)
+    control.publish(control.faps, frame(1), END)
+    assert frames.get() is not None
+    with pytest.raises(Refused, match="bad-audio: x"):
+        frames.get()
+    assert list(frames) == []
+
+
+def test_audio_after_its_end_is_refused(client: Client) -> None:
+    session = client.open_session("s")
+    session.finish()
+    session.finish()
+    for push in (session.push, session.try_push):
+        with pytest.raises(KouxingError, match=r"has ended \(finish\); open another session"):
+            push(CHUNK)
+
+
+def test_refuses_an_array_with_another_number_of_channels(client: Client) -> None:
+    session = client.open_session("s")
+    with pytest.raises(KouxingError, match="num_channels=1"):
+        session.push(np.zeros((1600, 2), np.int16))
+
+
+def test_a_key_may_be_a_path(control: FakeControl, tmp_path: Path) -> None:
+    add_key("laptop", ["client"], tmp_path / "laptop.key")
+    for path in (tmp_path / "laptop.key", str(tmp_path / "laptop.key")):
+        with Client(control.address, key=path) as client:
+            assert not client.is_closed
+    with pytest.raises(KouxingError, match=r"none\.key: No such file"):
+        Client(control.address, key=tmp_path / "none.key")
+
+
+@pytest.mark.parametrize(
+    ("address", "insecure", "text"),
+    [
+        ("127.0.0.1:5550", True, "cannot connect to '127.0.0.1:5550': .*; write tcp://HOST:PORT"),
+        ("tcp://127.0.0.1:1 " + "a" * 40, True, "tcp://127.0.0.1:1 uses encryption, but this"),
+    ],
+)
+def test_refuses_an_address_that_cannot_work(address: str, *, insecure: bool, text: str) -> None:
+    with pytest.raises(KouxingError, match=text):
+        Client(address, insecure=insecure)
+
+
+def test_unknown_keywords_and_names_are_refused(client: Client) -> None:
+    options: dict[str, Any] = {"sample_rate": 48000}
+    with pytest.raises(TypeError, match="did you mean 'sample_rate_hz'"):
+        client.open_session(**options)
+    settings: dict[str, Any] = {"lip_mode": "learned"}
+    with pytest.raises(TypeError, match="did you mean 'lip_model'"):
+        client.set_face("s", **settings)
+    with pytest.raises(KouxingError, match="'a b' is not a session's name"):
+        client.set_face("a b", still=True)
+
+
+def test_results_may_be_read_in_several_event_loops(control: FakeControl) -> None:
+    client = AsyncClient(control.address, insecure=True)
+
+    async def read(frames: AsyncResults[FapFrame]) -> float:
+        return (await frames.__anext__()).values[0]
+
+    async def subscribe() -> AsyncResults[FapFrame]:
+        return await (await client.open_session("s")).frames()
+
+    frames = asyncio.run(subscribe())
+    with ThreadPoolExecutor() as pool:
+        readers = [pool.submit(asyncio.run, read(frames)) for _ in range(2)]
+        wait_until(lambda: len(frames._signal._tasks) == 2)
+        control.publish(control.faps, frame(1), frame(2))
+        assert {reader.result() for reader in readers} == {1.0, 2.0}
+    asyncio.run(client.close())
 
 
 def test_a_session_that_control_closes_ends(control: FakeControl, client: Client) -> None:

@@ -5,7 +5,7 @@ from array import array
 import numpy as np
 import pytest
 from kouxing_client import KouxingError
-from kouxing_client.audio import RESEND_S, AudioStream, to_pcm
+from kouxing_client.audio import RESEND_S, AudioStream, check_channels, to_pcm
 
 CHUNK = 1600  # samples: 100 ms
 
@@ -91,3 +91,14 @@ def test_rejects_numbers_far_beyond_1(audio: object, encoding: str) -> None:
     """They are usually 16-bit samples in a list or in an array of another type."""
     with pytest.raises(KouxingError, match=r"16-bit integers .*, or floats within ±1, not "):
         to_pcm(audio, encoding)
+
+
+def test_rejects_an_array_with_another_number_of_channels() -> None:
+    for audio in (b"", FLOATS, np.zeros(4), np.zeros((4, 2))):
+        check_channels(audio, 2)
+    check_channels(np.zeros((4, 1)), 1)
+    with pytest.raises(KouxingError, match=r"shape \(4, 2\), .* num_channels=1; push .* \(n, 1\)"):
+        check_channels(np.zeros((4, 2)), 1)
+    for shape in ((2, 4), (4, 2, 1)):
+        with pytest.raises(KouxingError, match="num_channels=2"):
+            check_channels(np.zeros(shape), 2)

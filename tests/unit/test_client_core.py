@@ -8,6 +8,7 @@ from kouxing_client.audio import ANSWER_LIMITS_S
 from kouxing_client.core import RETRY_S, ClientCore
 from kouxing_client.inbox import Inbox
 from kouxing_client.messages import Joined
+from kouxing_client.reach import NO_LISTENER
 from kouxing_client.session_core import (
     MOVE_LIMIT_S,
     RESUBSCRIBE_S,
@@ -19,6 +20,7 @@ from kouxing_client.session_core import (
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.fake_sockets import FakeConnection, FakeSockets
 
+START_S = 2.0
 OPENED = {
     "epoch": 1,
     "token": "t",
@@ -46,7 +48,7 @@ class CoreHarness:
 
     def __init__(self, *, paced: bool = True) -> None:
         self.sockets = FakeSockets()
-        self.core = ClientCore(cast(Any, self.sockets), "control", 10.0)
+        self.core = ClientCore(cast(Any, self.sockets), "control", 10.0, START_S)
         opening = self.core.open_session({"sample_rate_hz": 16000, "paced": paced})
         self.answer("session-opened", **OPENED)
         self.session: SessionCore = opening.result()
@@ -115,6 +117,34 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     assert "control does not answer: another program" in str(answer.exception(0))
     harness.pass_time(10.0)
     assert harness.sockets.num_explained == 3  # an idle client does not connect again and again
+
+
+@pytest.mark.parametrize("reason", [NO_LISTENER, "the connection times out"])
+def test_reports_early_that_nothing_listens_at_an_address(reason: str) -> None:
+    sockets = FakeSockets()
+    core = ClientCore(cast(Any, sockets), "control", 10.0, START_S)
+    sockets.reach_error = reason
+    answer = core.request("flush-session", "s")
+    for _ in range(2):
+        assert not answer.done()
+        sockets.now_s += 0.6 * START_S
+        core.tick()
+    assert answer.done() == (reason == NO_LISTENER)
+    core.tick()
+    assert sockets.num_explained == 1
+    sockets.now_s += 10.0
+    core.tick()
+    assert reason in str(answer.exception(0))
+
+
+def test_a_restarting_control_has_the_whole_time_limit() -> None:
+    harness = CoreHarness()
+    harness.sockets.reach_error = NO_LISTENER
+    answer = harness.core.request("flush-session", "s")
+    harness.pass_time(9.9)
+    assert not answer.done()
+    harness.answer("done")
+    assert answer.done()
 
 
 def test_status_collects_all_pages() -> None:

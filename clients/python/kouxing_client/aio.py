@@ -11,12 +11,10 @@ from kouxing_client.base import (
     BaseClient,
     BaseResults,
     BaseSession,
-    FaceSettings,
-    SessionOptions,
-    open_fields,
 )
 from kouxing_client.errors import Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
+from kouxing_client.options import FaceSettings, SessionOptions, face_fields, open_fields
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -54,7 +52,7 @@ class AsyncClient(BaseClient):
 
     async def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
         """Change the face of any session, as ``Client.set_face``."""
-        await self.request("set-face", session, face=settings)
+        await self.request("set-face", session, face=face_fields(settings))
 
     async def request(self, kind: str, session: str = "", **fields: object) -> Fields:
         """Send a request, as ``Client.request``."""
@@ -88,7 +86,7 @@ class AsyncSession(BaseSession):
 
     async def set_face(self, **settings: Unpack[FaceSettings]) -> None:
         """Change the face, as ``Client.set_face``."""
-        await asyncio.wrap_future(self._request("set-face", {"face": settings}))
+        await asyncio.wrap_future(self._request("set-face", {"face": face_fields(settings)}))
 
     async def close(self) -> None:
         """Close the session, as ``Session.close``."""
@@ -129,7 +127,7 @@ class AsyncSession(BaseSession):
         inbox, close, joined = self._subscribe(classes, shape_set, keep_all)
         try:
             await asyncio.wait_for(asyncio.wrap_future(joined), self._thread.timeout_s)
-        except TimeoutError:
+        except asyncio.TimeoutError:  # noqa: UP041 - another class in Python 3.10
             raise self._join_error() from None
         if added := self._request_shapes(shape_set):
             await asyncio.wrap_future(added)
@@ -137,14 +135,17 @@ class AsyncSession(BaseSession):
 
 
 class AsyncResults(BaseResults, Generic[T]):
-    """Results of one session. Iteration ends with the session's last frame."""
+    """Results of one session. Iteration ends with the session's last frame.
+
+    At the end, it raises an error about the audio that neither ``push`` nor ``finish`` has raised.
+    """
 
     def __aiter__(self) -> AsyncResults[T]:
         return self
 
     async def __anext__(self) -> T:
         await self._signal.wait_async(self._has_results)
-        result = self._take()
+        result = self._take_or_fail()
         if result is None:
             raise StopAsyncIteration
         return cast(T, result)

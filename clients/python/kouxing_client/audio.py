@@ -27,6 +27,16 @@ QUICK_ANSWER_S = 2.5  # up to this wait, the round trip measured before limits a
 MAX_TIMED = 200  # messages whose send time is remembered
 
 
+def check_channels(audio: Any, num_channels: int) -> None:
+    """Raise ``KouxingError`` if audio is an array with another number of channels."""
+    shape = getattr(audio, "shape", ())
+    if len(shape) > 1 and shape[1:] != (num_channels,):
+        raise KouxingError(
+            f"the audio has the shape {shape}, but the session has num_channels={num_channels};"
+            f" push an array of shape (n, {num_channels}), or open the session for its channels"
+        )
+
+
 def to_pcm(audio: Any, encoding: str) -> bytes:
     """Convert audio to interleaved PCM of an encoding.
 

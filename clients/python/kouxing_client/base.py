@@ -1,17 +1,19 @@
 """The common base of ``Client`` and ``AsyncClient``: arguments, audio formats and waiting."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, TypedDict
+from pathlib import Path
+from typing import Any
 
-from kouxing_client.audio import SAMPLE_BYTES, split, to_pcm
+from kouxing_client.audio import SAMPLE_BYTES, check_channels, split, to_pcm
 from kouxing_client.core import ClientCore
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.inbox import Inbox
-from kouxing_client.keys import Key, find_key
-from kouxing_client.messages import MEDIA_RATE_HZ, Fields, Result
+from kouxing_client.keys import Key, find_key, read_key
+from kouxing_client.messages import Fields, Result
+from kouxing_client.options import check_name
 from kouxing_client.session_core import SessionCore, Subscription
 from kouxing_client.thread import ClientThread
 
@@ -23,56 +25,6 @@ MAX_UNACKNOWLEDGED = 500  # messages; then the sender waits
 LAST_ANSWER_S = 2.0  # limit for delivering the end of the audio before a session closes
 
 
-class FaceSettings(TypedDict, total=False):
-    """How a face moves. Omitted settings keep their values."""
-
-    lip_model: str
-    """name of the lip model"""
-    acoustic: str
-    """acoustic model: ``full``, or ``light`` with less processor time and more errors"""
-    expressions: Mapping[str, float]
-    """strengths from 0 to 1 by name; they replace the current ones, and ``{}`` removes them"""
-    hold_s: float
-    """time until the expressions fade, s"""
-    expressiveness: float
-    """scale of the mouth movements, 0.5 to 2"""
-    feeling: float
-    """how strongly the face shows the emotion in the voice, 0 to 1"""
-    still: bool
-    """whether to keep the head and the brows still"""
-    eye_contact: bool
-    """whether the eyes always look at the viewer"""
-    listen_to: str
-    """session to which the face listens: it looks at the viewer and nods in pauses; or ``""``"""
-    listening: bool
-    """whether a person without a session is speaking, so that the face listens"""
-    shapes: Sequence[str]
-    """blendshape sets to publish in addition to FAPs"""
-
-
-class SessionOptions(TypedDict, total=False):
-    """How to open a session."""
-
-    sample_rate_hz: int
-    """of the audio, 8000 to 48000; default: 16000"""
-    num_channels: int
-    """of the audio: 1 (the default) or 2"""
-    encoding: str
-    """of pushed bytes and of messages: ``s16le`` (the default) or ``f32le``"""
-    paced: bool
-    """False: audio arrives faster than real time"""
-    language: str | None
-    """spoken language: ``auto``, a code or a name; None: the recognizer's"""
-    shapes: Sequence[str]
-    """sets of blendshapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``"""
-    face: FaceSettings
-    """settings of the face"""
-    mouth_profile: bytes | None
-    """the speaker's, from ``kouxing adapt``"""
-    record: bool
-    """whether the driver writes a video"""
-
-
 class BaseClient:
     """A connection to a running system.
 
@@ -82,11 +34,14 @@ class BaseClient:
         Address of control; default ``$KOUXING_CONTROL``, else ``tcp://127.0.0.1:5550``. Control's
         public key may follow after a space.
     key
-        Key of this program; default: the user's own key (``find_key``).
+        Key of this program, or the path of its file; default: the user's own key (``find_key``).
     insecure
         Whether the system has ``insecure = true``, so that nothing is encrypted.
     timeout_s
         Time limit for an answer.
+    start_s
+        Time for control to start: a request fails after this time if nothing listens at its
+        address and it has not answered yet.
 
     Raises
     ------
@@ -98,13 +53,16 @@ class BaseClient:
         self,
         control: str | None = None,
         *,
-        key: Key | None = None,
+        key: Key | str | Path | None = None,
         insecure: bool = False,
         timeout_s: float = 10.0,
+        start_s: float = 2.0,
     ) -> None:
         control = control or os.environ.get("KOUXING_CONTROL") or CONTROL
+        if isinstance(key, str | Path):
+            key = read_key(key)
         key = None if insecure else key or find_key()
-        self._thread = ClientThread(control, key, timeout_s)
+        self._thread = ClientThread(control, key, timeout_s, start_s)
 
     @property
     def is_closed(self) -> bool:
@@ -112,6 +70,7 @@ class BaseClient:
         return not self._thread.is_running
 
     def _request(self, kind: str, session: str, fields: Fields) -> Future[Fields]:
+        check_name(session)
         return self._thread.submit(lambda core: core.request(kind, session, **fields))
 
 
@@ -155,9 +114,10 @@ class BaseSession:
         Raises
         ------
         KouxingError
-            If the session has ended, or another program opened it.
+            If the audio or the session has ended, or another program opened the session.
         """
         self._num_frames(pcm)
+        self._check_unfinished()
         self._check_open()
         if not self._has_room():
             return False
@@ -208,9 +168,13 @@ class BaseSession:
 
     def _chunks(self, audio: Any) -> Iterator[tuple[bytes, int]]:
         """Yield messages of PCM and their number of samples per channel."""
-        pcm = self._partial_sample + to_pcm(audio, (self._options or {}).get("encoding", "s16le"))
-        end = len(pcm) // self._frame_bytes * self._frame_bytes
+        self._check_sender()
         self._check()
+        self._check_unfinished()
+        options = self._options or {}
+        check_channels(audio, options["num_channels"])
+        pcm = self._partial_sample + to_pcm(audio, options["encoding"])
+        end = len(pcm) // self._frame_bytes * self._frame_bytes
         pcm, self._partial_sample = pcm[:end], pcm[end:]
         for chunk in split(pcm, CHUNK_BYTES):
             yield chunk, self._num_frames(chunk)
@@ -260,6 +224,7 @@ class BaseSession:
         inbox = Inbox(MAX_LIVE if core.is_live and not keep_all else None)
         subscription = Subscription(core, classes, shape_set, inbox, on_result)
         thread.call(lambda: core.subscribe(subscription))
+        inbox.errors = core.errors
         close = partial(thread.call, lambda: core.unsubscribe(subscription))
         return inbox, close, subscription.joined
 
@@ -290,6 +255,10 @@ class BaseSession:
         self._check_open()
         if self._core.errors:
             raise self._core.errors.popleft()
+
+    def _check_unfinished(self) -> None:
+        if self._has_finished:
+            raise KouxingError("the audio of this session has ended (finish); open another session")
 
     def _check_open(self) -> None:
         if self._core.is_over:
@@ -340,18 +309,9 @@ class BaseResults:
             raise self._inbox.failure
         return None
 
-
-def open_fields(name: str, options: SessionOptions) -> Fields:
-    """Return the fields of ``open-session``."""
-    fields: Fields = {
-        "session": name,
-        "sample_rate_hz": MEDIA_RATE_HZ,
-        "num_channels": 1,
-        "encoding": "s16le",
-        **options,
-    }
-    if fields["encoding"] not in SAMPLE_BYTES:
-        raise KouxingError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
-    if shapes := fields.pop("shapes", ()):
-        fields["face"] = {**fields.get("face", {}), "shapes": list(shapes)}
-    return fields
+    def _take_or_fail(self) -> Any:
+        """Return the next result, or None; at the end, raise an error that no push has raised."""
+        result = self._take()
+        if result is None and self._inbox.is_over and self._inbox.errors:
+            raise self._inbox.errors.popleft()
+        return result

@@ -12,12 +12,10 @@ from kouxing_client.base import (
     BaseClient,
     BaseResults,
     BaseSession,
-    FaceSettings,
-    SessionOptions,
-    open_fields,
 )
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
+from kouxing_client.options import FaceSettings, SessionOptions, face_fields, open_fields
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -66,7 +64,7 @@ class Client(BaseClient):
 
     def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
         """Change the face of any session. ``FaceSettings`` lists the keywords."""
-        self.request("set-face", session, face=settings)
+        self.request("set-face", session, face=face_fields(settings))
 
     def request(self, kind: str, session: str = "", **fields: object) -> Fields:
         """Send a request of PROTOCOL.md and return the fields of the answer."""
@@ -99,7 +97,8 @@ class Session(BaseSession):
         Refused
             If the recognizer rejected earlier audio; the session continues.
         KouxingError
-            If the session has ended, another program opened it, or the wait timed out.
+            If the audio is not valid or has ended, the session has ended, another program opened
+            it, or the wait timed out.
         """
         for pcm, num_frames in self._chunks(audio):
             if not self._signal.wait(self._can_push, timeout_s):
@@ -120,7 +119,7 @@ class Session(BaseSession):
 
     def set_face(self, **settings: Unpack[FaceSettings]) -> None:
         """Change the face. ``FaceSettings`` lists the keywords."""
-        self._request("set-face", {"face": settings}).result()
+        self._request("set-face", {"face": face_fields(settings)}).result()
 
     def close(self) -> None:
         """Close the connections of the session, and the session if this program opened it."""
@@ -189,7 +188,10 @@ class Session(BaseSession):
 
 
 class Results(BaseResults, Generic[T]):
-    """Results of one session. Iteration ends with the session's last frame."""
+    """Results of one session. Iteration ends with the session's last frame.
+
+    At the end, it raises an error about the audio that neither ``push`` nor ``finish`` has raised.
+    """
 
     def __iter__(self) -> Results[T]:
         return self
@@ -207,12 +209,18 @@ class Results(BaseResults, Generic[T]):
         ------
         KouxingError
             If the session failed before its last frame.
+        Refused
+            At the end, if the recognizer rejected audio and no ``push`` or ``finish`` raised it.
         """
         self._signal.wait(self._has_results, timeout_s)
-        return cast("T | None", self._take())
+        return cast("T | None", self._take_or_fail())
 
     def available(self, timeout_s: float = 0.0) -> Iterator[T]:
-        """Wait for a result, then yield all that have arrived. Raises the errors of ``get``."""
-        while (result := self.get(timeout_s)) is not None:
-            yield result
-            timeout_s = 0.0
+        """Wait for a result, then yield all that have arrived.
+
+        Raises ``KouxingError`` if the session failed before its last frame. ``take_errors`` of the
+        session returns errors about the audio.
+        """
+        self._signal.wait(self._has_results, timeout_s)
+        while (result := self._take()) is not None:
+            yield cast(T, result)

@@ -26,6 +26,7 @@ from kouxing_client.messages import (
     kind_of,
     topic,
 )
+from kouxing_client.reach import NO_LISTENER
 from kouxing_client.session_core import SILENT_S, SessionCore, refused
 
 if TYPE_CHECKING:
@@ -43,6 +44,8 @@ class _Request:
     parts: list[bytes]
     answer: Future[Fields]
     end_s: float
+    start_s: float  # then control must have started
+    is_checked: bool = False  # whether the address was checked after ``start_s``
     retry_s: float = 0.0
 
 
@@ -52,11 +55,13 @@ class ClientCore:
     For the parameters, see ``ClientThread``; ``control`` includes control's public key.
     """
 
-    def __init__(self, sockets: Sockets, control: str, timeout_s: float) -> None:
+    def __init__(self, sockets: Sockets, control: str, timeout_s: float, start_s: float) -> None:
         self.sessions: list[SessionCore] = []
         self._sockets = sockets
         self._control = control
         self._timeout_s = timeout_s
+        self._start_s = start_s
+        self._has_started = False  # control has sent something
         self._requests: dict[str, _Request] = {}
         self._refused_s = math.inf  # when control started to reject this key
         self._is_diagnosing = False  # searching for the reason why control does not answer
@@ -69,8 +74,10 @@ class ClientCore:
         """Send a request to control; the future gets the answer's fields, or ``Refused``."""
         name = secrets.token_hex(8)
         parts = encode(kind, session, {**fields, "request": name})
-        end_s = self._sockets.now_s + self._timeout_s
-        request = self._requests[name] = _Request(parts, new_future(), end_s)
+        now_s = self._sockets.now_s
+        request = self._requests[name] = _Request(
+            parts, new_future(), now_s + self._timeout_s, now_s + self._start_s
+        )
         self._send(request)
         return request.answer
 
@@ -127,9 +134,8 @@ class ClientCore:
         now_s = self._sockets.now_s
         has_failed = bool(self.sessions) and self._is_refused()
         for request in self._requests.values():
-            if now_s > request.end_s:
-                has_failed = True
-            elif now_s >= request.retry_s:
+            has_failed |= now_s > request.end_s or self._is_late(request)
+            if request.retry_s <= now_s <= request.end_s:
                 self._send(request)
         if has_failed and not self._is_diagnosing:
             self._is_diagnosing = True
@@ -170,13 +176,20 @@ class ClientCore:
         """Return whether control has rejected this key for longer than a temporary penalty."""
         return self._sockets.now_s > self._refused_s + self._timeout_s
 
+    def _is_late(self, request: _Request) -> bool:
+        """Return whether control should have started, and its address is not checked yet."""
+        is_due = self._sockets.now_s > request.start_s
+        return is_due and not request.is_checked and not self._has_started
+
     def _fail_requests(self, reason: str) -> None:
         """End requests without an answer, and all sessions if control rejects this key."""
         self._is_diagnosing = False
         failure = KouxingError(self._failure(reason))
         for name, request in list(self._requests.items()):
-            if self._sockets.now_s > request.end_s:
+            is_unanswerable = self._is_late(request) and reason == NO_LISTENER
+            if self._sockets.now_s > request.end_s or is_unanswerable:
                 self._requests.pop(name).answer.set_exception(failure)
+            request.is_checked = self._sockets.now_s > request.start_s
         if self._is_refused():
             for session in self.sessions:
                 session.end(failure)
@@ -238,6 +251,7 @@ class ClientCore:
     def _on_command(self, parts: list[bytes]) -> None:
         if (message := decode(parts)) is None:
             return
+        self._has_started = True
         kind, fields = message
         if kind == "session-moved":
             self._on_moved(fields)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-from kouxing_client.errors import KouxingError
+from kouxing_client.errors import KouxingError, Refused
 
 
 def new_future() -> Future[Any]:
@@ -19,20 +19,19 @@ def new_future() -> Future[Any]:
 
 
 class Signal:
-    """Wakes the threads, and the tasks of one event loop, that wait for a change."""
+    """Wakes the threads, and the tasks of any event loop, that wait for a change."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._event = asyncio.Event()
+        self._tasks: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
 
     def notify(self) -> None:
         """Report a change; any thread may call this."""
         with self._condition:
             self._condition.notify_all()
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the event loop is closed
-                self._loop.call_soon_threadsafe(self._event.set)
+            for loop, event in self._tasks:
+                with contextlib.suppress(RuntimeError):  # the event loop is closed
+                    loop.call_soon_threadsafe(event.set)
 
     def wait(self, condition: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Block the thread until a condition holds; return whether it does."""
@@ -41,11 +40,19 @@ class Signal:
 
     async def wait_async(self, condition: Callable[[], bool]) -> None:
         """Wait in a task until a condition holds."""
-        self._loop = asyncio.get_running_loop()
-        while not condition():
-            self._event.clear()
-            if not condition():
-                await self._event.wait()
+        if condition():
+            return
+        event = asyncio.Event()
+        task = (asyncio.get_running_loop(), event)
+        with self._condition:
+            self._tasks.add(task)
+        try:
+            while not condition():
+                await event.wait()
+                event.clear()
+        finally:
+            with self._condition:
+                self._tasks.remove(task)
 
 
 class Inbox:
@@ -56,6 +63,7 @@ class Inbox:
         self.is_over = False  # no more messages arrive
         self.failure: KouxingError | None = None  # reason for an early end
         self.num_missed = 0  # frames and phones that did not arrive
+        self.errors: deque[Refused] = deque()  # errors about the session's audio
         self.signal = Signal()
 
     def add(self, message: Any) -> None:

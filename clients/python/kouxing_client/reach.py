@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 LookUp = Callable[..., list[tuple[Any, ...]]]
+NO_LISTENER = "nothing listens there; start kouxing there (kouxing run), or correct the address"
 
 
 def reach_error(
@@ -72,7 +73,7 @@ def _reason_for(error: OSError) -> str:
     if isinstance(error, TimeoutError):
         return "the connection times out; open this port in the firewalls between the machines"
     if isinstance(error, ConnectionRefusedError):
-        return "nothing listens there; start kouxing there (kouxing run), or correct the address"
+        return NO_LISTENER
     return f"{error.strerror}; check the address and the network"
 
 

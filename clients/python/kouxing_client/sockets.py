@@ -45,8 +45,12 @@ def connect(raw: Connection, endpoint: str, key: Key | None) -> None:
     """
     address, _, server = endpoint.partition(" ")
     if bool(server) != (key is not None):
-        side = "this process" if server else f"the service at {address}"
-        raise KouxingError(f"only {side} has insecure = true; set it for both or for neither")
+        raise KouxingError(
+            f"{address} uses encryption, but this program does not: leave out 'insecure' here"
+            if server
+            else f"{address} uses no encryption, but this program does: set 'insecure' here too, or"
+            " for no program"
+        )
     try:
         if key is not None:
             raw.setsockopt_string(zmq.CURVE_SERVERKEY, server)
@@ -55,7 +59,8 @@ def connect(raw: Connection, endpoint: str, key: Key | None) -> None:
         raw.setsockopt(zmq.IPV6, "[" in address)
         raw.connect(address)
     except zmq.ZMQError as error:
-        raise KouxingError(f"cannot connect to {address!r}: {error.strerror}") from None
+        hint = "" if "://" in address else "; write tcp://HOST:PORT"
+        raise KouxingError(f"cannot connect to {address!r}: {error.strerror}{hint}") from None
 
 
 class Sockets:

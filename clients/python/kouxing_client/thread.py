@@ -28,6 +28,8 @@ class ClientThread:
         The key of this program; None if nothing is encrypted.
     timeout_s
         Time limit for an answer.
+    start_s
+        Time for control to start: how long a request waits if nothing listens at its address.
 
     Raises
     ------
@@ -35,14 +37,18 @@ class ClientThread:
         If the address is invalid.
     """
 
-    def __init__(self, control: str, key: Key | None, timeout_s: float) -> None:
+    def __init__(self, control: str, key: Key | None, timeout_s: float, start_s: float) -> None:
         if key is not None and " " not in control:
             control = f"{control} {key.control}"
         self.timeout_s = timeout_s
         self._sockets = Sockets(key)
         self._tick_s = 0.0
         self._is_stopping = False
-        self.core = ClientCore(self._sockets, control, timeout_s)
+        try:
+            self.core = ClientCore(self._sockets, control, timeout_s, start_s)
+        except KouxingError:
+            self._sockets.close()
+            raise
         self._thread = threading.Thread(target=self._run, name="kouxing-client", daemon=True)
         self._thread.start()
 

@@ -1,0 +1,124 @@
+"""The keywords of sessions and faces, and their checks before a request is sent."""
+
+import difflib
+import re
+from collections.abc import Collection, Mapping, Sequence
+from typing import TypedDict
+
+from kouxing_client.audio import SAMPLE_BYTES
+from kouxing_client.errors import KouxingError
+from kouxing_client.messages import MEDIA_RATE_HZ, Fields
+
+MIN_RATE_HZ, MAX_RATE_HZ = 8000, 48000
+MAX_CHANNELS = 2
+_NAME = re.compile("[A-Za-z0-9_-]{0,64}")
+
+
+class FaceSettings(TypedDict, total=False):
+    """How a face moves. Omitted settings keep their values."""
+
+    lip_model: str
+    """name of the lip model"""
+    acoustic: str
+    """acoustic model: ``full``, or ``light`` with less processor time and more errors"""
+    expressions: Mapping[str, float]
+    """strengths from 0 to 1 by name; they replace the current ones, and ``{}`` removes them"""
+    hold_s: float
+    """time until the expressions fade, s"""
+    expressiveness: float
+    """scale of the mouth movements, 0.5 to 2"""
+    feeling: float
+    """how strongly the face shows the emotion in the voice, 0 to 1"""
+    still: bool
+    """whether to keep the head and the brows still"""
+    eye_contact: bool
+    """whether the eyes always look at the viewer"""
+    listen_to: str
+    """session to which the face listens: it looks at the viewer and nods in pauses; or ``""``"""
+    listening: bool
+    """whether a person without a session is speaking, so that the face listens"""
+    shapes: Sequence[str]
+    """blendshape sets to publish in addition to FAPs"""
+
+
+class SessionOptions(TypedDict, total=False):
+    """How to open a session."""
+
+    sample_rate_hz: int
+    """of the audio, 8000 to 48000; default: 16000"""
+    num_channels: int
+    """of the audio: 1 (the default) or 2"""
+    encoding: str
+    """of pushed bytes and of messages: ``s16le`` (the default) or ``f32le``"""
+    paced: bool
+    """False: audio arrives faster than real time"""
+    language: str | None
+    """spoken language: ``auto``, a code or a name; None: the recognizer's"""
+    shapes: Sequence[str]
+    """sets of blendshapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``"""
+    face: FaceSettings
+    """settings of the face"""
+    mouth_profile: bytes | None
+    """the speaker's, from ``kouxing adapt``"""
+    record: bool
+    """whether the driver writes a video"""
+
+
+def open_fields(name: str, options: SessionOptions) -> Fields:
+    """Return the fields of ``open-session``.
+
+    Raises
+    ------
+    TypeError
+        If a keyword is unknown.
+    KouxingError
+        If the name is not valid, or the form of the audio is not supported.
+    """
+    _check_keywords("open_session", options, SessionOptions.__annotations__)
+    check_name(name)
+    fields: Fields = {
+        "session": name,
+        "sample_rate_hz": MEDIA_RATE_HZ,
+        "num_channels": 1,
+        "encoding": "s16le",
+        **options,
+    }
+    if fields["encoding"] not in SAMPLE_BYTES:
+        raise KouxingError(
+            f"encoding must be one of {', '.join(SAMPLE_BYTES)}, not {fields['encoding']!r}"
+        )
+    _check_integer("sample_rate_hz", fields["sample_rate_hz"], MIN_RATE_HZ, MAX_RATE_HZ)
+    _check_integer("num_channels", fields["num_channels"], 1, MAX_CHANNELS)
+    face = face_fields(fields.get("face", {}))
+    if shapes := fields.pop("shapes", ()):
+        face["shapes"] = list(shapes)
+    if face:
+        fields["face"] = face
+    return fields
+
+
+def face_fields(settings: FaceSettings) -> Fields:
+    """Return the settings of a face as a dictionary. Raises ``TypeError`` for unknown keywords."""
+    _check_keywords("set_face", settings, FaceSettings.__annotations__)
+    return {**settings}
+
+
+def check_name(name: str) -> None:
+    """Raise ``KouxingError`` if a text is not a session's name; it may be empty."""
+    if not (isinstance(name, str) and _NAME.fullmatch(name)):
+        raise KouxingError(
+            f"{name!r} is not a session's name; use up to 64 letters, digits, '-' and '_'"
+        )
+
+
+def _check_keywords(function: str, given: Mapping[str, object], known: Collection[str]) -> None:
+    for name in given:
+        if name not in known:
+            likely = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean {likely[0]!r}?" if likely else f"use {', '.join(known)}"
+            raise TypeError(f"{function}() has no keyword {name!r}; {hint}")
+
+
+def _check_integer(name: str, value: object, lowest: int, highest: int) -> None:
+    if type(value) is not int or not lowest <= value <= highest:
+        raise KouxingError(f"{name} must be an integer from {lowest} to {highest}, not {value!r}")

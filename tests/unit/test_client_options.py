@@ -1,0 +1,73 @@
+"""Keywords of sessions and faces: unknown ones and wrong values are rejected before sending."""
+
+from typing import Any
+
+import pytest
+from kouxing_client import KouxingError
+from kouxing_client.options import FaceSettings, check_name, face_fields, open_fields
+
+from kouxing.shared.name_rules import NAME_RULE
+from kouxing.shared.wire import face
+
+
+def test_the_package_has_all_face_settings_of_the_protocol() -> None:
+    assert FaceSettings.__annotations__.keys() == {*face.FaceSettings.__struct_fields__}
+
+
+@pytest.mark.parametrize(
+    ("options", "hint"),
+    [
+        (
+            {"sample_rate": 48000},
+            r"open_session\(\) .* 'sample_rate'; did you mean 'sample_rate_hz'",
+        ),
+        ({"channels": 2}, "did you mean 'num_channels'"),
+        ({"x": 1}, "use sample_rate_hz, num_channels, "),
+        (
+            {"face": {"lip_mode": "learned"}},
+            r"set_face\(\) has no keyword 'lip_mode'; did you mean 'lip_model'",
+        ),
+    ],
+)
+def test_an_unknown_keyword_is_rejected_with_the_nearest(options: Any, hint: str) -> None:
+    with pytest.raises(TypeError, match=hint):
+        open_fields("", options)
+
+
+def test_an_unknown_face_setting_is_rejected() -> None:
+    settings: Any = {"expression": {"joy": 1.0}}
+    with pytest.raises(TypeError, match="did you mean 'expressions'"):
+        face_fields(settings)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"sample_rate_hz": 200000}, "must be an integer from 8000 to 48000, not 200000"),
+        ({"sample_rate_hz": 16000.0}, "must be an integer from 8000 to 48000, not 16000.0"),
+        ({"num_channels": 3}, "num_channels must be an integer from 1 to 2, not 3"),
+        ({"encoding": "mp3"}, "encoding must be one of s16le, f32le, not 'mp3'"),
+    ],
+)
+def test_wrong_values_are_rejected(options: Any, text: str) -> None:
+    with pytest.raises(KouxingError, match=text):
+        open_fields("", options)
+
+
+def test_a_name_follows_the_rule_of_the_product() -> None:
+    check_name("")
+    check_name("my-call_1")
+    for name in ("a b", "x" * 65, "line\n"):
+        with pytest.raises(KouxingError, match=f"is not a session's name; {NAME_RULE}"):
+            check_name(name)
+
+
+def test_the_fields_contain_defaults_and_one_list_of_shapes() -> None:
+    fields = open_fields("s", {"shapes": ("vrm",), "face": {"still": True}})
+    assert fields == {
+        "session": "s",
+        "sample_rate_hz": 16000,
+        "num_channels": 1,
+        "encoding": "s16le",
+        "face": {"still": True, "shapes": ["vrm"]},
+    }
