@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +18,7 @@ from kouxing.services.cli.options import (
     MouthFile,
     PhoneAlphabet,
 )
-from kouxing.services.cli.running_system import find_control
+from kouxing.services.cli.running_system import RunningSystem, find_control, other_systems
 from kouxing.services.service_kinds import read_settings
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint
@@ -120,16 +122,17 @@ def speak(
     else:
         raw_format = RawFormat(rate or 16_000, channels or 1)
         audio = open_audio(Path(source), track=track, raw=raw_format if raw else None)
-    summary = stream(
-        audio,
-        control_address(control),
-        CONSOLE,
-        session=_session_name(session),
-        record=record,
-        paced=not fast,
-        mouth_profile=profile,
-        language=language,
-    )
+    with find_control_address(control) as endpoint:
+        summary = stream(
+            audio,
+            endpoint,
+            CONSOLE,
+            session=_session_name(session),
+            record=record,
+            paced=not fast,
+            mouth_profile=profile,
+            language=language,
+        )
     print_message(
         f"session {summary.session}: {plural(summary.num_phones, 'phone')} in"
         f" {summary.duration_s:.1f} s"
@@ -185,7 +188,8 @@ def listen(
     from kouxing.services.cli.follow import follow
 
     check_output(output, force=force)
-    follow(_session_name(session), output, form, control_address(control), alphabet)
+    with find_control_address(control) as endpoint:
+        follow(_session_name(session), output, form, endpoint, alphabet)
 
 
 def send(
@@ -207,12 +211,9 @@ def send(
     from kouxing.services.synthesizer.config import SynthesizerConfig
 
     config = read_settings().load(SynthesizerConfig)
-    send_to(
-        [parse_target(url) for url in targets],
-        _session_name(session),
-        control_address(control),
-        config.idle_motion_seed,
-    )
+    parsed = [parse_target(url) for url in targets]
+    with find_control_address(control) as endpoint:
+        send_to(parsed, _session_name(session), endpoint, config.idle_motion_seed)
 
 
 def express(
@@ -240,7 +241,7 @@ def express(
         raise UserError("--hold needs an expression: kouxing express joy=0.4 --hold 2")
     hold_s = DEFAULT_HOLD_S if hold is None else hold
     check_expressions(strengths, hold_s)
-    with connect_client(control_address(control)) as client:
+    with find_control_address(control) as endpoint, connect_client(endpoint) as client:
         all_sessions = [state.session for state in client.status().sessions]
         for name in [session] if session else ["", *all_sessions]:
             client.set_face(name, expressions=strengths, hold_s=hold_s)
@@ -259,7 +260,10 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
     from kouxing.shared.client_connection import connect_client
 
     check_output(json_file, force=force)
-    with connect_client(control_address(control), timeout_s=3.0) as client:
+    with (
+        find_control_address(control) as endpoint,
+        connect_client(endpoint, timeout_s=3.0) as client,
+    ):
         report = client.status()
     out = Console()
     services = []
@@ -322,24 +326,52 @@ def _is_drop_counter(name: str) -> bool:
     return name.startswith("dropped_") and not name.endswith("_per_s")
 
 
-def control_address(address: str) -> str:
-    """Return the address of control, followed by its public key unless connections are insecure.
+@contextlib.contextmanager
+def find_control_address(address: str) -> Iterator[str]:
+    """Yield the address of control, followed by its public key unless connections are insecure.
 
-    Without ``address`` and a setting, it is the address of the user's newest system.
+    Without ``address`` and a setting, it is the address of the newest system with this user's keys.
+    Raises ``UserError`` if there is no such system, and control's default address cannot be used.
     """
-    running, config = find_system(address)
-    return running or control_endpoint(config.control, insecure=config.insecure)
+    from kouxing_client import NotConnected
+
+    running, config, is_given = find_system(address)
+    is_guess = not (running or is_given)
+    others = other_systems() if is_guess else []
+    if any(system.address == config.control for system in others):
+        raise UserError(_not_running_text(others))
+    try:
+        yield running or control_endpoint(config.control, insecure=config.insecure)
+    except UserError as error:
+        if is_guess and isinstance(error.__cause__, NotConnected):
+            raise UserError(f"{_not_running_text(others)}. Tried: {error}") from error
+        raise
 
 
-def find_system(address: str) -> tuple[str, ServiceConfig]:
-    """Return control's endpoint in the user's newest system, if it applies, and the settings."""
+def _not_running_text(others: Sequence[RunningSystem]) -> str:
+    text = "your kouxing is not running on this machine; start it with 'kouxing run'"
+    if others:
+        listed = ", ".join(f"{system.address} (keys: {system.keys})" for system in others)
+        text += (
+            f". With other keys, kouxing runs at {listed}; to use it, set XDG_STATE_HOME to the"
+            " folder that contains its key folder, and --control or KOUXING_CONTROL to its address"
+        )
+    return text
+
+
+def find_system(address: str) -> tuple[str, ServiceConfig, bool]:
+    """Return control's endpoint in the user's newest system, if any, and the settings.
+
+    The last value is whether ``address`` or a setting gives the address; then no system is searched.
+    """
     if address:
         split_endpoint(address, "--control")
     settings, overrides = read_settings(), {"control": address} if address else {}
     keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
-    running = find_control() if keys["control"].is_default else ""
+    is_given = not keys["control"].is_default
+    running = "" if is_given else find_control()
     config = settings.load(ServiceConfig, overrides)
     if "*" in config.control:
         key = "--control" if address else "common.control"
         raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
-    return running, config
+    return running, config, is_given

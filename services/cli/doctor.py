@@ -11,7 +11,7 @@ from kouxing_client.keys import Key
 from kouxing_client.reach import reach_error
 
 from kouxing.services.cli.clients import find_system
-from kouxing.services.cli.running_system import find_control
+from kouxing.services.cli.running_system import running_systems
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.client_connection import connect_client
@@ -41,7 +41,7 @@ class CheckResult(NamedTuple):
 
 def run_checks(address: str) -> Iterator[CheckResult]:
     """Yield the result of each check; if ``address`` is empty, control is the configured one."""
-    control, config = find_system(address)
+    control, config, _ = find_system(address)
     control = control or config.control
     endpoint_address = control.partition(" ")[0]
     if reason := reach_error(*split_endpoint(endpoint_address, "control"), is_zeromq=True):
@@ -92,8 +92,8 @@ def _check_key(name: str, key: Key | None, address: str) -> CheckResult:
         return CheckResult(f"key {name}", "cannot be used", str(error))
     if result is ProbeResult.ACCEPTED:
         return CheckResult(f"key {name}", "control accepts it")
-    running, _, running_key = find_control().partition(" ")
-    if key is not None and running == address and running_key not in ("", key.control):
+    controls = [system.control for system in running_systems() if system.address == address]
+    if key is not None and controls and controls[0] not in (address, control):
         return CheckResult(
             f"key {name}",
             "belongs to another system than this control",

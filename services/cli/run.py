@@ -17,9 +17,9 @@ from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, ServiceAssignments
 from kouxing.services.cli.running_system import (
     announce_system,
-    find_control,
     lock_output_folder,
     lock_startup,
+    running_systems,
 )
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
@@ -196,15 +196,16 @@ def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) ->
         for setting in settings.describe(kind.config_type)
         if setting.is_default and variable_name(kind.name, setting.key) in moved
     ]
-    running = find_control() if BOUND_CONTROL_VARIABLE in moved else ""
+    running = running_systems() if BOUND_CONTROL_VARIABLE in moved else []
     if running:
-        owner = f"another kouxing is running, with control at {running.partition(' ')[0]}"
+        owner = f"another kouxing is running, with control at {running[0].address}"
     else:
         owner = f"other programs use {', '.join(taken)}"
     warnings = [f"{owner}; this kouxing uses free ports"] if taken else []
     if BOUND_CONTROL_VARIABLE in moved:
         warnings.append(
-            f"your commands use this kouxing; for other programs, set KOUXING_CONTROL={control}"
+            "commands with the same HOME and XDG_STATE_HOME use this kouxing; for other programs,"
+            f" set KOUXING_CONTROL={control}"
         )
     return "; ".join(warnings)
 

@@ -1,7 +1,10 @@
 """Finds the running systems of a user, for commands without an address.
 
-``kouxing run`` writes control's address to a file in the user's own folder, and locks the file. The
-lock ends with the process, even if the process is killed.
+``kouxing run`` writes control's address and the folder of its keys to a file in the user's own
+folder, and locks the file. The lock ends with the process, even if the process is killed.
+
+One user can have systems with different keys, such as in a container or with another
+``XDG_STATE_HOME``. Commands use only a system with their keys.
 """
 
 import contextlib
@@ -10,8 +13,22 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.keys import key_folder
+
+
+class RunningSystem(NamedTuple):
+    """A system of this user."""
+
+    control: str  # control's address and, with encryption, its public key
+    keys: str  # folder of its keys
+
+    @property
+    def address(self) -> str:
+        """Address of control."""
+        return self.control.partition(" ")[0]
 
 
 @contextlib.contextmanager
@@ -30,7 +47,7 @@ def announce_system(control: str) -> Iterator[None]:
         with contextlib.suppress(OSError):  # such as a full disk
             file = stack.enter_context(path.open("wb", buffering=0))
             fcntl.flock(file, fcntl.LOCK_EX)
-            file.write(control.encode())
+            file.write(os.fsencode(f"{control}\n{_key_folder()}"))
         yield
 
 
@@ -79,18 +96,37 @@ def lock_output_folder(folder: Path) -> Iterator[None]:
 
 
 def find_control() -> str:
-    """Return the address of control in the user's newest running system, or an empty string."""
+    """Return control of the newest running system with this user's keys, or an empty string."""
+    own = [system.control for system in running_systems() if system.keys == _key_folder()]
+    return own[0] if own else ""
+
+
+def other_systems() -> list[RunningSystem]:
+    """Return the running systems of this user that have other keys, the newest first."""
+    return [system for system in running_systems() if system.keys != _key_folder()]
+
+
+def running_systems() -> list[RunningSystem]:
+    """Return all running systems of this user, the newest first."""
     folder = _own_folder()
     paths = [] if folder is None else folder.iterdir()
+    systems = []
     for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
-        with contextlib.suppress(FileNotFoundError), path.open(encoding="utf-8") as file:
+        with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                if control := file.read():
-                    return control
+                control, _, keys = os.fsdecode(file.read()).partition("\n")
+                if control:  # else not yet written
+                    systems.append(RunningSystem(control, keys))
                 continue
             path.unlink()  # the system has ended
+    return systems
+
+
+def _key_folder() -> str:
+    with contextlib.suppress(RuntimeError):  # no home folder; an insecure system needs no keys
+        return str(key_folder().resolve())
     return ""
 
 

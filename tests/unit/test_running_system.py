@@ -7,8 +7,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from kouxing_client import NotConnected
 
-from kouxing.services.cli.clients import control_address
+from kouxing.services.cli.clients import find_control_address
 from kouxing.services.cli.running_system import (
     announce_system,
     find_control,
@@ -41,6 +42,45 @@ def test_finds_the_newest_running_system_even_if_others_were_killed(
         assert find_control() == "tcp://127.0.0.1:2"
         assert not killed.exists()
     assert find_control() == ""
+
+
+def control_address(address: str) -> str:
+    with find_control_address(address) as endpoint:
+        return endpoint
+
+
+def test_finds_no_system_with_other_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own_state = os.environ["XDG_STATE_HOME"]
+    others = tmp_path / "others"
+    with announce_system("tcp://127.0.0.1:1 own"), ExitStack() as stack:
+        monkeypatch.setenv("XDG_STATE_HOME", str(others))
+        monkeypatch.setattr(os, "getpid", lambda: 1)
+        stack.enter_context(announce_system("tcp://127.0.0.1:5550 other"))
+        assert control_address("") == "tcp://127.0.0.1:5550 other"
+        monkeypatch.setenv("XDG_STATE_HOME", own_state)
+        assert control_address("") == "tcp://127.0.0.1:1 own"
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "third"))
+        text = (
+            "your kouxing is not running on this machine; start it with 'kouxing run'. With other"
+            rf" keys, kouxing runs at .*tcp://127.0.0.1:5550 \(keys: {others}/kouxing\).*XDG_STATE_HOME"
+            ".*--control or KOUXING_CONTROL"
+        )
+        with pytest.raises(UserError, match=text):
+            control_address("")
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("", "your kouxing is not running .*. Tried: no answer"),
+        ("tcp://127.0.0.1:5550", "^no answer"),
+    ],
+)
+def test_says_that_no_system_runs_unless_the_user_gave_its_address(
+    address: str, message: str
+) -> None:
+    with pytest.raises(UserError, match=message), find_control_address(address):
+        raise UserError("no answer") from NotConnected("no answer")
 
 
 def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:

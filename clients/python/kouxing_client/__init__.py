@@ -6,7 +6,7 @@ lost messages and follows sessions that move to another worker.
 
 from kouxing_client.aio import AsyncClient, AsyncResults, AsyncSession
 from kouxing_client.client import Client, Results, Session
-from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.errors import KouxingError, NotConnected, Refused
 from kouxing_client.keys import Key, find_key, read_key
 from kouxing_client.messages import (
     SHAPE_NAMES,
@@ -34,6 +34,7 @@ __all__ = [
     "Key",
     "KouxingError",
     "Lateness",
+    "NotConnected",
     "Phone",
     "Refused",
     "Result",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.errors import KouxingError, NotConnected, Refused
 from kouxing_client.inbox import Inbox, new_future
 from kouxing_client.messages import (
     Decoders,
@@ -184,7 +184,7 @@ class ClientCore:
     def _fail_requests(self, reason: str) -> None:
         """End requests without an answer, and all sessions if control rejects this key."""
         self._is_diagnosing = False
-        failure = KouxingError(self._failure(reason))
+        failure = NotConnected(self._failure(reason))
         for name, request in list(self._requests.items()):
             is_unanswerable = self._is_late(request) and reason == NO_LISTENER
             if self._sockets.now_s > request.end_s or is_unanswerable:

@@ -5,6 +5,10 @@ class KouxingError(Exception):
     """Raised if the system does not answer, a key is missing, or a session has ended."""
 
 
+class NotConnected(KouxingError):
+    """Raised if control does not answer, or does not accept this key."""
+
+
 class Refused(KouxingError):
     """Raised if a service rejects a request or audio. ``code`` is an error code of PROTOCOL.md."""
 
