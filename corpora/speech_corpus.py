@@ -26,6 +26,7 @@ of two native speakers of English (``en-native``) and of one of Korean.
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,6 +87,7 @@ class RowErrors:
     """Rows that were skipped, and why."""
 
     messages: list[str] = field(default_factory=list)
+    splits: Counter[str] = field(default_factory=Counter)  # number of all rows
 
     def add(self, row_name: str, problem: str) -> None:
         """Add a bad row."""
@@ -99,9 +101,11 @@ class RowErrors:
             report(f"{plural(len(self.messages), 'row')} skipped")
 
     def no_recording_error(self, where: str) -> UserError:
-        """Make the error that no recording can be used, with the reason for the last one."""
+        """Make the error that no recording can be used, with the last reason and all splits."""
         last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
-        return UserError(f"no usable recordings {where}{last}")
+        counts = ", ".join(f"{split} ({count})" for split, count in self.splits.items())
+        splits = f"; rows by split: {counts}" if counts else ""
+        return UserError(f"no usable recordings {where}{last}{splits}")
 
 
 def may_distribute(license_name: str) -> bool:
@@ -142,7 +146,11 @@ def read_corpus(
             "text, or with AISHELL's wav and transcript folders"
         )
     with check_content(folder, "a corpus"):
-        chosen = [(row_name, row) for row_name, row in rows if split in (None, _split_of(row))]
+        chosen = []
+        for row_name, row in rows:
+            errors.splits[_split_of(row)] += 1
+            if split in (None, _split_of(row)):
+                chosen.append((row_name, row))
     utterances = [_utterance(row_name, row, errors, inventory) for row_name, row in chosen]
     return [utterance for utterance in utterances if utterance]
 

@@ -25,7 +25,9 @@ def read_rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     known = set(table.fieldnames)
     missing = [column for column in columns if known.isdisjoint(column.split(" or "))]
     if missing:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}")
+        word = "column" if len(missing) == 1 else "columns"
+        existing = ", ".join(table.fieldnames) or "no columns"
+        raise UserError(f"{path} lacks the {word} {', '.join(missing)}; it has {existing}")
     rows: list[dict[str, str]] = []
     for row in table:
         if len(rows) == _MAX_ROWS:

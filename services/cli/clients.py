@@ -243,8 +243,17 @@ def express(
     check_expressions(strengths, hold_s)
     with find_control_address(control) as endpoint, connect_client(endpoint) as client:
         all_sessions = [state.session for state in client.status().sessions]
+        if session and session not in all_sessions:
+            raise UserError(
+                f"session {session!r} does not exist; open sessions:"
+                f" {', '.join(all_sessions) or 'none'}; without a session, all faces change"
+            )
         for name in [session] if session else ["", *all_sessions]:
             client.set_face(name, expressions=strengths, hold_s=hold_s)
+    faces = [session] if session else [*all_sessions, "the face at rest"]
+    shown = ", ".join(f"{name} {strength:g}" for name, strength in strengths.items())
+    action = f"showing {shown} for {hold_s:g} s" if shown else "cleared the expressions"
+    print_message(f"{action}: {', '.join(faces)}")
 
 
 def _parse_strength(text: str) -> tuple[str, float]:
@@ -362,7 +371,7 @@ def _not_running_text(others: Sequence[RunningSystem]) -> str:
 def find_system(address: str) -> tuple[str, ServiceConfig, bool]:
     """Return control's endpoint in the user's newest system, if any, and the settings.
 
-    The last value is whether ``address`` or a setting gives the address; then no system is searched.
+    The last value is whether ``address`` or a setting names control, so that no system is searched.
     """
     if address:
         split_endpoint(address, "--control")

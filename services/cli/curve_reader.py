@@ -9,6 +9,7 @@ full second, it is taken as the app's default.
 
 import codecs
 import csv
+import difflib
 import itertools
 import re
 from collections import Counter
@@ -54,13 +55,18 @@ def read_table(path: Path) -> FapAnimation:
     written = [str(name).strip() for name in next(rows, [])]
     names = [name.lower() for name in written]
     time_name = next((name for name in ("time_s", "timecode") if name in names), None)
+    if not written:
+        raise UserError(f"{path}: the file is empty; export the curves again")
     if time_name is None:
-        raise UserError(f"{path}: the table has no times; add a column time_s or Timecode")
+        raise UserError(
+            f"{path}: no column has the name time_s or Timecode; the columns are"
+            f" {', '.join(written)}; rename the column of the times"
+        )
     columns, basis = _known_columns(path, written)
     is_shapes = names[columns[0]] not in FAP_NUMBER
     expected = {*_OTHER_COLUMNS, *(names[column] for column in columns)}
     if ignored := [name for name in written if name.lower() not in expected]:
-        print_message(f"{path}: ignored unknown columns: {', '.join(ignored)}")
+        print_message(f"{path}: ignored unknown columns: {', '.join(map(_hint, ignored))}")
     count = names.index("blendshapecount") if "blendshapecount" in names else None
     times: list[str] = []
     values: list[Float64] = []
@@ -86,6 +92,13 @@ def read_table(path: Path) -> FapAnimation:
         raise UserError(f"{path}: the table has no frames with a face; record it again")
     times_s = _parse_times_s(path, times, is_time_code=time_name == "timecode")
     return _resample(path, times_s, np.array(values) @ basis)
+
+
+def _hint(column: str) -> str:
+    """Return the name of an unknown column, with the nearest known name, if any."""
+    known = [*FAP_NUMBER, *itertools.chain(*(shapes.names for shapes in SHAPE_SETS.values()))]
+    nearest = difflib.get_close_matches(column, known, n=1, cutoff=0.8)
+    return f"{column} (did you mean {nearest[0]}?)" if nearest else column
 
 
 def _read_lines(path: Path) -> Iterator[str]:

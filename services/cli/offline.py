@@ -72,7 +72,7 @@ def render(
         typer.Argument(
             metavar="SOUND|CURVES [OUTPUT]",
             help="Audio or video files, or curves (.fap, .csv, .jsonl); '-' is standard input."
-            " Then, for a single file, the output.",
+            " Then, for a single file, the output. Default: a video (.mp4) next to the file.",
         ),
     ],
     output: Annotated[
@@ -131,7 +131,10 @@ def render(
     ] = None,
     captions: Annotated[
         CaptionKind | None,
-        typer.Option(help="Captions below the face: pinyin, phones, or the characters of --text."),
+        typer.Option(
+            metavar="CONTENT",
+            help="Captions below the face: pinyin, phones, or the characters of --text.",
+        ),
     ] = None,
     speed: Annotated[
         float, typer.Option(min=0.25, max=1, help="Speed at the same pitch; 0.5 is half as fast.")
@@ -151,6 +154,7 @@ def render(
     The output is a video (.mp4, .mov, .webm, or .webp without sound) or a picture (.png). Other
     outputs are numbered pictures (a folder, or a pattern such as face%05d.png), curves (.fap, .csv,
     .jsonl), an animated head (.glb) and drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).
+    Without an output, the video my.mp4 of my.wav is written next to my.wav.
     Curves of the app Live Link Face are also read.
     """
     with show_loading():

@@ -38,6 +38,8 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
         for target in targets:
             senders.start(target)
             print_message(f"sending {target.contents} to {target.url}; press Ctrl-C to stop")
+            if target.expression_hint:
+                print_message(f"{target.url}: {target.expression_hint}")
         with _SessionFinder(session, client, senders) as search:
             _send_frames(search, client, senders)
 

@@ -42,6 +42,16 @@ class Target:
         return contents
 
     @property
+    def expression_hint(self) -> str:
+        """How the target gets expressions such as joy; empty if it gets them, or needs none."""
+        if self.shapes == "arkit" or self.is_mouth_only:
+            return ""
+        return (
+            "these shapes have no brows and cheeks, so joy and anger are hardly visible; if the"
+            " avatar has ARKit's shapes, add ?shapes=arkit to the address"
+        )
+
+    @property
     def is_local(self) -> bool:
         """Whether the target, and the tracker if any, are on this machine."""
         return is_loopback(self.host) and (self.camera is None or is_loopback(self.camera[0]))

@@ -196,7 +196,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
         installed = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         package = installed.get(language)
         if package is None:
-            known = ", ".join([*language_codes(), *sorted({*BUILT_IN, *installed})])
+            known = ", ".join([*language_codes(), *sorted(installed.keys() - BUILT_IN.keys())])
             raise UserError(f"language {language!r} is not installed; choose from: {known}")
     try:
         if resources.files(package).joinpath(SETTINGS).is_file():

@@ -169,7 +169,7 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["express", "heard", "joy=2"], "between 0 and 1"),
         (["express", "heard", "joy"], "joy=0.4"),
         (["express", "heard", "joy=1", "--hold", "-1"], "0 to 3600"),
-        (["express", "nobody", "joy=1"], "session 'nobody' does not exist"),
+        (["express", "nobody", "joy=1"], "'nobody' does not exist; open sessions: none; without"),
     ],
 )
 def test_wrong_arguments_are_rejected(
@@ -191,7 +191,8 @@ def test_express_changes_the_face(system: System, command: CommandRunner) -> Non
             while not low < faces.get(LIMIT_S).values[corner] < high:  # type: ignore[union-attr]
                 pass
 
-        assert command("express", "smiling", "joy=1", "--hold", 600)[0] == 0
+        status, _, message = command("express", "smiling", "joy=1", "--hold", 600)
+        assert (status, message) == (0, "showing joy 1 for 600 s: smiling\n")
         wait_for_lip_corner(300.0, 400.0)  # a face at rest has frames without sound
         session.set_face(expressions={"smile": 0.25, "squint": 1.0}, hold_s=600.0)
         wait_for_lip_corner(150.0, 200.0)

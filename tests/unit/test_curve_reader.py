@@ -126,17 +126,24 @@ def test_reads_the_names_of_other_programs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], columns: str, shapes: tuple[str, str]
 ) -> None:
     path = tmp_path / "a.csv"
-    path.write_text(f"TIME_S,{columns},nose\n0,0.5,0.25,1\n", encoding="utf-8")
+    path.write_text(f"TIME_S,{columns},nose,jawOpne\n0,0.5,0.25,1,1\n", encoding="utf-8")
     weights = np.zeros(len(ARKIT.names), np.float32)
     weights[[ARKIT.names.index(shape) for shape in shapes]] = 0.5, 0.25
     assert np.abs(read_table(path).faps[0] - ARKIT.faps(weights)).max() < 1e-3
-    assert capsys.readouterr().err == f"{path}: ignored unknown columns: nose\n"
+    assert (
+        capsys.readouterr().err
+        == f"{path}: ignored unknown columns: nose, jawOpne (did you mean jawOpen?)\n"
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.csv", "frame,jawOpen\n0,0.5\n", "no times; add a column time_s or Timecode"),
+        (
+            "a.csv",
+            "frame,jawOpen\n0,0.5\n",
+            "time_s or Timecode; the columns are frame, jawOpen; rename",
+        ),
         ("a.csv", "time_s,nose\n0,0.5\n", "no column has the name of a FAP or of a shape"),
         ("a.csv", "time_s,jawOpen,JawOpen\n0,0,1\n", "two columns have the name jawOpen"),
         ("a.csv", "time_s,jawOpen\n0,nan\n", "frame 1: a value is missing or not a number"),
@@ -145,7 +152,8 @@ def test_reads_the_names_of_other_programs(
         ("a.csv", "time_s,jawOpen\nnow,0\n", "every line needs a time in seconds"),
         ("a.csv", "time_s,jawOpen\n0,0\n40,0\n", "1 to 1000 frames per second"),
         ("a.csv", "Timecode,JawOpen\n00:01,0\n", "every line needs a time code"),
-        ("a.csv", "", "no times"),
+        ("a.csv", "", "the file is empty"),
+        ("a.csv", "\n,,\n", "the file is empty"),
         ("a.csv", "time_s,jawOpen\n", "no frames with a face"),
         ("a.csv", "time_s,jawOpen\n0,0.2\n0.02,50\n", "frame 2: .* divide percentages by 100"),
         ("a.csv", f"time_s,jawOpen\n0,{'1' * 140_000}\n", "not a table"),

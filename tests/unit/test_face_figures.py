@@ -67,7 +67,7 @@ def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
     with pytest.raises(UserError, match="names no emotion"):
         read_emotions(folder)
     manifest.write_text("path\tspeaker\ncalm.wav\tann\n", encoding="utf-8")
-    with pytest.raises(UserError, match="lacks the columns license, seconds, note"):
+    with pytest.raises(UserError, match="lacks the columns license, seconds, note; it has "):
         read_emotions(folder)
     manifest.write_text(COLUMNS + "calm.wav\tann\tCC0\tlong\temotion fear\t\n", encoding="utf-8")
     with pytest.raises(UserError, match="write the seconds as a number"):

@@ -62,8 +62,8 @@ def test_finds_no_system_with_other_keys(tmp_path: Path, monkeypatch: pytest.Mon
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "third"))
         text = (
             "your kouxing is not running on this machine; start it with 'kouxing run'. With other"
-            rf" keys, kouxing runs at .*tcp://127.0.0.1:5550 \(keys: {others}/kouxing\).*XDG_STATE_HOME"
-            ".*--control or KOUXING_CONTROL"
+            rf" keys, kouxing runs at .*tcp://127.0.0.1:5550 \(keys: {others}/kouxing\)"
+            ".*XDG_STATE_HOME.*--control or KOUXING_CONTROL"
         )
         with pytest.raises(UserError, match=text):
             control_address("")
@@ -72,7 +72,7 @@ def test_finds_no_system_with_other_keys(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     ("address", "message"),
     [
-        ("", "your kouxing is not running .*. Tried: no answer"),
+        ("", r"your kouxing is not running .*\. Tried: no answer"),
         ("tcp://127.0.0.1:5550", "^no answer"),
     ],
 )

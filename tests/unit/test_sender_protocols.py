@@ -25,6 +25,12 @@ def osc_messages(url: str, frame: FaceFrame) -> Messages:
     return read_osc(list(make_connection(parse_target(url)).encode(frame)))  # type: ignore[attr-defined]
 
 
+def test_only_a_target_without_brows_needs_a_hint_for_expressions() -> None:
+    assert "?shapes=arkit" in parse_target("vmc://").expression_hint
+    for url in ("vmc://?shapes=arkit", "vmc://?only=mouth", "vts://", "livelink://"):
+        assert not parse_target(url).expression_hint
+
+
 def test_vmc_sends_the_names_of_vrm_0_and_vrm_1() -> None:
     messages = osc_messages("vmc://", frame_of("vrm", 2.5, aa=0.6, blinkLeft=0.5))
     assert messages[:2] == [("/VMC/Ext/OK", [1]), ("/VMC/Ext/T", [2.5])]

@@ -313,7 +313,8 @@ def test_reports_each_word_that_cannot_be_read(capsys: pytest.CaptureFixture[str
         assert len(read_transcript(text, MANDARIN).syllables) == 3
         assert "ignored: 'hello', 'world', 'café', 'Tom'; write" in capsys.readouterr().err
     with pytest.raises(
-        UserError, match="read: 'hello', 'world'; write them in characters, or use --language auto"
+        UserError,
+        match=r"read: 'hello', 'world'; write them in .*Mandarin, the default .* --language en",
     ):
         read_transcript("hello world", MANDARIN)
     with pytest.raises(UserError, match="read: '你好'; write them as they are spoken, or use ano"):

@@ -82,7 +82,10 @@ def test_reads_a_kaldi_folder(tmp_path: Path) -> None:
     assert [u.utterance_id for u in rows] == ["u1"]
     assert "line 2 (u2): no audio file" in errors.messages[0]
     assert "line 3 (u3): no text" in errors.messages[1]
-    assert read_corpus(held_out, RowErrors(), MANDARIN, split="train") == []
+    errors = RowErrors()
+    assert read_corpus(held_out, errors, MANDARIN, split="train") == []
+    text = str(errors.no_recording_error("in the split 'train'"))
+    assert text == "no usable recordings in the split 'train'; rows by split: test (3)"
     (held_out / "text").unlink()
     with pytest.raises(UserError, match="text: no such file"):
         read_corpus(held_out, RowErrors(), MANDARIN)
@@ -108,7 +111,7 @@ def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not a corpus"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_text("utt_id\tpath\n")
-    with pytest.raises(UserError, match="lacks the columns pinyin or text"):
+    with pytest.raises(UserError, match="lacks the column pinyin or text"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_bytes("utt_id\tpath\tpinyin\n你".encode("gb18030"))
     with pytest.raises(UserError, match="not UTF-8 text"):

@@ -115,7 +115,7 @@ def test_labels_of_a_stop_are_one_phone(tmp_path: Path) -> None:
     ends = [end for end, _ in labeled_phones(table)]
     assert ends == [1.0, 1.0, 0.5, 1.0, 1.0, 1.0, 1.0]
     table.write_text("start_s\tend_s\n0\t1\n")
-    with pytest.raises(UserError, match="lacks the columns symbol"):
+    with pytest.raises(UserError, match="lacks the column symbol"):
         universal_words(row)
 
 

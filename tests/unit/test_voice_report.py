@@ -109,7 +109,7 @@ def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> No
     ("rows", "problem"),
     [
         ("", "lists no sounds"),
-        ("a.flac\t\n", "lacks the columns license"),
+        ("a.flac\t\n", "lacks the column license"),
         ("short row", "cannot read a sound in"),
     ],
 )
