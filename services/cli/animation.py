@@ -53,6 +53,7 @@ class FaceMotion:
     syllables: Sequence[TimedSyllable] = ()  # as written, in order
     source: Path | None = None
     language: str = DEFAULT_LANGUAGE  # of the phones
+    has_wrong_text: bool = False  # the mouth follows a text that does not fit the sound
 
 
 def slow_down(motion: FaceMotion, speed: float) -> FaceMotion:
@@ -129,6 +130,7 @@ def animate(
     progress.remove_task(loading)
     samples = read_mono_16k(source, track, progress)
     events: Sequence[SoundEvent]
+    has_wrong_text = False
     if live:
         chains = [
             LivePipeline(model, lip_model, synthesizer=config, lip_predictor=predictor)
@@ -146,7 +148,7 @@ def animate(
             )
             report_mismatch(source, alignment)
             if alignment.fits or not text_may_differ:
-                phones = alignment.phones
+                phones, has_wrong_text = alignment.phones, not alignment.fits
             else:
                 transcript = None
         if phones is None:
@@ -176,6 +178,7 @@ def animate(
         write_syllables(spoken, transcript, model.inventory),
         source,
         language,
+        has_wrong_text,
     )
 
 

@@ -155,7 +155,8 @@ def render(
     outputs are numbered pictures (a folder, or a pattern such as face%05d.png), curves (.fap, .csv,
     .jsonl), an animated head (.glb) and drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).
     Without an output, the video my.mp4 of my.wav is written next to my.wav.
-    Curves of the app Live Link Face are also read.
+    Curves of the app Live Link Face are also read. The exit status is 1 if --text does not fit the
+    sound; the mouth then follows the text.
     """
     with show_loading():
         from kouxing.services.cli.exporters import existing_output, is_output
@@ -180,6 +181,8 @@ def render(
         lips=models, form=form, head=head, size=size, background=background, camera=camera,
         rate_hz=rate, at_s=at, sound=sound, captions=captions, speed=speed,
     )  # fmt: skip
+
+    wrong_texts: list[Path] = []
 
     def render_file(source: Path, target: Path) -> None:
         from kouxing.services.cli.animation import animate, has_motion, read_motion
@@ -209,8 +212,15 @@ def render(
             print_message(f"{source}: no speech was found; the mouth stays closed")
         phones = "" if motion.phones is None else f", {plural(len(motion.phones), 'phone')}"
         print_message(f"wrote {target}: {plural(count, exporter.unit)}{phones}")
+        if motion.has_wrong_text:
+            print_message(
+                f"{target}: the mouth follows the text; without --text, it follows the sound"
+            )
+            wrong_texts.append(source)
 
     process_all(pairs, render_file)
+    if wrong_texts:
+        raise typer.Exit(1)
 
 
 def _check_no_sound_options(source: Path, **options: object) -> None:
@@ -326,7 +336,8 @@ def lips(
     lips: Annotated[
         WidthSource,
         typer.Option(
-            help="Lip model that gives the width of the mouth; with ferguson, it is constant."
+            metavar="MODEL",
+            help=f"Lip model for the width of the mouth: {', '.join(WidthSource)} (constant).",
         ),
     ] = WidthSource.VISEMES,
     language: Language = None,

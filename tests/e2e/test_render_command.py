@@ -119,6 +119,14 @@ def test_renders_a_sound_as_curves_and_converts_them(tmp_path: Path) -> None:
         render(SENTENCE, lines, live=True, text="啊")
 
 
+def test_a_text_that_does_not_fit_is_rendered_with_exit_status_1(tmp_path: Path) -> None:
+    result = kouxing("render", SENTENCE, tmp_path / "a.csv", "--text", "你好")
+    assert result.returncode == 1
+    assert "the text does not fit the sound" in result.stderr
+    assert "a.csv: the mouth follows the text; without --text, it" in result.stderr
+    assert (tmp_path / "a.csv").exists()
+
+
 def test_live_frames_are_those_of_the_live_chain(tmp_path: Path) -> None:
     render(SENTENCE, tmp_path / "live.fap", live=True)
     chain = LivePipeline(load_model(), load_lip_model())

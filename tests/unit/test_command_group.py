@@ -1,5 +1,6 @@
 """Commands that other packages add as entry points."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -47,6 +48,14 @@ def test_an_added_command_runs_and_is_listed(added: list[str]) -> None:
     result = CliRunner().invoke(command_line.app, ["wafe"])
     assert result.exit_code == 2
     assert "wave" in result.output, "a suggestion"
+
+
+@pytest.mark.parametrize("command", ["render", "lips", "listen", "phones", "speak"])
+def test_the_choices_of_an_option_are_not_broken_in_a_narrow_terminal(command: str) -> None:
+    arguments = [command, "--help"]
+    printed = CliRunner().invoke(command_line.app, arguments, env={"COLUMNS": "80"}).output
+    assert "--help" in printed
+    assert not re.findall(r"<[\w|-]+\s", printed)
 
 
 @pytest.mark.parametrize(
