@@ -24,9 +24,14 @@ class ErrorCounts:
     reference: int = 0
 
     @property
+    def total(self) -> int:
+        """Number of errors."""
+        return self.insertions + self.deletions + self.substitutions
+
+    @property
     def rate(self) -> float:
         """Errors per reference phone."""
-        return (self.insertions + self.deletions + self.substitutions) / max(1, self.reference)
+        return self.total / max(1, self.reference)
 
     def __add__(self, other: ErrorCounts) -> ErrorCounts:
         return ErrorCounts(

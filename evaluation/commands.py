@@ -80,7 +80,7 @@ def recognizer(
 
     The speech is clean, disturbed by noise, music, other voices, a room or a telephone band, and
     grouped by speaking rate. Without --sounds, the music is synthesized. The JSON file also
-    contains figures by speaker and for other output rules.
+    contains figures by speaker, by recording and for other output rules.
     """
     from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
     from kouxing.evaluation.recognizer.disturbances import (

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
 from kouxing.shared.phones.inventory import PhoneInventory
 
 ENTRY_POINTS = "kouxing.lip_models"
@@ -42,11 +43,14 @@ class LipModelInfo:
 
 
 def lip_models() -> dict[str, LipModelInfo]:
-    """Return the installed lip models by name.
-
-    Raises ``UserError`` if an installed lip model cannot be imported.
-    """
-    return {name: lip_model_info(name) for name in _packages()}
+    """Return the installed lip models by name. Faulty ones are logged and left out."""
+    models = {}
+    for name in _packages():
+        try:
+            models[name] = lip_model_info(name)
+        except UserError as error:
+            LOG.warning("%s", error)
+    return models
 
 
 def lip_model_names() -> list[str]:
@@ -70,13 +74,16 @@ def _packages() -> dict[str, str]:
 def lip_model_info(name: str) -> LipModelInfo:
     """Return the description of an installed lip model.
 
-    Raises ``UserError`` if the lip model is not installed or cannot be imported.
+    Raises ``UserError`` if the lip model is not installed, cannot be imported, or has no
+    ``LipModelInfo``.
     """
     package = _packages().get(name)
     if package is None:
         raise UserError(f"unknown lip model {name!r}; use one of {', '.join(_packages())}")
     try:
-        info: LipModelInfo = importlib.import_module(package).LIP_MODEL
-    except (ImportError, AttributeError) as error:
+        info = importlib.import_module(package).LIP_MODEL
+    except Exception as error:  # code of another distribution may raise any exception
         raise UserError(f"cannot import the lip model {name} from {package}: {error}") from error
+    if not isinstance(info, LipModelInfo):
+        raise UserError(f"lip model {name} (package {package}): LIP_MODEL is not a LipModelInfo")
     return info

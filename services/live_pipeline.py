@@ -65,8 +65,8 @@ class LivePipeline:
 
     Examples
     --------
-    >>> chain = LivePipeline(load_model(), load_lip_model())
-    >>> frames = chain.accept_waveform(samples) + chain.input_finished()
+    >>> pipeline = LivePipeline(load_model(), load_lip_model())
+    >>> frames = pipeline.accept_waveform(samples) + pipeline.input_finished()
     """
 
     def __init__(

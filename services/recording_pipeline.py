@@ -84,7 +84,8 @@ def analyze_recording(
         Predicts the lip frames; None: no lip frames.
     is_text_known
         Whether the phones come from a known text.
-    with_progress Wraps the loop to show progress.
+    with_progress
+        Wraps the loop to show progress.
     """
     lip_stream = None
     if lip_predictor is not None:

@@ -27,9 +27,8 @@ from kouxing.shared.zap import Zap, answer_handshakes
 AUDIO = SocketLimits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
 COMMANDS = SocketLimits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
 PHONES = SocketLimits(part_bytes=4 * KIB, queue_length=64)
-SUBSCRIPTIONS = SocketLimits(
-    part_bytes=512, queue_length=32, cost=1.0
-)  # most of it for the handshake
+# most of the cost is for the handshake
+SUBSCRIPTIONS = SocketLimits(part_bytes=512, queue_length=32, cost=1.0)
 
 
 class ProbeResult(Enum):

@@ -146,7 +146,7 @@ def bootstrap_interval(
     """
     if len(by_speaker) < 2:
         return None
-    errors = np.array([c.insertions + c.deletions + c.substitutions for c in by_speaker])
+    errors = np.array([c.total for c in by_speaker])
     lengths = np.array([c.reference for c in by_speaker])
     picks = rng.integers(len(by_speaker), size=(_NUM_RESAMPLES, len(by_speaker)))
     rates = errors[picks].sum(axis=1) / np.maximum(1, lengths[picks].sum(axis=1))
@@ -163,8 +163,10 @@ def evaluate_recognizer(
     """Measure a model; return figures for a JSON file.
 
     ``speech`` in the figures contains the scores with ``rule``, by disturbance and speaking rate.
-    ``rules`` contains the scores with ``COMPARED_RULES`` in clean speech.
+    ``rules`` contains the scores with ``COMPARED_RULES`` in clean speech. ``errors_by_recording``
+    contains the errors of the final hypothesis in clean speech by utterance.
     """
+    by_recording: dict[str, dict[str, int]] = {}
     speech: dict[str, ErrorStats] = defaultdict(lambda: ErrorStats(model.inventory))
     by_rule: dict[str, ErrorStats] = defaultdict(lambda: ErrorStats(model.inventory))
     for reference in track(references, "recognizing", console=CONSOLE, transient=True):
@@ -174,6 +176,11 @@ def evaluate_recognizer(
             recognition = recognize_live(model, scored, rule)
             speech[name].add(reference, recognition)
             if name == CLEAN:
+                counts = _count_final_errors(reference, recognition)
+                by_recording[reference.utterance.utterance_id] = {
+                    "phones": counts.reference,
+                    "errors": counts.total,
+                }
                 speech[reference.group].add(reference, recognition)
                 for other in COMPARED_RULES:
                     by_rule[_rule_name(other)].add(reference, recognize_live(model, scored, other))
@@ -186,7 +193,13 @@ def evaluate_recognizer(
             for name in sorted(speech, key=[*disturbances, *RATE_NAMES, *speech].index)
         },
         "rules": {name: score.summary(rng) for name, score in by_rule.items()},
+        "errors_by_recording": by_recording,
     }
+
+
+def _count_final_errors(reference: AlignedRecording, recognition: Recognition) -> ErrorCounts:
+    final = [phone.symbol for phone in recognition.final]
+    return count_errors([phone.symbol for phone in reference.phones], final)
 
 
 def _rule_name(rule: OutputRuleConfig) -> str:

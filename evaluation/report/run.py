@@ -20,7 +20,13 @@ from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.steps import FOLDER_OPTIONS, ROOT, STEPS
 from kouxing.shared.terminal import print_message
 
-_OMITTED_KEYS = {"rules", "lateness_s", "phone_errors_by_speaker", "viseme_errors_by_speaker"}
+_OMITTED_KEYS = {
+    "rules",
+    "lateness_s",
+    "errors_by_recording",
+    "phone_errors_by_speaker",
+    "viseme_errors_by_speaker",
+}
 _OMITTED_GROUPS = ("source ", "speaker ")
 _DIGITS = 5
 # The report itself writes these files, so their changes do not make a commit dirty.
@@ -101,7 +107,7 @@ def _git(*arguments: str) -> str:
 
 
 def write_result(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result rounded to five digits, without figures by speaker and by frame."""
+    """Write a result rounded to five digits, without figures by speaker, recording and frame."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(_to_json(_trim_figures(result)) + "\n", encoding="utf-8")
 

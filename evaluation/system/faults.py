@@ -154,6 +154,7 @@ def _cut_link(which: str, *, is_mended: bool) -> Actions:
 
 _WORKERS = ("recognizer", "synthesizer")
 _SIGNALS = {"killed": signal.SIGKILL, "stopped": signal.SIGSTOP, "hangs": signal.SIGUSR1}
+# fault of a worker, and whether there is a spare worker
 _WORKER_FAULTS = (
     ("killed", False),
     ("killed", True),
@@ -161,7 +162,7 @@ _WORKER_FAULTS = (
     ("hangs", True),
     ("stopped", False),
     ("hangs", False),
-)  # fault of a worker, and whether there is a spare worker
+)
 FAULTS = {
     "none": Fault(_no_actions, is_sudden=False),
     **{

@@ -132,13 +132,13 @@ def animate(
     events: Sequence[SoundEvent]
     has_wrong_text = False
     if live:
-        chains = [
+        pipelines = [
             LivePipeline(model, lip_model, synthesizer=config, lip_predictor=predictor)
             for lip_model, config in zip(models, settings, strict=True)
         ]
         with_progress = partial(progress.track, description="recognizing")
-        faces = [chain.animate(samples, with_progress) for chain in chains]
-        events = chains[-1].events
+        faces = [pipeline.animate(samples, with_progress) for pipeline in pipelines]
+        events = pipelines[-1].events
     else:
         phones = None
         if transcript is not None:

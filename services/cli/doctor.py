@@ -24,11 +24,8 @@ MAX_CLOCK_OFFSET_MS = 1000.0
 MAX_AGE_S = 2.0  # limit for the age of the newest heartbeat
 REQUIRED_SERVICES = ("control", "recognizer", "synthesizer")  # without them, no face moves
 PUBLISHERS = ("phones", "faps", "events")  # accept every allowed key
-ROUTER_ROLES = {
-    "audio": "client",
-    "unpaced_audio": "client",
-    "phone_input": "service",
-}  # and its role
+# role that a key needs, by router
+ROUTER_ROLES = {"audio": "client", "unpaced_audio": "client", "phone_input": "service"}
 
 
 class CheckResult(NamedTuple):

@@ -243,7 +243,10 @@ def phones(
     track: AudioTrack = None,
     force: Force = False,
 ) -> None:
-    """Recognize the phones of audio files, with their times."""
+    """Recognize the phones of audio files, with their times.
+
+    proto/VALUES.md lists the symbols. For Mandarin, ii is the vowel of si and iii of shi.
+    """
     with show_loading():
         from kouxing.services.mono_audio import read_mono_16k
         from kouxing.services.recognizer.acoustic.languages import load_model_for_language

@@ -159,9 +159,8 @@ class ControlService(Service):
             return known.opened_message(self.endpoints["events"])
         if known is not None and not self._commands.is_open(known.client.connection):
             known.client = sender  # the client has reconnected
-            if (
-                known.announced and known.next_sequence == 1
-            ):  # the client may not have received its token
+            if known.announced and known.next_sequence == 1:
+                # the client may not have received its token
                 self._lifecycle.end(known, "its client was disconnected before the answer arrived")
                 known = None
         if known is not None and not known.announced:

@@ -24,9 +24,8 @@ class _Pose:
 class PoseStore:
     """Keeps the newest FAPs of each session, and chooses the session to show.
 
-        The shown session is the user's choice, a configured session, or the newest session.
-
-    The user's choice is valid until that session closes, or until the user returns to the default.
+    The shown session is the user's choice, a configured session, or the newest session. The user's
+    choice is valid until that session closes, or until the user returns to the default.
     """
 
     def __init__(self, session: str = NEWEST, idle_motion_seed: int = 0) -> None:

@@ -68,9 +68,8 @@ class _WebSocket(web.WebSocketResponse):
         self, *, code: int = WSCloseCode.OK, message: bytes = b"", drain: bool = True
     ) -> bool:
         reason = message or _CLOSE_REASONS.get(code, "").format(self._max_size).encode()
-        reason = (
-            reason[:MAX_REASON_BYTES].decode(errors="ignore").encode()
-        )  # without an incomplete character
+        # cut without an incomplete character
+        reason = reason[:MAX_REASON_BYTES].decode(errors="ignore").encode()
         if code in _CLOSE_REASONS and code != WSCloseCode.OK and not self.closed:
             # The client may still send. It would lose the reason if the connection closed now.
             with contextlib.suppress(ConnectionError):
@@ -193,8 +192,9 @@ def _modules_folder() -> Path | None:
 async def _serve_offers(_request: web.Request) -> web.StreamResponse:
     """Answer with the names of heads, and the titles of lip models and of languages."""
     heads = sorted(path.stem.removeprefix("head-") for path in PAGE_FOLDER.glob("head-*.webp"))
-    names = sorted(lip_models(), key=lambda name: name != DEFAULT_LIP_MODEL)
-    lips = {name: dict(lip_models()[name].titles) for name in names}
+    models = lip_models()
+    names = sorted(models, key=lambda name: name != DEFAULT_LIP_MODEL)
+    lips = {name: dict(models[name].titles) for name in names}
     return web.json_response({"heads": heads, "lips": lips, "languages": language_titles()})
 
 

@@ -10,7 +10,7 @@ symbol   meaning                                                shape           
 ======== ====================================================== =================== ===========
 s        scale of each FAP                                      (15,)               1
 b        offset of each FAP                                     (15,)               FAP units
-r        residual: the speaker's deviation from the model      (2 units, delays,   FAP units
+r        residual: the speaker's deviation from the model       (2 units, delays,   FAP units
                                                                 15)
 ======== ====================================================== =================== ===========
 

@@ -65,9 +65,8 @@ _SYMBOL = re.compile(r"[a-z]{1,4}")
 _WORDS = re.compile(r"[^\W\d_]+(?: +[^\W\d_]+)*")
 
 Syllable = tuple[str, ...]
-VisemeFractions = tuple[
-    tuple[str, float], ...
-]  # (viseme, fraction of the phone's duration), in order
+# (viseme, fraction of the phone's duration), in order
+VisemeFractions = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True, kw_only=True)

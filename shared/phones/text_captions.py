@@ -15,9 +15,8 @@ GAP = 0.7  # cost of a missing or inserted syllable; a wrong one costs up to 1
 
 def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> list[int | None]:
     """Return the index in the text of each syllable recognized so far; None: not in the text."""
-    costs = [
-        [GAP * j for j in range(len(text) + 1)]
-    ]  # [i][j]: of i recognized syllables and j of the text
+    # costs[i][j]: of i recognized syllables and j of the text
+    costs = [[GAP * j for j in range(len(text) + 1)]]
     for i, syllable in enumerate(recognized, start=1):
         costs.append([GAP * i])
         for j, spoken in enumerate(text):

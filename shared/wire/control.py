@@ -68,19 +68,18 @@ class Heartbeat(Message, frozen=True, kw_only=True):
     state: ServiceStatus
     sent_ns: int  # the sender's clock, which may be wrong
     endpoints: EndpointMap = field(default_factory=dict)  # endpoints that it provides, by name
-    needs: Annotated[list[Name], Meta(max_length=16)] = field(
-        default_factory=list
-    )  # names of the endpoints that it connects to
+    # names of the endpoints that it connects to
+    needs: Annotated[list[Name], Meta(max_length=16)] = field(default_factory=list)
     facts: SessionFacts = field(default_factory=SessionFacts)
-    languages: Annotated[list[Name], Meta(max_length=64)] = field(
-        default_factory=list
-    )  # additional languages that its sessions may choose
+    # additional languages that its sessions may choose
+    languages: Annotated[list[Name], Meta(max_length=64)] = field(default_factory=list)
     build: Text = ""  # version of kouxing
     load: Probability = 0.0  # fraction of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)
+    # sessions of the service
     sessions: Annotated[dict[SessionName, SessionProgress], Meta(max_length=10000)] = field(
         default_factory=dict
-    )  # sessions of the service
+    )
 
 
 class AllowedKey(Struct, frozen=True, kw_only=True):

@@ -15,9 +15,8 @@ def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     service = "recognizer"
     timing = Timing(length_s=6.0, fault_at_s=3.2, other_times_s=())
     monkeypatch.setattr("kouxing.evaluation.system.faults.TIMING", timing)
-    monkeypatch.setattr(
-        "kouxing.evaluation.system.live.END_LIMIT_S", 60.0
-    )  # a busy machine starts slowly
+    # a busy machine starts slowly
+    monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
     for name, value in SKIP_NO_AUDIO.items():
         monkeypatch.setenv(name, value)
     fault, figures, logs = f"{service} killed", tmp_path / "faults.json", tmp_path / "logs"

@@ -283,9 +283,8 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
         for _ in range(num_chunks):
             await microphone.send_bytes(b"\x01\x00" * 320)
         await microphone.send_json({"flush": True})
-        await wait_until_async(
-            lambda: control.messages_of(FlushSession)
-        )  # the gateway has read all chunks
+        # the gateway has then read all chunks
+        await wait_until_async(lambda: control.messages_of(FlushSession))
         control.run_job(control.bind_audio)
         await wait_until_async(lambda: len(control.audio_messages) == MAX_UNACKNOWLEDGED)
         await microphone.send_json({"skip": 320})

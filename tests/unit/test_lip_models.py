@@ -1,25 +1,28 @@
 """Discovery of lip models: built-in packages and entry points."""
 
+import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from kouxing.services.cli.configuration import markdown_page
-from kouxing.services.lip_models import _packages, lip_models
+from kouxing.services.lip_models import ENTRY_POINTS, _packages, lip_models
 from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent
+from tests.documents import code_blocks
+from tests.system import ROOT
 
-PACKAGE = """
+GUIDE = ROOT / "docs" / "extending.md"
+WRONG_LOAD = """
 from kouxing.services.lip_models import LipModelInfo
 
-LIP_MODEL = LipModelInfo(
-    delay_ms=40.0,
-    titles={"en": "toy", "zh": "toy"},
-    load=lambda inventory: ("toy", inventory.language),
-)
+LIP_MODEL = LipModelInfo(delay_ms=40.0, titles={"en": "toy", "zh": "toy"}, load=lambda _: object())
 """
 
 
@@ -33,7 +36,7 @@ def _fresh_registry() -> Iterator[None]:
 
 def install(folder: Path, package: str, code: str) -> None:
     """Write a distribution with the lip model ``toy`` to a folder."""
-    (folder / f"{package}.py").write_text(code)
+    (folder / f"{package}.py").write_text(code, encoding="utf-8")
     metadata = folder / "toy_lips-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-lips\nVersion: 1.0\n")
@@ -48,14 +51,24 @@ def test_built_in_lip_models() -> None:
         assert SynthesizerConfig(lips=name).delay_ms == info.delay_ms
 
 
-def test_a_package_adds_a_lip_model_by_entry_point(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    install(tmp_path, "toy_lips", PACKAGE)
+def test_the_lip_model_of_the_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (code,), (project,) = (code_blocks(GUIDE, kind) for kind in ("python", "toml"))
+    (entry,) = tomllib.loads(project)["project"]["entry-points"][ENTRY_POINTS].items()
+    assert entry == ("my-lips", "my_lips")
+    install(tmp_path, "my_lips", code)
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert lip_models()["toy"].delay_ms == 40.0
-    toy: object = load_lip_model(name="toy")
-    assert toy == ("toy", "mandarin")
+    assert lip_models()["toy"].delay_ms == 100.0
+    face = FaceAnimator(load_lip_model(name="toy"), frame_rate_hz=50.0, delay_s=0.1)
+
+    def jaw_after(event: SoundEvent) -> list[float]:
+        return [float(faps[2]) for _, faps in face.process(event)]
+
+    vowel = Phone(index=0, symbol="a", onset_s=0.5, duration_s=0.5, confidence=1.0, final=True)
+    face.process(vowel)
+    jaw = jaw_after(Progress(time_s=2.0, level_db=-20.0))
+    assert max(jaw[:25]) == 0.0  # before the vowel
+    assert max(jaw[25:50]) == pytest.approx(300.0, abs=30.0)
+    assert jaw[-1] < 1.0
 
 
 def test_an_unknown_lip_model_is_an_error() -> None:
@@ -63,12 +76,23 @@ def test_an_unknown_lip_model_is_an_error() -> None:
         load_lip_model(name="muscles")
 
 
-def test_a_broken_package_spoils_no_other_lip_model_nor_the_configuration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("code", "error"),
+    [
+        ("raise ImportError('no muscles')", "cannot import the lip model toy .* no muscles"),
+        ("1 / 0", "cannot import the lip model toy .* division by zero"),
+        ("LIP_MODEL = 3", r"lip model toy \(package .*\): LIP_MODEL is not a LipModelInfo"),
+        (WRONG_LOAD, "lip model toy: load returned object, which is not a LipModel"),
+    ],
+)
+def test_a_faulty_package_spoils_no_other_lip_model_nor_the_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, error: str
 ) -> None:
-    install(tmp_path, "broken_lips", "raise ImportError('no muscles')")
+    install(tmp_path, "faulty_lips", code)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "faulty_lips", raising=False)
     assert SynthesizerConfig(lips="ferguson").delay_ms == 160.0
     assert "| `lips` |" in markdown_page()
-    with pytest.raises(UserError, match=r"cannot import the lip model toy .* no muscles"):
+    assert DEFAULT_LIP_MODEL in lip_models()
+    with pytest.raises(UserError, match=error):
         load_lip_model(name="toy")

@@ -65,6 +65,9 @@ def test_a_corpus_with_bad_rows_is_evaluated(
     assert set(results["rules"]) == {"N = 3", "N = 3, conf. 0.99"}
     clean = results["speech"]["clean"]
     assert clean["final"]["phone_errors"]["reference"] == 6
+    final = clean["final"]["phone_errors"]
+    errors = final["insertions"] + final["deletions"] + final["substitutions"]
+    assert results["errors_by_recording"] == {"v": {"phones": 6, "errors": errors}}
     assert clean["final"]["labials"]["recall"] is None  # no p, b, m, f in it
     assert clean == results["speech"]["5.5 to 7/s"]
     for reason in (

@@ -162,9 +162,10 @@ class BlockReadout(Readout):
 
     def _run(self, inputs: Tensor, state: Tensor) -> Tensor:
         weights = [getattr(self.gru, f"{kind}_l0") for kind in _GRU_WEIGHTS]
+        # with biases, one layer, no dropout, one direction, batch first
         outputs, _ = torch.gru(
             inputs, state[None], weights, True, 1, 0.0, self.training, False, True
-        )  # with biases, one layer, no dropout, one direction, batch first
+        )
         return outputs
 
     def _backward_states(self, of_blocks: Tensor, layout: BlockLayout) -> Tensor:

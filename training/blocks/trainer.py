@@ -45,10 +45,7 @@ from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.networks.optimizer import cross_entropy, optimize
 from kouxing.training.networks.teacher import WholeEncoder
 
-_LEARNING_RATE, _READOUT_LEARNING_RATE = (
-    1.5e-4,
-    1.5e-3,
-)  # learning rates of the last layer and of the readout
+_LEARNING_RATE, _READOUT_LEARNING_RATE = 1.5e-4, 1.5e-3  # of the last layer, of the readout
 _LAYER_RATE_DECAY = 0.85  # relative to the rate of the layer above
 _READOUT_STEPS = 150
 _WARM_UP_STEPS = 60

@@ -83,9 +83,8 @@ def draw_phones(
     for step in track(range(_CONTEXT_WORDS, drawn.shape[1]), description="words"):
         context = drawn[:, step - _CONTEXT_WORDS : step]
         drawn[:, step] = _next_words(levels, context, rng)
-    return _phones_of_words(
-        drawn.ravel(), words, inventory
-    )  # word 0, before each chain, is a pause
+    # word 0, before each chain, is a pause
+    return _phones_of_words(drawn.ravel(), words, inventory)
 
 
 def _phones_of_words(

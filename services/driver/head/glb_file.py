@@ -30,12 +30,8 @@ _MESHOPT, _DRACO = "EXT_meshopt_compression", "KHR_draco_mesh_compression"
 _SUPPORTED = {
     _MESHOPT, _DRACO, "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp",
 }  # fmt: skip
-_LOOK_EXTENSIONS = (
-    "KHR_materials_",
-    "KHR_lights_",
-    "KHR_xmp",
-    "VRM",
-)  # extensions whose data is plain glTF
+# extensions whose data is plain glTF
+_LOOK_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "VRM")
 
 Float64 = NDArray[np.float64]
 

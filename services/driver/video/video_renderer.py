@@ -24,11 +24,9 @@ Faps = NDArray[np.float32]
 class VideoRenderer:
     """Renders FAP frames to images, and writes them and the sound to a video.
 
-        The file appears when the video is closed.
-
-    A renderer with a transparent background makes a transparent video. Unless ``overwrite`` is set,
-    ``close`` adds a number to the name of an existing file.
-    ``captions`` are drawn below the images.
+    The file appears when the video is closed. A renderer with a transparent background makes a
+    transparent video. Unless ``overwrite`` is set, ``close`` adds a number to the name of an
+    existing file. ``captions`` are drawn below the images.
 
     Raises ``UserError`` if the file cannot be written.
     """

@@ -5,7 +5,7 @@ model, add a package like ``dynamic_visemes`` whose ``__init__`` defines ``LIP_M
 ``services.lip_models``.
 """
 
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,7 @@ class LipStream(Protocol):
         """Drop the known events (an interruption); the next frames return to rest."""
 
 
+@runtime_checkable
 class LipModel(Protocol):
     """A lip model, shared by any number of sessions."""
 

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 
@@ -12,8 +13,13 @@ from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 def load_lip_model(language: str = DEFAULT_LANGUAGE, name: str = DEFAULT_LIP_MODEL) -> LipModel:
     """Load a lip model for the phones of a language.
 
-    Raises ``UserError`` if the lip model or the language is not installed, or the lip model does
-    not support it.
+    Raises ``UserError`` if the lip model or the language is not installed, or the lip model is
+    faulty or does not support the language.
     """
-    lip_model: LipModel = lip_model_info(name).load(load_inventory(language))
+    lip_model = lip_model_info(name).load(load_inventory(language))
+    if not isinstance(lip_model, LipModel):
+        raise UserError(
+            f"lip model {name}: load returned {type(lip_model).__name__}, which is not a LipModel;"
+            " it needs the attributes stream and amplitude_applies"
+        )
     return lip_model

@@ -1,6 +1,6 @@
 """Reads texts that mix languages, such as Mandarin with English words.
 
-        Each script is read in one language. For other languages, the user must choose a language.
+Each script is read in one language. For other languages, the user must choose a language.
 Numbers and their units are read in the language of the words before them. In a text with kana,
 Chinese characters are Japanese.
 """

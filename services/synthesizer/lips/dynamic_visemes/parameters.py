@@ -71,17 +71,15 @@ class VisemeParameters:
     c: float
     closure_ratio: float  # C of Wang & Cai 2003, eq. 7
     closure_reach_s: float  # T of Wang & Cai 2003, eq. 7, seconds
-    # columns for each viseme: offset_s, log alpha, theta_minus and theta_plus
-    dominance: NDArray[np.float64] = dataclasses.field(
-        init=False
-    )  # (num_visemes, 4, num_mouth_faps)
+    # columns for each viseme: offset_s, log alpha, theta_minus and theta_plus;
+    # (num_visemes, 4, num_mouth_faps)
+    dominance: NDArray[np.float64] = dataclasses.field(init=False)
     # silence after speech, then before it, (2, 1, 1, num_mouth_faps)
     silence_log_alpha: NDArray[np.float64] = dataclasses.field(init=False)
     silence_theta: NDArray[np.float64] = dataclasses.field(init=False)
     silence_offset_s: NDArray[np.float64] = dataclasses.field(init=False)
-    any_closes: NDArray[np.bool_] = dataclasses.field(
-        init=False
-    )  # (num_visemes,) whether any FAP closes
+    # (num_visemes,) whether any FAP closes
+    any_closes: NDArray[np.bool_] = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
         for name in (field.name for field in fields(self) if field.init):
