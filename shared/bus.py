@@ -15,9 +15,10 @@ from kouxing_client.keys import Key
 from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
 from zmq.utils.monitor import recv_monitor_message
 
-from kouxing.shared.connection_limits import KIB, ConnectionLimiter, SocketLimits
+from kouxing.shared.connection_limits import ConnectionLimiter
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
+from kouxing.shared.socket_limits import KIB, SocketLimits
 from kouxing.shared.sockets import Socket
 from kouxing.shared.waker import Waker
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES

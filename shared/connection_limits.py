@@ -20,7 +20,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import zmq
@@ -32,10 +31,11 @@ from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
 from kouxing.shared.peer_budget import BUDGET, MIN_BUDGET, PeerBudget
 from kouxing.shared.peer_quota import PeerQuota
+from kouxing.shared.socket_limits import KIB, MAX_QUEUED, SocketLimits
 from kouxing.shared.tarpit import MAX_HELD, Tarpit
 from kouxing.shared.waker import Waker
 
-KIB, MIB = 1024, 1024 * 1024
+MIB = 1024 * KIB
 CHECK_INTERVAL_S = 0.05  # interval between checks of all connections while data arrives
 MAX_INTERVAL_S = 1.0  # interval between checks without new data
 RECEIVE_BUFFER = 256 * KIB  # in the kernel, which doubles it
@@ -43,7 +43,6 @@ MAX_UNDELIVERED = 24 * MIB  # limit for all connections together
 MAX_INCOMPLETE = MIB  # limit for all connections together: 16 audio messages on slow links
 SMALL_INCOMPLETE = 4 * KIB  # additional limit for each connection
 MAX_UNREAD = 200_000  # messages queued for all peers; about 100 bytes of memory each
-MAX_QUEUED = 20_000  # messages that libzmq queues for one peer; it drops later ones
 STALLED_S = 1.0  # a live subscriber that reads nothing for this time is disconnected
 NEW_CHECKS = 20  # checks in which a connection is new; a flood is disconnected earlier
 MAX_ENDED = 1024  # ended connections that a service has not handled yet
@@ -58,30 +57,6 @@ _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor r
 _READABLE = int(zmq.POLLIN)
 _EVENT = struct.Struct("=HI")  # a monitor's event and descriptor
 _WARNINGS = RateLimit()
-
-
-@dataclass(frozen=True, slots=True)
-class SocketLimits:
-    """Limits of a bound socket."""
-
-    part_bytes: int
-    """size of the largest message part"""
-    queue_length: int
-    """messages of one connection that wait for delivery; above this, its peer waits"""
-    num_answers: int = MAX_QUEUED
-    """messages queued for one peer; later messages are dropped"""
-    cost: float = 0.0
-    """part of the sender's budget that each message uses"""
-
-    @property
-    def undelivered_bytes(self) -> int:
-        """Bytes that libzmq reads from a well-behaved peer while nothing is delivered."""
-        return (self.queue_length + 1) * self.message_bytes
-
-    @property
-    def message_bytes(self) -> int:
-        """Bytes of an incomplete message, with those that libzmq reads at once."""
-        return self.part_bytes + 16 * KIB
 
 
 class PeerConnection:

@@ -14,7 +14,6 @@ from kouxing_client.keys import Key
 from kouxing_client.sockets import connect
 
 from kouxing.shared.connection_limits import (
-    KIB,
     LONG_PENALTY_S,
     PENALTY_S,
     LimitedSocket,
@@ -25,6 +24,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import Record
 from kouxing.shared.keys import NO_PEER, Grant, Peer, may_subscribe
 from kouxing.shared.name_rules import is_name
+from kouxing.shared.socket_limits import KIB
 from kouxing.shared.waker import Waker
 from kouxing.shared.wire.codec import BadMessage, decode, encode, make_topic
 from kouxing.shared.wire.message import Message

@@ -1,5 +1,6 @@
-"""A client of the running system, commands, and a session that no test may disturb."""
+"""A client of the running system, commands, a witness, and the page in a browser."""
 
+import subprocess
 import sys
 from collections.abc import Iterator
 
@@ -9,7 +10,13 @@ from kouxing_client import Client, Session
 from kouxing.services.cli.main import main
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import load_user_key
-from tests.system import DEMO, System, samples_of_file, wait_until
+from tests.browser import Browser
+from tests.e2e.page_actions import write_tone
+from tests.e2e.page_control import PageControl
+from tests.system import DEMO, ROOT, Gateway, System, samples_of_file, wait_until
+
+PAGE = ROOT / "services" / "gateway" / "page"
+HEADS = {"woman": PAGE / "head.glb", "man": PAGE / "head-man.glb"}
 
 
 class CommandRunner:
@@ -54,3 +61,43 @@ def witness(system: System, client: Client) -> Iterator[Session]:
         session.push(samples_of_file(DEMO / "hello-female.wav")[:16000])
         wait_until(lambda: any(frame.media_time > 12000 for frame in output.available(0.1)))
     system.assert_all_alive()
+
+
+@pytest.fixture(scope="module")
+def control() -> Iterator[PageControl]:
+    with PageControl() as control:
+        yield control
+
+
+@pytest.fixture(scope="module")
+def gateway(control: PageControl) -> Iterator[Gateway]:
+    for name, file in HEADS.items():
+        if not file.is_file():
+            command = [sys.executable, "-m", "kouxing", "head", "export", "--head", name]
+            subprocess.run([*command, str(file)], cwd=ROOT, check=True)
+    gateway = Gateway(control.address)
+    wait_until(lambda: control.heartbeats)
+    yield gateway
+    assert gateway.stop() == 0
+
+
+@pytest.fixture(scope="module")
+def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    folder = tmp_path_factory.mktemp("browser")
+    write_tone(folder / "tone.wav")
+    browser = Browser(folder, folder / "tone.wav")
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def page(browser: Browser, gateway: Gateway) -> Browser:
+    """The browser with the loaded page."""
+    browser.open(gateway.page)
+    return browser
+
+
+@pytest.fixture(scope="module")
+def session(control: PageControl, gateway: Gateway) -> Iterator[Session]:
+    with Client(control.address, insecure=True) as client:
+        yield client.open_session("seen")

@@ -4,107 +4,25 @@ The gateway is real. Control, recognizer and synthesizer play a script, so that 
 known. The Chrome DevTools Protocol drives the browser.
 """
 
-import base64
-import io
 import re
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 
-import av
 import numpy as np
 import pytest
-import soundfile
-from kouxing_client import Client, Session
+from kouxing_client import Session
 from numpy.typing import NDArray
 
-from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import OpenSession
 from tests.browser import SIZE_PX, Browser
+from tests.e2e.page_actions import A_FACE, B_FACE, NOTICE, STATE, choose, colorfulness, is_loud
 from tests.e2e.page_control import LOOK_AHEAD_MS, PageControl
-from tests.system import ROOT, Gateway, wait_until
+from tests.system import Gateway, wait_until
 
 pytestmark = pytest.mark.timeout(400)
 
-PAGE = ROOT / "services" / "gateway" / "page"
-HEADS = {"woman": PAGE / "head.glb", "man": PAGE / "head-man.glb"}
-NOTICE = "document.getElementById('notice').textContent"
-STATE = "window.kouxing.state"
 IS_BEHIND = "document.getElementById('status').dataset.state === 'behind'"
 IS_BACK = f"!{STATE}.microphone && {STATE}.session === 'seen'"  # the microphone is off
-# Rows 15 (a) and 13 (b) of the Mandarin viseme table: FAP number to value.
-FAP_COLUMNS = [*range(3, 15), 16, 17, 44, 45, 46, 47, *range(51, 61)]
-A_VALUES = [
-    *(450, -280, -600, -40, -40, -220, -220, -520, -520, -70, -70, 0, 0, 70),
-    *(-210, -100, -220, 120, -260, -510, -40, -40, -230, -230, -520, -520, -20, -20),
-]
-B_VALUES = [
-    *(0, 0, 0, -50, -50, 0, 0, 0, 0, -20, -20, 0, 50, 50),
-    *(-120, -50, -120, 0, 10, 80, -100, -100, 10, 10, 30, 30, -30, -30),
-]
-
-
-def face(values: list[int]) -> NDArray[np.float32]:
-    faps = np.zeros(NUM_FAPS, np.float32)
-    faps[np.array(FAP_COLUMNS) - 1] = values
-    return faps
-
-
-A_FACE, B_FACE = face(A_VALUES), face(B_VALUES)
-
-
-def write_tone(path: Path) -> None:
-    """Write a pulsed 300 Hz tone, which no noise suppression removes."""
-    time_s = np.arange(2 * 48000) / 48000
-    tone = 0.4 * np.sin(2 * np.pi * 300 * time_s) * (np.sin(2 * np.pi * 2 * time_s) > 0)
-    soundfile.write(path, tone, 48000)
-
-
-def is_loud(samples: NDArray[np.int16]) -> bool:
-    return bool(np.sqrt((samples.astype(float) ** 2).mean()) > 300)
-
-
-@pytest.fixture(scope="module")
-def control() -> Iterator[PageControl]:
-    with PageControl() as control:
-        yield control
-
-
-@pytest.fixture(scope="module")
-def gateway(control: PageControl) -> Iterator[Gateway]:
-    for name, file in HEADS.items():
-        if not file.is_file():
-            command = [sys.executable, "-m", "kouxing", "head", "export", "--head", name]
-            subprocess.run([*command, str(file)], cwd=ROOT, check=True)
-    gateway = Gateway(control.address)
-    wait_until(lambda: control.heartbeats)
-    yield gateway
-    assert gateway.stop() == 0
-
-
-@pytest.fixture(scope="module")
-def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    folder = tmp_path_factory.mktemp("browser")
-    write_tone(folder / "tone.wav")
-    browser = Browser(folder, folder / "tone.wav")
-    yield browser
-    browser.close()
-
-
-@pytest.fixture(scope="module")
-def page(browser: Browser, gateway: Gateway) -> Browser:
-    """The browser with the loaded page."""
-    browser.open(gateway.page)
-    return browser
-
-
-@pytest.fixture(scope="module")
-def session(control: PageControl, gateway: Gateway) -> Iterator[Session]:
-    with Client(control.address, insecure=True) as client:
-        yield client.open_session("seen")
 
 
 @pytest.fixture
@@ -132,13 +50,6 @@ def turn_on_microphone(control: PageControl, page: Browser) -> str:
 def turn_off_microphone(page: Browser) -> None:
     page.click("microphone")
     page.wait_for(IS_BACK)
-
-
-def colorfulness(image: NDArray[np.uint8]) -> NDArray[np.int_]:
-    """Return the colorfulness of each pixel, 0 to 255."""
-    levels = image.astype(np.int_)
-    spread: NDArray[np.int_] = levels.max(axis=2) - levels.min(axis=2)
-    return spread
 
 
 def show_controls(page: Browser, share: int) -> None:
@@ -337,14 +248,6 @@ def test_a_microphone_can_be_turned_off_while_it_starts(
     assert not [text for text in page.page_errors if "exceptionDetails" in text]
 
 
-def choose(page: Browser, name: str, value: object) -> None:
-    """Change a setting."""
-    page.evaluate(
-        f"(() => {{ const input = document.getElementById('{name}'); input.value = '{value}';"
-        "input.dispatchEvent(new Event('input')); })()"
-    )
-
-
 def face_changes(control: PageControl) -> list[tuple[str, FaceSettings]]:
     return [(message.session, message.face) for message in control.messages_of(SetFace)]
 
@@ -431,117 +334,6 @@ def test_arrow_keys_turn_the_head_and_announce_it(
     front_again = page.steady_image()
     show_controls(page, 1)
     assert_changed_and_back(front, turned, front_again)
-
-
-def choose_file(page: Browser, path: Path) -> None:
-    document = page.command("DOM.getDocument")["root"]["nodeId"]
-    field = page.command("DOM.querySelector", nodeId=document, selector="#file")["nodeId"]
-    page.command("DOM.setFileInputFiles", nodeId=field, files=[str(path)])
-
-
-def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
-    control: PageControl, session: Session, page: Browser, tmp_path: Path
-) -> None:
-    before = {*control.openings}
-    control.talk(session.name, A_FACE, "a")
-    page.evaluate(
-        "window.saved = null; const make = URL.createObjectURL; URL.createObjectURL = (blob) =>"
-        " (blob.type.startsWith('video') && (window.saved = blob), make(blob))"
-    )
-    page.click("record")
-    page.wait_for(f"{STATE}.recording")
-    canvas = "document.getElementById('head')"
-    size = page.evaluate(f"[{canvas}.width, {canvas}.height]")
-    frames = page.evaluate(f"{STATE}.numFrames")
-    page.wait_for(f"{STATE}.numFrames > {frames + 25}")
-    page.resize(400, 300)  # the video keeps its size
-
-    write_tone(tmp_path / "tone.wav")  # 2 s
-    choose_file(page, tmp_path / "tone.wav")
-    wait_until(lambda: {*control.openings} > before)
-    (name,) = {*control.openings} - before
-    wait_until(lambda: control.has_ended(name))  # at the end of the file
-    samples = control.samples(name)
-    assert len(samples) > control.openings[name].sample_rate_hz  # a busy page drops late chunks
-    assert is_loud(samples)
-
-    page.wait_for(f"{STATE}.session === 'seen'")
-    page.click("record")
-    page.wait_for(f"!{STATE}.recording && {NOTICE}.startsWith('Saved')")
-    page.resize(*SIZE_PX)
-    video = base64.b64decode(
-        page.evaluate(
-            "window.saved.arrayBuffer().then((data) =>"
-            " btoa(Array.from(new Uint8Array(data), (byte) => String.fromCharCode(byte)).join('')))"
-        )
-    )
-    with av.open(io.BytesIO(video), "r") as container:
-        kind = "webm" if "webm" in container.format.name else "mp4"
-        assert f".{kind}." in page.evaluate(NOTICE)
-        assert {stream.type for stream in container.streams} == {"video", "audio"}
-        frames = container.decode(video=0)
-        images = [np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in frames]
-    assert len(images) > 5
-    assert {picture.shape for picture in images} == {(size[1], size[0], 3)}
-    assert colorfulness(images[-1]).max() > 50  # skin
-    assert images[-1][2, 2].min() > 200  # the page's background, not black
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "english", "chinese"),
-    [
-        (
-            f"{'broken' * 20}.wav",
-            b"RIFF" + bytes(40),
-            "the file is damaged or cut off",
-            "文件损坏或不完整",
-        ),
-        ("silent.wav", None, "silent.wav: no speech was found; it is silent", "文件是静音的"),
-    ],
-)
-def test_a_file_without_sound_is_explained_in_both_languages(
-    page: Browser, tmp_path: Path, name: str, content: bytes | None, english: str, chinese: str
-) -> None:
-    if content is None:
-        soundfile.write(tmp_path / name, np.zeros(16000), 16000)
-    else:
-        (tmp_path / name).write_bytes(content)
-    for language, text in (("zh", chinese), ("en", english)):
-        choose(page, "language", language)
-        choose_file(page, tmp_path / name)
-        page.wait_for(f"{NOTICE}.includes('{text}')")
-        notice = "document.getElementById('notice')"
-        assert page.evaluate(f"{notice}.scrollWidth <= {notice}.clientWidth")  # long names wrap
-
-
-def test_reading_of_a_file_is_shown_and_can_be_stopped(page: Browser, tmp_path: Path) -> None:
-    write_tone(tmp_path / "tone.wav")
-    (tmp_path / "empty.wav").touch()
-    choose_file(page, tmp_path / "empty.wav")
-    page.wait_for(f"{NOTICE}.includes('empty.wav')")
-    page.evaluate("window.realFetch = fetch; void (window.fetch = () => new Promise(() => {}))")
-    choose_file(page, tmp_path / "tone.wav")
-    busy = "[...document.querySelectorAll('[aria-busy=true]')].map(({ id }) => id).join()"
-    page.wait_for(f"{busy} === 'open-file'")
-    assert page.evaluate(f"{NOTICE} === ''"), "the error was about another file"
-    page.click("open-file")
-    page.wait_for(f"{busy} === ''")
-    page.evaluate("void (window.fetch = window.realFetch)")
-
-
-def test_a_dropped_file_is_streamed(
-    control: PageControl, session: Session, page: Browser, tmp_path: Path
-) -> None:
-    before = {*control.openings}
-    write_tone(tmp_path / "tone.wav")
-    dropped = {"items": [], "files": [str(tmp_path / "tone.wav")], "dragOperationsMask": 1}
-    for kind in ("dragEnter", "dragOver", "drop"):
-        page.command("Input.dispatchDragEvent", type=kind, x=240, y=150, data=dropped)
-    wait_until(lambda: {*control.openings} > before)
-    (name,) = {*control.openings} - before
-    wait_until(lambda: control.has_ended(name))
-    assert is_loud(control.samples(name))
-    page.wait_for(f"{STATE}.session === 'seen'")
 
 
 @pytest.mark.parametrize("view", ["", "?view=bare&background=transparent"])

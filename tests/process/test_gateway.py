@@ -1,7 +1,6 @@
 """The gateway's WebSockets, between a scripted control and clients."""
 
 import json
-import signal
 import socket
 import struct
 from collections.abc import Iterator
@@ -10,7 +9,6 @@ import aiohttp
 import msgpack
 import numpy as np
 import pytest
-from kouxing_client.base import MAX_UNACKNOWLEDGED
 from pythonosc.osc_bundle import OscBundle
 
 from kouxing.services.gateway.browser_messages import (
@@ -22,10 +20,7 @@ from kouxing.services.gateway.browser_messages import (
 from kouxing.services.gateway.microphone_handler import MAX_MESSAGE_BYTES
 from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.face.shapes import VRM
-from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import SessionStarted
-from kouxing.shared.wire.face import EndOfFaps, SetFace
-from kouxing.shared.wire.session import CloseSession, FlushSession
+from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.speech import Acoustic
 from tests.fake_control import EPOCH, FakeControl
 from tests.process.web_clients import (
@@ -33,7 +28,6 @@ from tests.process.web_clients import (
     async_test,
     open_websockets,
     publish_all,
-    publish_phone,
     receive_binary,
     receive_json,
     receive_session_message,
@@ -41,15 +35,9 @@ from tests.process.web_clients import (
 )
 from tests.raw_bytes import flood
 from tests.samples import fap_frame
-from tests.system import LIMIT_S, Gateway, free_port, port_of
+from tests.system import LIMIT_S, Gateway, port_of
 
 PONG = b"\x8a\x80" + bytes(4)  # of a client
-LONG_TIMEOUT = """
-from kouxing.services.gateway import audio_sessions
-from kouxing.services.process import serve
-audio_sessions.LAST_FRAME_TIMEOUT_S = 600
-serve("gateway", None, [])
-"""
 
 
 @pytest.fixture(scope="module")
@@ -71,20 +59,6 @@ def control(shared_control: FakeControl) -> FakeControl:
     """The control of the module, without the records of earlier tests."""
     shared_control.clear()
     return shared_control
-
-
-@pytest.fixture
-def own_control() -> Iterator[FakeControl]:
-    with FakeControl() as control:
-        yield control
-
-
-@pytest.fixture
-def own_gateway(own_control: FakeControl) -> Iterator[Gateway]:
-    gateway = Gateway(own_control.address)
-    assert own_control.page == gateway.page
-    yield gateway
-    gateway.stop()
 
 
 # --- viewers
@@ -248,57 +222,6 @@ async def test_a_slow_viewer_gets_the_newest_frames(control: FakeControl, gatewa
 
 
 @async_test
-async def test_a_microphone_session_closes_after_its_last_frame(own_control: FakeControl) -> None:
-    control, gateway = own_control, Gateway(own_control.address, "-c", LONG_TIMEOUT)
-    assert control.page == gateway.page
-    async with open_websockets(gateway.page, "microphone") as (microphone,):
-        await microphone.send_json({"sample_rate_hz": 48000, "num_channels": 1})
-        session = (await receive_json(microphone, "opened"))["session"]
-        for _ in range(5):
-            await microphone.send_bytes(b"\x01\x00" * 960)
-        await wait_until_async(lambda: len(control.audio_messages) == 5)
-    await wait_until_async(lambda: len(control.audio_messages) == 6)
-    assert not control.messages_of(CloseSession)  # before the last frame has arrived
-    control.publish(control.faps, EndOfFaps(session=session, epoch=EPOCH))
-    await wait_until_async(lambda: control.sessions_of(CloseSession) == [session])
-    gateway.stop()
-    *chunks, last = control.audio_messages
-    assert [chunk.media_time for chunk in chunks] == [0, 320, 640, 960, 1280]
-    assert all(isinstance(chunk, AudioChunk) and len(chunk.pcm) == 1920 for chunk in chunks)
-    assert isinstance(last, AudioChunk)
-    assert last.last
-
-
-@async_test
-async def test_dropped_audio_leaves_a_gap_in_media_time(
-    own_control: FakeControl, own_gateway: Gateway
-) -> None:
-    control = own_control
-    control.audio_endpoint = f"tcp://127.0.0.1:{free_port()}"  # not bound yet
-    num_chunks = MAX_UNACKNOWLEDGED + 100
-    last_pcm = b"\x02\x00" * 320
-    async with open_websockets(own_gateway.page, "microphone") as (microphone,):
-        await microphone.send_json({"sample_rate_hz": 16000})
-        await receive_json(microphone, "opened")
-        for _ in range(num_chunks):
-            await microphone.send_bytes(b"\x01\x00" * 320)
-        await microphone.send_json({"flush": True})
-        # the gateway has then read all chunks
-        await wait_until_async(lambda: control.messages_of(FlushSession))
-        control.run_job(control.bind_audio)
-        await wait_until_async(lambda: len(control.audio_messages) == MAX_UNACKNOWLEDGED)
-        await microphone.send_json({"skip": 320})
-        await microphone.send_bytes(last_pcm)
-        await wait_until_async(lambda: len(control.audio_messages) > MAX_UNACKNOWLEDGED)
-    *queued, last = control.audio_messages[: MAX_UNACKNOWLEDGED + 1]
-    assert [chunk.media_time for chunk in queued] == [320 * n for n in range(MAX_UNACKNOWLEDGED)]
-    assert isinstance(last, AudioChunk)
-    assert last.pcm == last_pcm
-    assert last.media_time == 320 * (num_chunks + 1)
-    assert last.sequence == MAX_UNACKNOWLEDGED + 1
-
-
-@async_test
 async def test_bad_audio_is_refused_with_a_reason(control: FakeControl, gateway: Gateway) -> None:
     hello = json.dumps({"sample_rate_hz": 16000})
     for messages, reason in (
@@ -349,28 +272,6 @@ async def test_malformed_messages_do_not_disturb_other_clients(
         await receive_json(microphone, "opened")
         await microphone.send_bytes(bytes(640))
         await wait_until_async(lambda: control.audio_messages)
-
-
-@async_test
-async def test_the_sample_sentence_plays_once_and_sigterm_closes_viewers(
-    own_control: FakeControl, own_gateway: Gateway
-) -> None:
-    control = own_control
-    async with open_websockets(own_gateway.page, "viewer", "viewer") as viewers:
-        for viewer in viewers:
-            await viewer.send_json({"play": "sample"})
-        shown = [await receive_json(viewer, "session", sample=True) for viewer in viewers]
-        names = {message["session"] for message in shown}
-        await wait_until_async(lambda: len(control.audio_messages) > 10)
-        assert names == {*control.sessions_of(SessionStarted)}
-        publish_phone(control, names.pop(), "n")
-        await receive_json(viewers[0], "syllable", symbol="你")
-        own_gateway.process.send_signal(signal.SIGTERM)
-        with pytest.raises(EOFError):
-            await receive_json(viewers[1], "never")
-        assert viewers[1].close_code == aiohttp.WSCloseCode.GOING_AWAY
-    assert own_gateway.process.wait(LIMIT_S) == 0
-    assert control.sessions_of(CloseSession) == control.sessions_of(SessionStarted)
 
 
 @async_test
@@ -443,18 +344,3 @@ def time_sent(program: socket.socket) -> float:
     while (first := next(iter(OscBundle(program.recv(2000))))).address != "/kouxing/time":
         pass
     return round(float(first.params[0]), 3)
-
-
-# --- the process
-
-
-@async_test
-async def test_without_control_browsers_are_told_to_start_it() -> None:
-    gateway = Gateway("tcp://127.0.0.1:9")
-    async with open_websockets(gateway.page, "viewer", "microphone") as (viewer, microphone):
-        await receive_json(viewer, "status", missing=["control"])
-        await microphone.send_json({"sample_rate_hz": 16000})
-        text = (await receive_json(microphone, "error"))["text"]
-    assert "does not answer" in text
-    assert "kouxing run" in text
-    assert gateway.stop() == 0

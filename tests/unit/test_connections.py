@@ -9,7 +9,6 @@ import pytest
 from kouxing.shared import connection_limits, kernel_sockets, peer_quota
 from kouxing.shared.bus import AUDIO
 from kouxing.shared.connection_limits import (
-    MAX_QUEUED,
     NEW_CHECKS,
     NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
@@ -19,6 +18,7 @@ from kouxing.shared.connection_limits import (
 )
 from kouxing.shared.kernel_sockets import Traffic
 from kouxing.shared.peer_budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, PeerBudget
+from kouxing.shared.socket_limits import MAX_QUEUED
 from kouxing.shared.tarpit import GAP_S, HOLD_S
 
 
