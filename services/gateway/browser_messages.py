@@ -6,7 +6,6 @@ Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media t
 
 import base64
 import json
-import re
 import struct
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 import msgspec
 
 from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, RATES_HZ, PcmFormat, check_text
+from kouxing.services.lip_models import lip_model_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import (
     DEFAULT_HOLD_S,
@@ -38,11 +38,10 @@ REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at
 MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
 MAX_SHOWN = 40  # letters of a client's text in an error
-_LIP_MODEL = re.compile("[a-z0-9-]{1,64}")
 # The face settings that a browser can change, and their values in words; the query of its address
 # selects shapes.
 FACE_SETTINGS = {
-    "lip_model": "the name of a lip model, such as learned",
+    "lip_model": f"the name of a lip model: {', '.join(lip_model_names())}",
     "acoustic": " or ".join(AcousticModelName),
     "expressiveness": f"a number from {MIN_EXPRESSIVENESS:g} to {MAX_EXPRESSIVENESS:g}",
     "feeling": "a number from 0 to 1",
@@ -185,7 +184,7 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
 def _is_setting(name: str, value: object) -> bool:
     """Return whether a face setting can have this value."""
     if name == "lip_model":
-        return isinstance(value, str) and _LIP_MODEL.fullmatch(value) is not None
+        return value in lip_model_names()
     if name == "acoustic":
         return value in [*AcousticModelName]
     try:

@@ -140,6 +140,7 @@ def test_parses_face_settings() -> None:
         ({"listen_to": "a b"}, 'listen_to is "a b"; it must be the name of a session, or "" for'),
         ({"acoustic": "heavy"}, 'acoustic is "heavy"; it must be full or light'),
         ({"acoustic": [1]}, r"acoustic is \[1\]; it must be full or light"),
+        ({"lip_model": "lerned"}, r"the name of a lip model: dynamic-visemes, .*learned"),
         ({"lip_model": "X Y!"}, 'lip_model is "X Y!"; it must be the name of a lip model'),
         (
             {"lip_model": ["a"] * 9999},

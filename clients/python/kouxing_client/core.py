@@ -206,7 +206,7 @@ class ClientCore:
             " run'. If it is yours, restart it. If it runs on another machine, run there 'kouxing"
             " keys add NAME --role client' and copy the file here"
             if key
-            else "refuses this client: insecure = true is set here, but not there; or see its log"
+            else "refuses this client: 'insecure' is set here, but not there; or see its log"
         )
 
     def _add(self, opened: Fields, options: Fields | None, *, is_live: bool) -> SessionCore:
