@@ -156,7 +156,7 @@ def _animate(
     model: AcousticModel, recordings: Sequence[EmotionRecording], config: SynthesizerConfig
 ) -> _Session:
     """Stream the recordings of a speaker as one session."""
-    chain = LivePipeline(model, load_lip_model(name=config.lips), synthesizer=config)
+    pipeline = LivePipeline(model, load_lip_model(name=config.lips), synthesizer=config)
     pause = np.zeros(round(_PAUSE_S * MEDIA_RATE_HZ), np.float32)
     frames, spans, stressed = [], [], []
     start = 0  # samples
@@ -164,13 +164,13 @@ def _animate(
         samples = read_audio(recording.path)
         joined = np.concatenate([samples, pause])
         for first in range(0, len(joined), _CHUNK):
-            frames += chain.accept_waveform(joined[first : first + _CHUNK])
+            frames += pipeline.accept_waveform(joined[first : first + _CHUNK])
         start_s = start / MEDIA_RATE_HZ
         spans.append((start_s, (start + len(samples)) / MEDIA_RATE_HZ))
         stressed += [start_s + time_s for time_s in recording.stressed_s]
         start += len(joined)
-    frames += chain.input_finished()
-    progress = [event for event in chain.events if isinstance(event, Progress)]
+    frames += pipeline.input_finished()
+    progress = [event for event in pipeline.events if isinstance(event, Progress)]
     times_s = np.array([event.time_s for event in progress])
     ends = np.searchsorted(times_s, [end_s for _, end_s in spans]) - 1
     return _Session(

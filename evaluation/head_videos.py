@@ -32,9 +32,9 @@ def write_head_videos(folder: Path, model: AcousticModel, recordings: Sequence[P
     """
     loaded = {name: scene.load_head(name) for name in HEAD_NAMES}
     samples = join_recordings([read_mono_16k(path) for path in recordings])
-    chain = LivePipeline(model, load_lip_model(model.inventory.language))
+    pipeline = LivePipeline(model, load_lip_model(model.inventory.language))
     show = partial(track, description="recognizing", console=CONSOLE, transient=True)
-    frames = chain.animate(samples, show)
+    frames = pipeline.animate(samples, show)
     for name, head in track(loaded.items(), "drawing", console=CONSOLE, transient=True):
         renderer = Renderer(head, *VIDEO_PX, camera=scene.place_camera(head))
         with contextlib.closing(renderer):

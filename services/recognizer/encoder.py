@@ -11,7 +11,7 @@ h        state of the recurrent layers                            (state width,)
 f        features for a lip predictor                             (features,)
 q        log posteriors of the phones of the default language,    (phones,)
          for the frames ``PHONES_LAG_FRAMES`` earlier
-v        probabilities of the kinds of voice (:class:`VoiceKind`),    (4,)
+v        probabilities of the kinds of voice (``VoiceKind``),     (4,)
          for the audio 40 ms earlier
 ======== ======================================================== ==================
 

@@ -6,7 +6,8 @@ recurrent unit).
 ======== ============================================================ ==================
 symbol   meaning                                                      shape
 ======== ============================================================ ==================
-f        a position: its two log-mel frames, and the encoder's features    (160 + encoder's,)
+f        a position: its two log-mel frames, and the encoder's        (160 + encoder's,)
+         features
 x        principal components of f                                    (components,)
 u        relu(U x + b_u)                                              (units,)
 h        state of the gated recurrent unit, driven by u               (units,)

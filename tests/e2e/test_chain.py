@@ -98,17 +98,17 @@ def test_services_send_the_frames_of_the_chain(
     samples = at_rate(samples_of_file(DEMO / f"{name}.wav")[:48000], rate_hz)
     samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
     streamed = stream_audio(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
-    chain = LivePipeline(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
-    frames = chain.accept_waveform(samples) + chain.input_finished()
+    pipeline = LivePipeline(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
+    frames = pipeline.accept_waveform(samples) + pipeline.input_finished()
 
     assert streamed.times == [to_samples(time_s) for time_s, _ in frames]
     np.testing.assert_array_equal(streamed.faps, np.array([faps for _, faps in frames]))
     assert streamed.faps[:, MOUTH].any()
     assert lip_frames_of(streamed) == [
-        event_to_message(event) for event in chain.events if isinstance(event, LipPositions)
+        event_to_message(event) for event in pipeline.events if isinstance(event, LipPositions)
     ]
     assert streamed.lips
-    recognized_phones = [event for event in chain.events if isinstance(event, events.Phone)]
+    recognized_phones = [event for event in pipeline.events if isinstance(event, events.Phone)]
     assert [
         (phone.index, phone.symbol, phone.media_time, phone.duration, phone.confidence, phone.final)
         for phone in streamed.phones
@@ -141,10 +141,10 @@ def lip_frames_of(streamed: StreamedSession) -> list[speech.LipPositions]:
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     samples = samples_of_file(VOWELS_FILE)
-    chain = LivePipeline(
+    pipeline = LivePipeline(
         load_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0, feeling=0.0)
     )
-    frames = chain.accept_waveform(samples) + chain.input_finished()
+    frames = pipeline.accept_waveform(samples) + pipeline.input_finished()
     delay_s = SynthesizerConfig().delay_ms / 1e3
     live = live_events(load_model(), samples, None, [delay_s])
     scored = live_frames(LIPS, live[delay_s], delay_s)

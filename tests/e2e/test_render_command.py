@@ -129,9 +129,9 @@ def test_a_text_that_does_not_fit_is_rendered_with_exit_status_1(tmp_path: Path)
 
 def test_live_frames_are_those_of_the_live_chain(tmp_path: Path) -> None:
     render(SENTENCE, tmp_path / "live.fap", live=True)
-    chain = LivePipeline(load_model(), load_lip_model())
+    pipeline = LivePipeline(load_model(), load_lip_model())
     samples = read_audio(SENTENCE)[0][:, 0]
-    frames = chain.accept_waveform(samples) + chain.input_finished()
+    frames = pipeline.accept_waveform(samples) + pipeline.input_finished()
     written = read_fap(tmp_path / "live.fap").faps[:, 2:]
     np.testing.assert_allclose(written, [faps[2:] for _, faps in frames], rtol=1e-6, atol=1e-6)
 

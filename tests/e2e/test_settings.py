@@ -44,8 +44,8 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 
 
 def frames_of_the_chain(lips: str) -> NDArray[np.float32]:
-    chain = LivePipeline(load_model(), load_lip_model(name=lips), synthesizer=FACE)
-    frames = chain.accept_waveform(SAMPLES) + chain.input_finished()
+    pipeline = LivePipeline(load_model(), load_lip_model(name=lips), synthesizer=FACE)
+    frames = pipeline.accept_waveform(SAMPLES) + pipeline.input_finished()
     return np.array([faps for _, faps in frames])
 
 

@@ -96,11 +96,11 @@ def test_lips_stay_within_their_travel_at_any_chunk_size() -> None:
     )
     live_openings = []
     for chunk in (32_000, 333):
-        chain = LivePipeline(load_model(), LIPS, synthesizer=settings)
+        pipeline = LivePipeline(load_model(), LIPS, synthesizer=settings)
         frames = []
         for begin in range(0, len(samples), chunk):
-            frames += chain.accept_waveform(samples[begin : begin + chunk])
-        live_openings.append(np.array([faps for _, faps in frames + chain.input_finished()]))
+            frames += pipeline.accept_waveform(samples[begin : begin + chunk])
+        live_openings.append(np.array([faps for _, faps in frames + pipeline.input_finished()]))
     np.testing.assert_array_equal(live_openings[0], live_openings[1])
     opening = 5.0 * live_openings[0][:, LOWER_LIP] / WIDEST
     assert opening.min() >= 0.0

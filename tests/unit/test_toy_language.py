@@ -101,9 +101,9 @@ def test_a_text_of_the_language_is_aligned(toy: PhoneInventory, path: Path) -> N
 def test_the_language_opens_the_mouth(toy: PhoneInventory, path: Path) -> None:
     visemes = "dynamic-visemes"
     config = SynthesizerConfig(lips=visemes)
-    chain = LivePipeline(load_model(path), load_lip_model("toy", visemes), synthesizer=config)
-    frames = chain.accept_waveform(SAMPLES) + chain.input_finished()
-    phones = [event for event in chain.events if isinstance(event, Phone)]
+    pipeline = LivePipeline(load_model(path), load_lip_model("toy", visemes), synthesizer=config)
+    frames = pipeline.accept_waveform(SAMPLES) + pipeline.input_finished()
+    phones = [event for event in pipeline.events if isinstance(event, Phone)]
     assert {phone.symbol for phone in phones} <= set(toy.phones)
     a = next(phone for phone in phones if phone.final and phone.symbol == "a")
     jaw = np.array([faps[2] for _, faps in frames])  # FAP 3, at 50 Hz
