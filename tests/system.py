@@ -241,7 +241,7 @@ class System(LocalSystem):
 
     def status(self) -> Status:
         """Return the status report of control."""
-        with Client(self.control, timeout_s=LIMIT_S) as client:
+        with Client(self.control, timeout_s=LIMIT_S, start_s=LIMIT_S) as client:
             return client.status()
 
     def endpoints(self) -> dict[str, str]:

@@ -102,6 +102,7 @@ class AudioClient:
                 key=self._key,
                 insecure=self._key is None,
                 timeout_s=CONTROL_TIMEOUT_S,
+                start_s=CONTROL_TIMEOUT_S,
             )
         self.num_opening += 1
         try:
