@@ -5,11 +5,12 @@ from collections.abc import Iterable
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
+from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import HEARTBEAT_S, Service
 from kouxing.shared.wire.control import EventName, SessionStarted, StartSession
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import CloseSession, ErrorCode, FlushSession
+from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession
 
 
 class SessionService(Service):
@@ -49,6 +50,21 @@ class SessionService(Service):
         """Report that this service serves a session, whose phones are final up to a media time."""
         self.send_to_control(
             SessionStarted(session=start.session, request=start.request, final_until=final_until)
+        )
+
+    def reject_session(
+        self, start: StartSession, code: str, reason: str, retry_after_s: float | None = None
+    ) -> None:
+        """Ask control to reject a session that this service cannot serve."""
+        LOG.info(reason, extra={"session": start.session})
+        self.send_to_control(
+            Error(
+                session=start.session,
+                request=start.request,
+                code=code,
+                text=reason,
+                retry_after_s=retry_after_s,
+            )
         )
 
     def report_skipped(self, session: str, skipped_s: float) -> None:

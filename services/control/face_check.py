@@ -1,7 +1,6 @@
-"""Checks the names in the settings of a face."""
+"""Checks the names in the settings of a face; the synthesizer checks its lip models."""
 
 from kouxing.services.control.rejection import RequestRejected
-from kouxing.services.lip_models import lip_model_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import check_expressions
 from kouxing.shared.face.shape_names import ShapeSetName
@@ -13,7 +12,6 @@ from kouxing.shared.wire.speech import AcousticModelName
 def check_face(settings: FaceSettings) -> None:
     """Raise ``RequestRejected`` if a setting has an unknown name; the text lists the names."""
     known: list[tuple[str, str | None, list[str]]] = [
-        ("lip model", settings.lip_model, lip_model_names()),
         ("acoustic model", settings.acoustic, [*AcousticModelName]),
         *(("set of shapes", name, [*ShapeSetName]) for name in settings.shapes or ()),
     ]

@@ -31,7 +31,7 @@ from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Error, ErrorCode
+from kouxing.shared.wire.session import ErrorCode
 
 LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
 MAX_DRAIN_S = 3.0  # time to draw the remaining images when the driver stops
@@ -89,7 +89,7 @@ class DriverService(SessionService):
         if session is None:
             key = start.client_key or ""
             if start.opening.record and (reason := self.recorder.rejection_reason(key)):
-                self._reject_session(start, reason)
+                self.reject_session(start, ErrorCode.BUSY, reason, RETRY_AFTER_S)
                 return False
             handlers: dict[type[Message], Callable[[Any], None]] = {
                 FapFrame: self._on_frame,
@@ -194,19 +194,6 @@ class DriverService(SessionService):
         self._was_stalled = is_stalled
 
     # --- videos --------------------------------------------------------------------------------
-
-    def _reject_session(self, start: StartSession, reason: str) -> None:
-        """Ask control to reject a session that cannot be recorded."""
-        LOG.info(reason, extra={"session": start.session})
-        self.send_to_control(
-            Error(
-                session=start.session,
-                request=start.request,
-                code=ErrorCode.BUSY,
-                text=reason,
-                retry_after_s=RETRY_AFTER_S,
-            )
-        )
 
     def _report_written(self, session: str, path: Path) -> None:
         self.metrics.count("videos")

@@ -102,6 +102,14 @@ class SynthesizerService(SessionService):
         """Create a face at rest. A session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
+            lip_model = start.opening.face.lip_model
+            if start.epoch == 1 and lip_model not in (None, *lip_model_names()):
+                self.reject_session(
+                    start,
+                    ErrorCode.BAD_FACE,
+                    f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}",
+                )
+                return False
             settings = self._known_settings(start.session, start.opening.face)
             face = self._new_face(start, settings)
             session = SynthesizerSession(

@@ -62,7 +62,8 @@ def test_lips_are_switched_while_a_session_runs(system: System) -> None:
         client.open_session(encoding="f32le", paced=False) as session,
     ):
         with pytest.raises(Refused, match="unknown lip model 'muscles'; use "):
-            session.set_face(lip_model="muscles")
+            client.open_session(face={"lip_model": "muscles"})
+        session.set_face(lip_model="muscles")  # is reported and ignored
         session.set_face(lip_model="learned")
         streamed = StreamedSession(session)
         streamed.send(SAMPLES)
