@@ -16,4 +16,4 @@ EmotionalSpeech = Annotated[
     Path,
     typer.Option("--recordings", help="Folder of speech whose manifest names emotions."),
 ]
-Picture = Annotated[Path | None, typer.Option(help="Picture of the figures to write (.png).")]
+Picture = Annotated[Path | None, typer.Option(help="Picture file (.png) to write.")]

@@ -57,9 +57,7 @@ Conditions = Annotated[
 ]
 Tables = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--from-csv", help="Folder with CLIP.csv, the curves of another program; repeatable."
-    ),
+    typer.Option("--from-csv", help="Folder of another program's curves, CLIP.csv; repeatable."),
 ]
 
 
@@ -315,7 +313,7 @@ def report(
         typer.Option(help="Folder of the audio files that corpora/languages.tsv lists."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Measure parts of the data, in about ten minutes.")
+        bool, typer.Option("--quick", help="Measure only part of the data, in about ten minutes.")
     ] = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Also run steps that are up to date.")

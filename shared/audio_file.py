@@ -135,7 +135,7 @@ def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -
             raise UserError(f"{name}: this is {kind}")
         source = raw_audio(pipe, raw := RawFormat(), name)
         source.notices.append(
-            f"{name}: no sound format fits, so this is read as raw samples: 16-bit, mono,"
+            f"{name}: the sound format is unknown; reading raw samples: 16-bit, mono,"
             f" {raw.sample_rate_hz} Hz; for other samples use kouxing speak with --raw, --rate and"
             " --channels"
         )

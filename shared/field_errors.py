@@ -10,9 +10,9 @@ _TYPES = {
     "bytes": "bytes",
     "float": "a number",
     "int": "an integer",
-    "null": "nothing",
+    "null": "null",
     "object": "an object",
-    "str": "a text",
+    "str": "a string",
 }
 _ERROR = re.compile(r"Expected `(?P<types>[^`]+)`(?P<rest>.*) - at `\$\.(?P<name>.+)`", re.DOTALL)
 _LIMITS = {"<=": "of at most", ">=": "of at least", "<": "below", ">": "above"}

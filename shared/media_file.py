@@ -347,7 +347,7 @@ class _GuardedFile:
         if is_interrupted():
             raise KeyboardInterrupt
         if isinstance(self._failure, OSError):
-            raise UserError(f"{self.name}: cannot be read to its end: {self._failure.strerror}")
+            raise UserError(f"{self.name}: cannot be read to the end: {self._failure.strerror}")
         if self._failure is not None:
             raise self._failure
 

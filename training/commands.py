@@ -30,7 +30,7 @@ PhoneLm = Annotated[
     ),
 ]
 Whisper = Annotated[
-    Path, typer.Option(help="Folder of the model Whisper base, in the format of faster-whisper.")
+    Path, typer.Option(help="Folder of the Whisper base model, in faster-whisper's format.")
 ]
 StartFrom = Annotated[
     Path | None,

@@ -84,7 +84,7 @@ function toKey(name) {
   return name.replaceAll(SEPARATOR, "").toLowerCase();
 }
 
-/** Return the keys of a name: of all its words, and of those after each separator. */
+/** Return a name's keys: one for all its words, and one for those after each separator. */
 function candidates(name) {
   const text = spellOutSide(name);
   const keys = [toKey(text)];

@@ -49,7 +49,7 @@ def heads(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SOUND", help="Speech and laughter. Pauses fill the rest of a minute."
+            metavar="SOUND", help="Speech and laughter, padded with pauses to one minute."
         ),
     ],
     language: Language = None,

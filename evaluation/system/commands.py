@@ -37,7 +37,7 @@ class BenchGroup(TyperGroup):
 app = typer.Typer(
     cls=BenchGroup,
     add_completion=False,
-    help="Measure speed and load. Without the name of a command, run latency.",
+    help="Measure speed and load. Without a command, run latency.",
 )
 
 
@@ -50,7 +50,7 @@ def measure_latency(
 ) -> None:
     """Measure latency, CPU time and images per second of the whole chain on this machine.
 
-    If Chromium is installed, the page is also measured. Only the latency uses --language.
+    If Chromium is installed, the page is also measured. --language applies only to latency.
     """
     from kouxing.evaluation.system import chromium, costs, latency, page
 

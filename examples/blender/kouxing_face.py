@@ -96,7 +96,7 @@ def to_key(name):
 
 
 def candidates(name):
-    """Return the keys of a name: of all its words, and of those after each separator."""
+    """Return a name's keys: one for all its words, and one for those after each separator."""
     name = spell_out_side(name)
     endings = [(match[0], to_key(name[match.end() :])) for match in SEPARATOR.finditer(name)]
     min_letters = {"": 7, **dict.fromkeys(".:|/", 0)}  # letters of a name after this separator

@@ -245,8 +245,8 @@ def express(
         all_sessions = [state.session for state in client.status().sessions]
         if session and session not in all_sessions:
             raise UserError(
-                f"session {session!r} does not exist; open sessions:"
-                f" {', '.join(all_sessions) or 'none'}; without a session, all faces change"
+                f"session {session!r} does not exist (open sessions:"
+                f" {', '.join(all_sessions) or 'none'}); to change all faces, leave it out"
             )
         for name in [session] if session else ["", *all_sessions]:
             client.set_face(name, expressions=strengths, hold_s=hold_s)
@@ -362,7 +362,7 @@ def _not_running_text(others: Sequence[RunningSystem]) -> str:
     if others:
         listed = ", ".join(f"{system.address} (keys: {system.keys})" for system in others)
         text += (
-            f". With other keys, kouxing runs at {listed}; to use it, set XDG_STATE_HOME to the"
+            f". A system with other keys runs at {listed}; to use it, set XDG_STATE_HOME to the"
             " folder that contains its key folder, and --control or KOUXING_CONTROL to its address"
         )
     return text

@@ -15,8 +15,8 @@ from kouxing.shared.errors import UserError
 PAGE_HEAD = """\
 # Configuration
 
-A test checks this page. `python -m kouxing.services.cli.configuration > docs/configuration.md`
-writes it.
+A test checks this page. To update it, run
+`python -m kouxing.services.cli.configuration > docs/configuration.md`.
 
 The sources of a value, from weakest to strongest:
 

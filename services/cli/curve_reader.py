@@ -59,8 +59,8 @@ def read_table(path: Path) -> FapAnimation:
         raise UserError(f"{path}: the file is empty; export the curves again")
     if time_name is None:
         raise UserError(
-            f"{path}: no column has the name time_s or Timecode; the columns are"
-            f" {', '.join(written)}; rename the column of the times"
+            f"{path}: no column is named time_s or Timecode; the columns are"
+            f" {', '.join(written)}; rename the time column"
         )
     columns, basis = _known_columns(path, written)
     is_shapes = names[columns[0]] not in FAP_NUMBER
@@ -164,8 +164,7 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
     known = max(tables, key=len)
     if not known:
         raise UserError(
-            f"{path}: no column has the name of a FAP or of a shape such as jawOpen; rename the"
-            " columns"
+            f"{path}: no column is named after a FAP or a shape such as jawOpen; rename the columns"
         )
     folded = [name.lower() for name in names]
     for name in known:

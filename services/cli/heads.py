@@ -30,7 +30,7 @@ def export_head(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="File to write: .glb, or .vrm for an avatar. An existing folder gets all heads.",
+            help="File to write: .glb, or .vrm for an avatar. For all heads: an existing folder.",
         ),
     ],
     head: HeadName = DEFAULT_HEAD,
@@ -42,7 +42,7 @@ def export_head(
 
     if glb.is_dir():
         if head != DEFAULT_HEAD:
-            raise UserError(f"{glb} is a folder, which gets all heads; leave out --head")
+            raise UserError(f"{glb} is a folder for all heads; leave out --head, or name a file")
         check_output(*(glb / file for file in _page_files().values()), force=force)
         export_page_heads(glb)
         print_message(f"wrote the heads to {glb}")

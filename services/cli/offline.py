@@ -347,8 +347,8 @@ def lips(
     timing: Annotated[
         TimingMethod | None,
         typer.Option(
-            help="Method that times the text: endpoints (energy and zero crossings), or forced"
-            " alignment. Default: endpoints, or align for long texts."
+            help="Timing of the text: endpoints (energy and zero crossings), or align (forced"
+            " alignment). Default: endpoints, or align for long texts."
         ),
     ] = None,
     speech_to_text: Annotated[

@@ -84,7 +84,7 @@ def run(
     reservation = _enter(lock_output_folder(out))
     arguments = ["--config", str(config)] if config else []
     startup = _enter(
-        lock_startup(lambda: print_message("waiting until another kouxing has started"))
+        lock_startup(lambda: print_message("waiting for another kouxing to finish starting"))
     )
     with rename_key_in_errors("--port", "gateway.port", is_given=port is not None):
         addresses = available_port_environment(settings)

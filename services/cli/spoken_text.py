@@ -51,7 +51,7 @@ def read_transcript(text: str, inventory: PhoneInventory) -> Transcript:
     if len(words) > _MAX_NAMED:
         named += f" and {len(words) - _MAX_NAMED} more"
     advice = (
-        "write them in characters or pinyin, as for Mandarin, the default language; for other"
+        "write them in characters or pinyin (for Mandarin, the default language); for other"
         " languages, add --language, such as --language en"
         if inventory.language == DEFAULT_LANGUAGE
         else "write them as they are spoken, or use another --language"

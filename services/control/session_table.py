@@ -70,7 +70,7 @@ class SessionTable:
         if not secrets.compare_digest(record.token.encode(), token.encode()):
             raise RequestRejected(
                 ErrorCode.BAD_TOKEN,
-                f"wrong token for session {name!r}; use the token of session-opened",
+                f"wrong token for session {name!r}; use the token from session-opened",
             )
         return record
 

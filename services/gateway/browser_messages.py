@@ -37,7 +37,7 @@ REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at
 
 MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
-MAX_SHOWN = 40  # letters of a client's text in an error
+MAX_SHOWN = 40  # characters of a client's text in an error
 # The face settings that a browser can change, and their values in words; the query of its address
 # selects shapes.
 FACE_SETTINGS = {

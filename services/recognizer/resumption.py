@@ -120,7 +120,7 @@ class ResumeFilter:
         return Waveform(time_s=self._time_s, samples=samples) if len(samples) else None
 
     def _trim_phone(self, phone: Phone) -> Phone | None:
-        """Return a new phone. An emitted phone that turns out to be known is finally withdrawn."""
+        """Return a new phone. An emitted phone that turns out to be known is withdrawn for good."""
         is_new = phone.onset_s + phone.duration_s / 2 >= self._time_s
         was_emitted = phone.index in self._emitted
         if phone.final:

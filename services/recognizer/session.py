@@ -162,7 +162,7 @@ class RecognizerSession:
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
         """Raise ``AudioRejected`` if the sender may not send this message here."""
         if not secrets.compare_digest(self.start.token.encode(), message.token.encode()):
-            text = f"wrong token for session {self.name!r}; use the token of session-opened"
+            text = f"wrong token for session {self.name!r}; use the token from session-opened"
             raise AudioRejected(ErrorCode.BAD_TOKEN, text)
         if socket is not self.socket:
             text = f"send the audio of session {self.name!r} to the endpoint in session-opened"

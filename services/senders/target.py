@@ -47,7 +47,7 @@ class Target:
         if self.shapes == "arkit" or self.is_mouth_only:
             return ""
         return (
-            "these shapes have no brows and cheeks, so joy and anger are hardly visible; if the"
+            "these shapes do not move brows or cheeks, so joy and anger hardly show; if the"
             " avatar has ARKit's shapes, add ?shapes=arkit to the address"
         )
 

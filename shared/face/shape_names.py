@@ -93,7 +93,7 @@ def _spell_out_side(name: str) -> str:
 
 @lru_cache(maxsize=1024)
 def _candidates(name: str) -> list[str]:
-    """Return the keys of a name: of all its words, and of those after each separator."""
+    """Return a name's keys: one for all its words, and one for those after each separator."""
     name = _spell_out_side(name)
     keys = [_key(name)]
     for separator in _SEPARATOR.finditer(name):

@@ -169,7 +169,7 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["express", "heard", "joy=2"], "between 0 and 1"),
         (["express", "heard", "joy"], "joy=0.4"),
         (["express", "heard", "joy=1", "--hold", "-1"], "0 to 3600"),
-        (["express", "nobody", "joy=1"], "'nobody' does not exist; open sessions: none; without"),
+        (["express", "nobody", "joy=1"], "'nobody' does not exist (open sessions: none); to"),
     ],
 )
 def test_wrong_arguments_are_rejected(

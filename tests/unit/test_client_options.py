@@ -58,7 +58,7 @@ def test_a_name_follows_the_rule_of_the_product() -> None:
     check_name("")
     check_name("my-call_1")
     for name in ("a b", "x" * 65, "line\n"):
-        with pytest.raises(KouxingError, match=f"is not a session's name; {NAME_RULE}"):
+        with pytest.raises(KouxingError, match=f"is not a valid session name; {NAME_RULE}"):
             check_name(name)
 
 

@@ -144,7 +144,7 @@ def test_reads_the_names_of_other_programs(
             "frame,jawOpen\n0,0.5\n",
             "time_s or Timecode; the columns are frame, jawOpen; rename",
         ),
-        ("a.csv", "time_s,nose\n0,0.5\n", "no column has the name of a FAP or of a shape"),
+        ("a.csv", "time_s,nose\n0,0.5\n", "no column is named after a FAP or a shape"),
         ("a.csv", "time_s,jawOpen,JawOpen\n0,0,1\n", "two columns have the name jawOpen"),
         ("a.csv", "time_s,jawOpen\n0,nan\n", "frame 1: a value is missing or not a number"),
         ("a.csv", "time_s,jawOpen\n0,0.1\n0.02\n", "frame 2: a value is missing"),

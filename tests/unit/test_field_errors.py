@@ -14,12 +14,12 @@ from kouxing.shared.wire.session import OpenSession
     ("fields", "text"),
     [
         ({"sample_rate_hz": 200000}, "sample_rate_hz must be an integer of at most 48000"),
-        ({"sample_rate_hz": "x"}, "sample_rate_hz must be an integer, not a text"),
+        ({"sample_rate_hz": "x"}, "sample_rate_hz must be an integer, not a string"),
         ({"session": "a b"}, f"session is not a valid name; {NAME_RULE}"),
         ({"encoding": "mp3"}, "encoding must be s16le or f32le"),
         ({"face": {"feeling": -1}}, "face.feeling must be a number of at least 0.0"),
         ({"face": {"shapes": 17 * ["x"]}}, "face.shapes must be a list of length <= 16"),
-        ({"language": 5}, "language must be a text or nothing, not an integer"),
+        ({"language": 5}, "language must be a string or null, not an integer"),
     ],
 )
 def test_names_the_field_and_its_rule(fields: dict[str, Any], text: str) -> None:

@@ -137,7 +137,7 @@ class AsyncSession(BaseSession):
 class AsyncResults(BaseResults, Generic[T]):
     """Results of one session. Iteration ends with the session's last frame.
 
-    At the end, it raises an error about the audio that neither ``push`` nor ``finish`` has raised.
+    At the end, it raises any error about the audio that no ``push`` or ``finish`` has raised.
     """
 
     def __aiter__(self) -> AsyncResults[T]:

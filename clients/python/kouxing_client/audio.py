@@ -33,7 +33,7 @@ def check_channels(audio: Any, num_channels: int) -> None:
     if len(shape) > 1 and shape[1:] != (num_channels,):
         raise KouxingError(
             f"the audio has the shape {shape}, but the session has num_channels={num_channels};"
-            f" push an array of shape (n, {num_channels}), or open the session for its channels"
+            f" push an array of shape (n, {num_channels}), or set num_channels to match the audio"
         )
 
 

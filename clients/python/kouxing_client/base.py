@@ -258,7 +258,7 @@ class BaseSession:
 
     def _check_unfinished(self) -> None:
         if self._has_finished:
-            raise KouxingError("the audio of this session has ended (finish); open another session")
+            raise KouxingError("finish() has ended the audio of this session; open another session")
 
     def _check_open(self) -> None:
         if self._core.is_over:

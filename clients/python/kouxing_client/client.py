@@ -190,7 +190,7 @@ class Session(BaseSession):
 class Results(BaseResults, Generic[T]):
     """Results of one session. Iteration ends with the session's last frame.
 
-    At the end, it raises an error about the audio that neither ``push`` nor ``finish`` has raised.
+    At the end, it raises any error about the audio that no ``push`` or ``finish`` has raised.
     """
 
     def __iter__(self) -> Results[T]:

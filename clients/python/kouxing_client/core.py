@@ -202,11 +202,11 @@ class ClientCore:
         if self._refused_s == math.inf:
             return f"control at {address} does not answer. Start it with 'kouxing run'"
         return f"control at {address} " + (
-            "does not accept this key. If it belongs to another user, start yours with 'kouxing"
-            " run'. If it is yours, restart it. If it runs on another machine, run there 'kouxing"
-            " keys add NAME --role client' and copy the file here"
+            "does not accept this key. If it belongs to another user, start your own with"
+            " 'kouxing run'. If it is yours, restart it. If it runs on another machine, run"
+            " 'kouxing keys add NAME --role client' there and copy the file here"
             if key
-            else "refuses this client: 'insecure' is set here, but not there; or see its log"
+            else "refuses this client: 'insecure' is set here but not there, or its log says why"
         )
 
     def _add(self, opened: Fields, options: Fields | None, *, is_live: bool) -> SessionCore:

@@ -1,4 +1,4 @@
-"""What waits for the program: the messages of a session, and the threads or tasks to wake."""
+"""Queues a session's messages for the program, and wakes waiting threads or tasks."""
 
 import asyncio
 import contextlib
@@ -72,6 +72,6 @@ class Inbox:
         self.signal.notify()
 
     def end(self, failure: KouxingError | None) -> None:
-        """Add no more messages."""
+        """Stop accepting messages."""
         self.is_over, self.failure = True, self.failure or failure
         self.signal.notify()

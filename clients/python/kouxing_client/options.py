@@ -34,7 +34,7 @@ class FaceSettings(TypedDict, total=False):
     eye_contact: bool
     """whether the eyes always look at the viewer"""
     listen_to: str
-    """session to which the face listens: it looks at the viewer and nods in pauses; or ``""``"""
+    """session that the face listens to, looking at the viewer and nodding in pauses; or ``""``"""
     listening: bool
     """whether a person without a session is speaking, so that the face listens"""
     shapes: Sequence[str]
@@ -45,13 +45,13 @@ class SessionOptions(TypedDict, total=False):
     """How to open a session."""
 
     sample_rate_hz: int
-    """of the audio, 8000 to 48000; default: 16000"""
+    """sample rate of the audio, 8000 to 48000; default: 16000"""
     num_channels: int
-    """of the audio: 1 (the default) or 2"""
+    """number of audio channels: 1 (the default) or 2"""
     encoding: str
-    """of pushed bytes and of messages: ``s16le`` (the default) or ``f32le``"""
+    """sample format of pushed bytes and messages: ``s16le`` (the default) or ``f32le``"""
     paced: bool
-    """False: audio arrives faster than real time"""
+    """whether audio arrives in real time; False: it arrives faster"""
     language: str | None
     """spoken language: ``auto``, a code or a name; None: the recognizer's"""
     shapes: Sequence[str]
@@ -59,7 +59,7 @@ class SessionOptions(TypedDict, total=False):
     face: FaceSettings
     """settings of the face"""
     mouth_profile: bytes | None
-    """the speaker's, from ``kouxing adapt``"""
+    """profile of the speaker, from ``kouxing adapt``"""
     record: bool
     """whether the driver writes a video"""
 
@@ -104,10 +104,10 @@ def face_fields(settings: FaceSettings) -> Fields:
 
 
 def check_name(name: str) -> None:
-    """Raise ``KouxingError`` if a text is not a session's name; it may be empty."""
+    """Raise ``KouxingError`` if a text is not a valid session name; it may be empty."""
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
         raise KouxingError(
-            f"{name!r} is not a session's name; use up to 64 letters, digits, '-' and '_'"
+            f"{name!r} is not a valid session name; use up to 64 letters, digits, '-' and '_'"
         )
 
 

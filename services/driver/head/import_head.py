@@ -206,7 +206,7 @@ class _HeadImport:
                 off.append(f"{name} by {distance / self._scale:.3g}")
         if off:
             raise self._points_error(
-                f"points are too far from the mesh, in its unit: {', '.join(off)}"
+                f"points are too far from the mesh, in units of the mesh: {', '.join(off)}"
             )
         skin = np.flatnonzero(self._component == self._component[self._points["8.1"]])
         local = np.full(len(self._welded), -1)
