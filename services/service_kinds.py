@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import pkgutil
+import secrets
 import socket
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import CommonConfig
 from kouxing.shared.service_kind import ServiceKind
 
+_FREE_PORTS = range(20_000, 32_000)  # below the range for outgoing connections
 _PACKAGES = ("control", "recognizer", "synthesizer", "driver", "gateway")  # in order of start
 
 KINDS: dict[str, ServiceKind] = {
@@ -52,8 +54,7 @@ def free_port_environment(
             for key, bound in bound_keys(KINDS[name].config_type).items():
                 if bound is BindAddress.HOST:
                     continue
-                probe = probes.enter_context(socket.socket())
-                probe.bind((host, 0))
+                probe = probes.enter_context(_bind_free_port(host))
                 port = str(probe.getsockname()[1])
                 address = f"tcp://{host}:{port}" if bound is BindAddress.ENDPOINT else port
                 environment[variable_name(name, key)] = address
@@ -62,6 +63,23 @@ def free_port_environment(
             variable_name("control", "control")
         ]
     return environment
+
+
+def _bind_free_port(host: str) -> socket.socket:
+    """Bind a random port that the system does not use for outgoing connections.
+
+    Otherwise, another program could get the port before the service starts.
+    """
+    while True:
+        probe = socket.socket()
+        try:
+            probe.bind((host, secrets.choice(_FREE_PORTS)))
+        except OSError as error:
+            probe.close()
+            if error.errno != errno.EADDRINUSE:
+                raise
+        else:
+            return probe
 
 
 def available_port_environment(settings: Settings) -> dict[str, str]:

@@ -27,10 +27,10 @@ def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     )
     assert result.exit_code == 0, result.output
     assert fault in result.stdout
-    ready = (logs / f"{fault}-3.2-s" / f"{service}.log").read_text("utf-8").count('"ready ')
-    assert ready == 2, "it was not killed"
     (outcome,) = json.loads(figures.read_text(encoding="utf-8"))
     assert (outcome["fault"], outcome["failure"]) == (fault, "")
+    ready = (logs / f"{fault}-3.2-s" / f"{service}.log").read_text("utf-8").count('"ready ')
+    assert ready == 2, "it was not killed"
     face = outcome["face"]
     assert face["phones"] > 25
     assert face["stood_s"] > 0
