@@ -77,10 +77,8 @@ test: .venv/installed-dev setup $(LIPS_MODELS) \
 		$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR))
 	$(STAGES) $(TEST_STAGES)
 
-# Tests of several services wait a lot, so four at a time use two cores. They run before the quick
-# unit tests, in the order of the folders: a slow file that starts last would run alone.
 test-python:
-	$(PYTEST) -n 4 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -n 3 --dist loadfile
 
 test-page:
 	$(NPM) $(PAGE) test
