@@ -11,8 +11,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import msgspec
+from kouxing_client.options import MAX_RATE_HZ
 
-from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, RATES_HZ, PcmFormat, check_text
+from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, PcmFormat, check_text
 from kouxing.services.lip_models import lip_model_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import (
@@ -36,7 +37,7 @@ SHAPES_TYPE = 4  # payload: float32 weights of a shape set, for a frame
 REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at rest
 
 MAX_LANGUAGE_LETTERS = 64
-MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
+MAX_SKIPPED = 600 * MAX_RATE_HZ  # samples; 10 minutes
 MAX_SHOWN = 40  # characters of a client's text in an error
 # The face settings that a browser can change, and their values in words; the query of its address
 # selects shapes.

@@ -4,14 +4,14 @@ import base64
 from dataclasses import dataclass
 
 import numpy as np
+from kouxing_client.audio import SAMPLE_BYTES
+from kouxing_client.options import MAX_RATE_HZ, MIN_RATE_HZ
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.sound_formats import audio_file_kind
 from kouxing.shared.user_file import parse_json
 
-SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
-RATES_HZ = (8000, 48000)  # minimum and maximum
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file
 
@@ -29,9 +29,9 @@ class PcmFormat:
 
     def __post_init__(self) -> None:
         rate_hz = self.sample_rate_hz
-        if type(rate_hz) is not int or not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+        if type(rate_hz) is not int or not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
             raise UserError(
-                f"sample_rate_hz must be an integer from {RATES_HZ[0]} to {RATES_HZ[1]}, "
+                f"sample_rate_hz must be an integer from {MIN_RATE_HZ} to {MAX_RATE_HZ}, "
                 f"not {rate_hz!r}"
             )
         if type(self.num_channels) is not int or self.num_channels not in (1, 2):

@@ -7,12 +7,15 @@ from typing import Any, get_args
 
 import msgspec
 import pytest
+from kouxing_client import KouxingError
+from kouxing_client.options import MAX_CHANNELS, MAX_RATE_HZ, MIN_RATE_HZ, check_name
 
 from kouxing.services.control.placement import CLIENT_NEEDS
 from kouxing.services.control.request_handler import Request
 from kouxing.services.synthesizer.service import LOW_LEVEL_FAPS
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.name_rules import NAME_RULE, is_name
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import AllowedKey, EventName, SessionProgress
@@ -23,6 +26,8 @@ from kouxing.shared.wire.schema import schema
 from kouxing.shared.wire.session import (
     ErrorCode,
     Lateness,
+    NumChannels,
+    SampleRate,
     ServiceState,
     SessionFacts,
     SessionMoved,
@@ -248,3 +253,18 @@ def test_documents_the_order_of_lip_values() -> None:
             ranges.append([fap])
     texts = [f"{r[0]} to {r[-1]}" if len(r) > 2 else ", ".join(map(str, r)) for r in ranges]
     assert ", ".join(texts) in section("`lip-positions`", MESSAGES_DOCUMENT)
+
+
+@pytest.mark.parametrize("name", ["", "a", "a" * 64, "a" * 65, "a b", "a\n", "é"])
+def test_the_client_accepts_the_session_names_of_the_wire(name: str) -> None:
+    if name == "" or is_name(name):
+        check_name(name)
+    else:
+        with pytest.raises(KouxingError, match=re.escape(NAME_RULE)):
+            check_name(name)
+
+
+def test_the_client_accepts_the_audio_of_the_wire() -> None:
+    (rate,), (channels,) = get_args(SampleRate)[1:], get_args(NumChannels)[1:]
+    assert (rate.ge, rate.le) == (MIN_RATE_HZ, MAX_RATE_HZ)
+    assert (channels.ge, channels.le) == (1, MAX_CHANNELS)
