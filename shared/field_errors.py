@@ -14,6 +14,7 @@ _TYPES = {
     "object": "an object",
     "str": "a string",
 }
+_ITEMS = {"bytes": "bytes", "str": "characters"}
 _ERROR = re.compile(r"Expected `(?P<types>[^`]+)`(?P<rest>.*) - at `\$\.(?P<name>.+)`", re.DOTALL)
 _LIMITS = {"<=": "of at most", ">=": "of at least", "<": "below", ">": "above"}
 
@@ -29,7 +30,8 @@ def describe_field_error(error: Exception) -> str:
     """
     match = _ERROR.fullmatch(str(error))
     if match is None:
-        return str(error)
+        problem, _, name = str(error).partition(" - at `$.")
+        return f"{name.rstrip('`')}: {problem}" if name else problem
     types = _list_types(match["types"])
     rest, name = match["rest"], match["name"]
     if rest.startswith(", got `"):
@@ -38,9 +40,12 @@ def describe_field_error(error: Exception) -> str:
         if pattern[1] in (NAME, NAME_OR_EMPTY):
             return f"{name} is not a valid name; {NAME_RULE}"
         return f"{name} must be {pattern[1].strip('()').replace('|', ' or ')}"
+    if rest.startswith(" of length"):
+        rest = f"{rest.removeprefix(' of length')} {_ITEMS.get(match['types'], 'items')}"
     limit, _, value = rest.strip().partition(" ")
     return f"{name} must be {types} {_LIMITS.get(limit, limit)} {value}".rstrip()
 
 
 def _list_types(types: str) -> str:
-    return " or ".join(_TYPES.get(name, name) for name in types.split(" | "))
+    names = types.removesuffix(" | null").split(" | ")
+    return " or ".join(_TYPES.get(name, name) for name in names)

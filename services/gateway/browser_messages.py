@@ -4,31 +4,26 @@ Binary messages are little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media t
 16 kHz), then the payload at an offset that is a multiple of four.
 """
 
-import base64
 import json
 import struct
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from kouxing_client.options import MAX_RATE_HZ
+from msgspec import Meta, Struct
 
 from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, PcmFormat, check_text
 from kouxing.services.lip_models import lip_model_names
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.expressions import (
-    DEFAULT_HOLD_S,
-    MAX_EXPRESSIVENESS,
-    MAX_HOLD_S,
-    MIN_EXPRESSIVENESS,
-    check_expressions,
-)
-from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
-from kouxing.shared.name_rules import NAME_RULE
+from kouxing.shared.face.expressions import DEFAULT_HOLD_S, check_expressions
+from kouxing.shared.field_errors import describe_field_error
 from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.session import MouthProfile
 from kouxing.shared.wire.speech import AcousticModelName
 
+_Kind = TypeVar("_Kind")
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
 SOUND_TYPE = 2  # payload: int16, 16 kHz mono
@@ -36,25 +31,11 @@ REST_TYPE = 3  # payload as for FAP_TYPE: the face while no session moves it
 SHAPES_TYPE = 4  # payload: float32 weights of a shape set, for a frame
 REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at rest
 
-MAX_LANGUAGE_LETTERS = 64
 MAX_SKIPPED = 600 * MAX_RATE_HZ  # samples; 10 minutes
 MAX_SHOWN = 40  # characters of a client's text in an error
-# The face settings that a browser can change, and their values in words; the query of its address
-# selects shapes.
-FACE_SETTINGS = {
-    "lip_model": f"the name of a lip model: {', '.join(lip_model_names())}",
-    "acoustic": " or ".join(AcousticModelName),
-    "expressiveness": f"a number from {MIN_EXPRESSIVENESS:g} to {MAX_EXPRESSIVENESS:g}",
-    "feeling": "a number from 0 to 1",
-    "still": "true or false",
-    "eye_contact": "true or false",
-    "listen_to": f'the name of a session, or "" for none; {NAME_RULE}',
-    "listening": "true or false",
-    "expressions": "an object that maps names to strengths from 0 to 1",
-    "hold_s": f"a number from 0 to {MAX_HOLD_S:g}",
-}
-_FORMAT_FIELDS = ("sample_rate_hz", "num_channels", "encoding")
-OPTIONS = (*_FORMAT_FIELDS, "ahead", "mouth_profile", "language")  # of a microphone
+# The face settings that a browser can change; the query of its address selects shapes.
+FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
+_FORMAT_FIELDS = PcmFormat.__struct_fields__
 COMMANDS = ("skip", "flush", "last", *FACE_SETTINGS)  # of a microphone
 # names in version 0.1.0, which are still accepted
 _OLD_NAMES = {"lips": "lip_model", "express": "expressions", "eof": "last"}
@@ -76,66 +57,34 @@ def error_text(reason: str, code: str = "refused", retry_after_s: float = 0.0) -
     return text("error", code=code, text=reason, **retry)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MicrophoneOptions:
+class MicrophoneOptions(PcmFormat, frozen=True, kw_only=True):
     """The first message of a microphone."""
 
-    pcm_format: PcmFormat
-    is_ahead: bool  # audio may arrive faster than real time
-    mouth_profile: bytes  # profile of the speaker; empty: average speaker
-    language: str  # spoken language; empty: language of the recognizer
-    problem: str  # error about unknown fields, which are ignored; empty: all are known
+    ahead: Any = False  # whether audio may arrive faster than real time
+    mouth_profile: MouthProfile = b""  # profile of the speaker; empty: average speaker
+    language: Annotated[str, Meta(max_length=64)] = ""  # empty: language of the recognizer
 
 
-def parse_microphone_options(message: str) -> MicrophoneOptions:
-    """Parse the first message of a microphone.
+def parse_microphone_options(message: str) -> tuple[MicrophoneOptions, str]:
+    """Return the first message of a microphone, and an error about unknown fields, or "".
 
     Raises ``UserError`` if a field is missing or out of range; the text names the field.
     """
     fields = parse_object(message)
-    problem = find_unknown(fields, OPTIONS)
+    problem = find_unknown(fields, MicrophoneOptions.__struct_fields__)
     if fields.get("sample_rate_hz") is None:
         raise UserError("; ".join(filter(None, ("sample_rate_hz is missing", problem))))
-    pcm_format = PcmFormat(
-        sample_rate_hz=fields["sample_rate_hz"],  # type: ignore[arg-type] # checked there
-        num_channels=fields.get("num_channels", 1),  # type: ignore[arg-type]
-        encoding=fields.get("encoding", "s16le"),  # type: ignore[arg-type]
-    )
-    return MicrophoneOptions(
-        pcm_format=pcm_format,
-        is_ahead=bool(fields.get("ahead")),
-        mouth_profile=_parse_mouth_profile(fields.get("mouth_profile", "")),
-        language=_parse_language(fields.get("language", "")),
-        problem=problem,
-    )
+    return _convert(fields, MicrophoneOptions), problem
 
 
-def _parse_language(field: object) -> str:
-    if not isinstance(field, str) or len(field) > MAX_LANGUAGE_LETTERS:
-        raise UserError("language must be auto, or the code of a language such as de")
-    return field
-
-
-def _parse_mouth_profile(field: object) -> bytes:
-    try:
-        profile = base64.b64decode(field, validate=True) if isinstance(field, str) else None
-    except ValueError:
-        profile = None
-    if profile is None or len(profile) > MAX_MOUTH_PROFILE_BYTES:
-        limit_kib = MAX_MOUTH_PROFILE_BYTES >> 10
-        raise UserError(f"mouth_profile must be at most {limit_kib} KiB in base64")
-    return profile
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MicrophoneCommand:
+class MicrophoneCommand(Struct, frozen=True, kw_only=True):
     """A command between the chunks of a browser's microphone."""
 
-    flush: bool  # interrupt: drop audio whose face is not shown yet
-    last: bool  # no more audio follows
-    num_skipped: int  # samples per channel that the client skipped
-    face: dict[str, object]  # settings to change
-    problem: str  # error about unknown fields, which are ignored; empty: all are known
+    flush: Any = False  # whether to drop audio whose face is not shown yet
+    last: Any = False  # whether no more audio follows
+    skip: Annotated[int, Meta(ge=0, le=MAX_SKIPPED)] = 0  # samples that the client skipped
+    face: dict[str, Any]  # settings to change
+    problem: str = ""  # error about unknown fields, which are ignored
 
 
 def parse_command(message: str, pcm_format: PcmFormat | None = None) -> MicrophoneCommand:
@@ -149,50 +98,40 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
     for name in _FORMAT_FIELDS:
         if name in fields and pcm_format and fields[name] != getattr(pcm_format, name):
             raise UserError(f"{name} cannot change during a session; open another connection")
-    num_skipped = fields.get("skip", 0)
-    if type(num_skipped) is not int or not 0 <= num_skipped <= MAX_SKIPPED:
-        raise UserError(f"skip must be an integer from 0 to {MAX_SKIPPED}")
-    face = parse_face_settings(fields)
-    return MicrophoneCommand(
-        flush=bool(fields.get("flush")),
-        last=bool(fields.get("last")),
-        num_skipped=num_skipped,
-        face={name: getattr(face, name) for name in FACE_SETTINGS} if face else {},
-        problem=find_unknown([name for name in fields if name not in _FORMAT_FIELDS], COMMANDS),
-    )
+    problem = find_unknown([name for name in fields if name not in _FORMAT_FIELDS], COMMANDS)
+    settings = parse_face_settings(fields)
+    face = {name: getattr(settings, name) for name in FACE_SETTINGS} if settings else {}
+    return _convert({**fields, "face": face, "problem": problem}, MicrophoneCommand)
 
 
 def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
     """Return the face settings of a command; None if it contains none.
 
     Null and an empty ``lip_model`` do not count. Raises ``UserError`` if a value is invalid; the
-    text names the field, its value and the allowed values.
+    text names the field and the allowed values.
     """
     given = {name: fields[name] for name in FACE_SETTINGS if fields.get(name) is not None}
     if given.get("lip_model") == "":
         del given["lip_model"]
+    if not given:
+        return None
     if given.keys() == {"hold_s"}:
         raise UserError("hold_s is how long expressions last; send it with expressions")
     if isinstance(expressions := given.get("expressions"), dict):
         check_expressions(expressions, given.get("hold_s", DEFAULT_HOLD_S))
-    for name, value in given.items():
-        if not _is_setting(name, value):
-            shown = _shorten(json.dumps(value, ensure_ascii=False))
-            raise UserError(f"{name} is {shown}; it must be {FACE_SETTINGS[name]}")
-    return msgspec.convert(given, FaceSettings) if given else None
+    for name, allowed in (("lip_model", lip_model_names()), ("acoustic", [*AcousticModelName])):
+        if name in given and given[name] not in allowed:
+            value = _shorten(json.dumps(given[name], ensure_ascii=False))
+            raise UserError(f"{name} is {value}; it must be {' or '.join(allowed)}")
+    return _convert(given, FaceSettings)
 
 
-def _is_setting(name: str, value: object) -> bool:
-    """Return whether a face setting can have this value."""
-    if name == "lip_model":
-        return value in lip_model_names()
-    if name == "acoustic":
-        return value in [*AcousticModelName]
+def _convert(fields: Mapping[str, object], kind: type[_Kind]) -> _Kind:
+    """Convert the fields of a message; raises ``UserError`` if one is invalid."""
     try:
-        msgspec.convert({name: value}, FaceSettings)
-    except msgspec.ValidationError:
-        return False
-    return True
+        return msgspec.convert(fields, kind)
+    except msgspec.ValidationError as error:
+        raise UserError(describe_field_error(error)) from None
 
 
 def find_unknown(fields: Collection[str], known: Collection[str]) -> str:

@@ -67,23 +67,23 @@ class MicrophoneHandler:
             ) from None
         if first.type is not WSMsgType.TEXT:
             raise UserError("the first message must be a JSON object that describes the audio")
-        options = browser_messages.parse_microphone_options(first.data)
+        options, problem = browser_messages.parse_microphone_options(first.data)
         async with self._audio_client.open(
-            encoding=options.pcm_format.encoding,
-            sample_rate_hz=options.pcm_format.sample_rate_hz,
-            num_channels=options.pcm_format.num_channels,
+            encoding=options.encoding,
+            sample_rate_hz=options.sample_rate_hz,
+            num_channels=options.num_channels,
             mouth_profile=options.mouth_profile or None,
             language=options.language or None,
         ) as session:
             self._session_names[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})
             await browser.send_str(browser_messages.text("opened", session=session.name))
-            if options.problem:
-                await browser.send_str(browser_messages.error_text(options.problem))
-            audio_input = AudioInput(session, options.pcm_format, is_ahead=options.is_ahead)
+            if problem:
+                await browser.send_str(browser_messages.error_text(problem))
+            audio_input = AudioInput(session, options, is_ahead=bool(options.ahead))
             try:
                 async with audio_input.running():
-                    await self._forward_audio(browser, session, audio_input, options.pcm_format)
+                    await self._forward_audio(browser, session, audio_input, options)
             finally:
                 self._session_names[browser] = ""
 
@@ -101,7 +101,7 @@ class MicrophoneHandler:
                 command = browser_messages.parse_command(message.data, pcm_format)
                 if command.problem:
                     await browser.send_str(browser_messages.error_text(command.problem))
-                session.skip(command.num_skipped)
+                session.skip(command.skip)
                 if command.flush:
                     await audio_input.flush()
                 if command.face:

@@ -1,43 +1,27 @@
 """The PCM format that a client announces, with checks of its data."""
 
 import base64
-from dataclasses import dataclass
 
 import numpy as np
 from kouxing_client.audio import SAMPLE_BYTES
-from kouxing_client.options import MAX_RATE_HZ, MIN_RATE_HZ
+from msgspec import Struct
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.sound_formats import audio_file_kind
 from kouxing.shared.user_file import parse_json
+from kouxing.shared.wire.session import Encoding, NumChannels, SampleRate
 
 MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
 MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PcmFormat:
-    """Sample rate, number of channels and encoding of raw PCM.
+class PcmFormat(Struct, frozen=True, kw_only=True):
+    """Sample rate, number of channels and encoding of raw PCM."""
 
-    Raises ``UserError`` if a field is out of range; the text names the field.
-    """
-
-    sample_rate_hz: int
-    num_channels: int = 1
-    encoding: str = "s16le"  # or f32le
-
-    def __post_init__(self) -> None:
-        rate_hz = self.sample_rate_hz
-        if type(rate_hz) is not int or not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
-            raise UserError(
-                f"sample_rate_hz must be an integer from {MIN_RATE_HZ} to {MAX_RATE_HZ}, "
-                f"not {rate_hz!r}"
-            )
-        if type(self.num_channels) is not int or self.num_channels not in (1, 2):
-            raise UserError("num_channels must be 1 or 2")
-        if not isinstance(self.encoding, str) or self.encoding not in SAMPLE_BYTES:
-            raise UserError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
+    sample_rate_hz: SampleRate
+    num_channels: NumChannels = 1
+    encoding: Encoding = "s16le"
 
     @property
     def frame_bytes(self) -> int:

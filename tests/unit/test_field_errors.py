@@ -18,8 +18,9 @@ from kouxing.shared.wire.session import OpenSession
         ({"session": "a b"}, f"session is not a valid name; {NAME_RULE}"),
         ({"encoding": "mp3"}, "encoding must be s16le or f32le"),
         ({"face": {"feeling": -1}}, "face.feeling must be a number of at least 0.0"),
-        ({"face": {"shapes": 17 * ["x"]}}, "face.shapes must be a list of length <= 16"),
-        ({"language": 5}, "language must be a string or null, not an integer"),
+        ({"face": {"shapes": 17 * ["x"]}}, "face.shapes must be a list of at most 16 items"),
+        ({"mouth_profile": "?"}, "mouth_profile: Invalid base64 encoded string"),
+        ({"language": 5}, "language must be a string, not an integer"),
     ],
 )
 def test_names_the_field_and_its_rule(fields: dict[str, Any], text: str) -> None:
