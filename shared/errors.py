@@ -1,9 +1,7 @@
 """The exception for users' mistakes, and helpers for its text."""
 
-import contextlib
 import importlib.util
 import sys
-from collections.abc import Iterator
 
 USER_ERROR = 2  # exit status of a program after a ``UserError``
 
@@ -20,17 +18,6 @@ def install_command(package: str) -> str:
     if importlib.util.find_spec("pip") is None:  # an environment of uv
         return f"uv pip install --python {sys.executable} '{package}'"
     return f"{sys.executable} -m pip install '{package}'"
-
-
-@contextlib.contextmanager
-def rename_key_in_errors(option: str, key: str, *, is_given: bool) -> Iterator[None]:
-    """Replace a configuration key in errors with the option that has set it, if it was given."""
-    try:
-        yield
-    except UserError as error:
-        if not is_given:
-            raise
-        raise UserError(str(error).replace(f"{key}:", f"{option}:", 1)) from None
 
 
 def prefix_name(name: str, text: str) -> str:

@@ -11,28 +11,24 @@ from kouxing.shared.errors import UserError
 
 
 @contextlib.contextmanager
-def open_output(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for writing. If an error or Ctrl-C interrupts the writing, the file is deleted.
+def open_output(path: Path, *, keep_on_error: bool = False) -> Iterator[BinaryIO]:
+    """Open a file for writing.
+
+    If an error or Ctrl-C interrupts the writing, the file is deleted unless ``keep_on_error``.
 
     Raises ``UserError`` if the file cannot be written.
     """
     try:
-        with path.open("wb") as file, delete_on_error(path):
-            yield file
-            file.flush()
+        with path.open("wb") as file:
+            try:
+                yield file
+                file.flush()
+            except BaseException:
+                if path.is_file() and not keep_on_error:  # not a device
+                    path.unlink()
+                raise
     except OSError as error:
         raise write_error(path, error) from error
-
-
-@contextlib.contextmanager
-def delete_on_error(path: Path) -> Iterator[None]:
-    """Delete a file if an error or Ctrl-C interrupts the writing."""
-    try:
-        yield
-    except BaseException:
-        if path.is_file():  # not a device
-            path.unlink()
-        raise
 
 
 def write_private(path: Path, content: bytes) -> None:

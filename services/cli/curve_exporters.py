@@ -10,7 +10,6 @@ import json
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -29,7 +28,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.output_file import delete_on_error, write_error
+from kouxing.shared.output_file import open_output, write_error
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.terminal import write_text
 
@@ -236,14 +235,10 @@ _LIVE_LINK_COLUMNS = [
 def _write_lines(output: Path, lines: Iterable[str], curves: FrameStream) -> int:
     """Write each line when it arrives; return their number. An error leaves only live frames."""
     count = 0
-    guard = nullcontext() if curves.is_live else delete_on_error(output)
-    try:
-        with output.open("w", encoding="utf-8", newline="") as file, guard:
-            for count, line in enumerate(lines, start=1):  # noqa: B007
-                file.write(line + "\n")
-                file.flush()
-    except OSError as error:
-        raise write_error(output, error) from None
+    with open_output(output, keep_on_error=curves.is_live) as file:
+        for count, line in enumerate(lines, start=1):  # noqa: B007
+            file.write(f"{line}\n".encode())
+            file.flush()
     return count
 
 

@@ -31,7 +31,7 @@ from kouxing.services.service_kinds import (
 )
 from kouxing.shared.config import COMMON, Settings, parse_assignments, variable_name
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
-from kouxing.shared.errors import UserError, rename_key_in_errors
+from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt, install_interrupt_handler
 from kouxing.shared.keys import check_keys, control_endpoint
 from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
@@ -86,8 +86,7 @@ def run(
     startup = _enter(
         lock_startup(lambda: print_message("waiting for another kouxing to finish starting"))
     )
-    with rename_key_in_errors("--port", "gateway.port", is_given=port is not None):
-        addresses = available_port_environment(settings)
+    addresses = _service_addresses(settings, has_port_option=port is not None)
     control_config = settings.load(ControlConfig)
     bound_control = addresses.get(BOUND_CONTROL_VARIABLE, control_config.bound_control)
     control = _control_address(bound_control)
@@ -137,6 +136,15 @@ def run(
     finally:
         supervisor.stop()
         reservation.close()
+
+
+def _service_addresses(settings: Settings, *, has_port_option: bool) -> dict[str, str]:
+    """Return the environment with free ports; an error names the option that set the port."""
+    try:
+        return available_port_environment(settings)
+    except UserError as error:
+        key = "--port:" if has_port_option else "gateway.port:"
+        raise UserError(str(error).replace("gateway.port:", key)) from None
 
 
 def _stop_at_interrupt() -> None:

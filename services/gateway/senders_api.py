@@ -5,7 +5,7 @@ configuration. It cannot make the gateway send to arbitrary hosts.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 
 import numpy as np
@@ -21,7 +21,7 @@ from kouxing.shared.logs import LOG
 
 
 class SendersApi:
-    """Sends the gateway's face to other programs, and reports their state.
+    """Sends the gateway's face to other programs with a ``pool``, and reports their state.
 
     ``on_started`` is called when a page starts a sender.
     """
@@ -31,27 +31,14 @@ class SendersApi:
     ) -> None:
         self._configured = {url: parse_target(url) for url in urls}
         self._on_started = on_started
-        self._senders = SenderPool(idle_motion_seed, _log_problem)
+        self.pool = SenderPool(idle_motion_seed, _log_problem)
         for target in self._configured.values():
-            self._senders.start(target)
-
-    @property
-    def is_sending(self) -> bool:
-        """Whether any program receives the face."""
-        return self._senders.is_sending
+            self.pool.start(target)
 
     def send_frame(self, media_time: int, values: bytes) -> None:
         """Send a frame: 68 little-endian float32, FAP units."""
         faps = np.frombuffer(values, "<f4").astype(np.float32)
-        self._senders.show(to_seconds(media_time), faps)
-
-    def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
-        """Show expressions on the face at rest."""
-        self._senders.express(strengths, hold_s)
-
-    def close(self) -> None:
-        """Stop all senders."""
-        self._senders.close()
+        self.pool.show(to_seconds(media_time), faps)
 
     async def serve_get(self, _request: web.Request) -> web.StreamResponse:
         """Answer with the state of all senders."""
@@ -63,12 +50,12 @@ class SendersApi:
             command = browser_messages.parse_object(await request.read())
             start, stop, delay_ms = (command.get(key) for key in ("start", "stop", "delay_ms"))
             if isinstance(start, str):
-                self._senders.start(self._allowed_target(start))
+                self.pool.start(self._allowed_target(start))
                 self._on_started()
             elif isinstance(stop, str):
-                self._senders.stop(stop)
+                self.pool.stop(stop)
             elif isinstance(delay_ms, int | float):
-                self._senders.set_delay(parse_delay_s(delay_ms))
+                self.pool.set_delay(parse_delay_s(delay_ms))
             else:
                 raise UserError(
                     "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"
@@ -87,7 +74,7 @@ class SendersApi:
         return target
 
     def _state(self) -> web.Response:
-        states = self._senders.states()
+        states = self.pool.states()
         running = {state.target for state in states}
         return web.json_response(
             {

@@ -171,7 +171,7 @@ class GatewayService(SessionService):
 
     def on_shutdown(self) -> None:
         """Stop HTTP and the senders."""
-        self._senders.close()
+        self._senders.pool.close()
         self._loop.run_until_complete(self._server.stop())
         self._loop.run_until_complete(self._audio_client.close())
         self._runner.close()
@@ -208,7 +208,7 @@ class GatewayService(SessionService):
     def _needed_sessions(self) -> set[str]:
         """Return the sessions that are shown or sent to other programs."""
         needed = {*self._viewers.shown_sessions}
-        if self._senders.is_sending:
+        if self._senders.pool.is_sending:
             needed.add(self._viewers.newest_session)
         return needed
 
@@ -233,7 +233,7 @@ class GatewayService(SessionService):
         """Change the face at rest, or notify viewers that a session's lip model has changed."""
         if message.session == "" and (strengths := message.face.expressions) is not None:
             self._resting_face.express(strengths, message.face.hold_s)
-            self._senders.express(strengths, message.face.hold_s)
+            self._senders.pool.express(strengths, message.face.hold_s)
         session = self._sessions.get(message.session)
         if session is not None and message.face.lip_model is not None:
             start = session.follower.session_start
@@ -320,7 +320,7 @@ class GatewayService(SessionService):
     def _on_frame(self, frame: FapFrame) -> None:
         now_s = time.monotonic()
         self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values, now_s)
-        if self._senders.is_sending and frame.session == self._viewers.newest_session:
+        if self._senders.pool.is_sending and frame.session == self._viewers.newest_session:
             self._senders.send_frame(frame.media_time, frame.values)
 
     def _on_sound(self, sound: Sound) -> None:

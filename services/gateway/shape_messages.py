@@ -7,6 +7,7 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+from aiohttp import web
 
 from kouxing.services.gateway import browser_messages
 from kouxing.shared.errors import UserError
@@ -63,13 +64,13 @@ class ShapeEncoder:
 def parse_shape_query(query: Mapping[str, str]) -> ShapeEncoder | None:
     """Return the encoder for the shapes in a URL's query; None without shapes.
 
-    Raises ``UserError`` if the shape set or the format does not exist.
+    Raises ``HTTPBadRequest`` if the shape set or the format does not exist.
     """
     shape_set, message_format = query.get("shapes", ""), query.get("format", FORMATS[0])
     if shape_set and shape_set not in SHAPE_SETS:
-        raise UserError(f"shapes must be one of {', '.join(SHAPE_SETS)}")
+        raise web.HTTPBadRequest(text=f"shapes must be one of {', '.join(SHAPE_SETS)}\n")
     if message_format not in FORMATS:
-        raise UserError(f"format must be one of {', '.join(FORMATS)}")
+        raise web.HTTPBadRequest(text=f"format must be one of {', '.join(FORMATS)}\n")
     return ShapeEncoder(shape_set, message_format) if shape_set else None
 
 

@@ -166,10 +166,7 @@ class ViewerHandler:
         chosen_session = request.query.get("session", "")
         if chosen_session and not is_name(chosen_session):
             raise web.HTTPBadRequest(text=f"session must be a name; {NAME_RULE}\n")
-        try:
-            shape_encoder = parse_shape_query(request.query)
-        except UserError as error:
-            raise web.HTTPBadRequest(text=f"{error}\n") from None
+        shape_encoder = parse_shape_query(request.query)
         async with self._web_sockets.open(request, self._quota) as browser:
             _limit_send_buffers(request)
             with self.connect_viewer(chosen_session, shape_encoder) as viewer:

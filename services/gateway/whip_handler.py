@@ -81,11 +81,7 @@ class WhipHandler:
             raise web.HTTPUnsupportedMediaType(text=f"expected an SDP offer ({SDP})\n")
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway is stopping\n")
-        try:
-            shape_encoder = parse_shape_query(request.query)
-        except UserError as error:
-            raise web.HTTPBadRequest(text=f"{error}\n") from None
-        name, client = secrets.token_urlsafe(12), _Client(shape_encoder)
+        name, client = secrets.token_urlsafe(12), _Client(parse_shape_query(request.query))
         async with contextlib.AsyncExitStack() as stack:
             stack.enter_context(self._quota.hold(request))
             offer = (await request.read()).decode(errors="replace")

@@ -9,7 +9,6 @@ what they move.
 import asyncio
 import json
 import math
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +20,7 @@ from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import key_folder
 from kouxing.shared.logs import LOG
+from kouxing.shared.output_file import write_private
 from kouxing.shared.user_file import parse_json, read_text
 
 _TOKENS = "vtube-studio.json"
@@ -284,8 +284,6 @@ def _write_tokens(tokens: dict[str, str]) -> None:
     path = key_folder() / _TOKENS
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            json.dump(tokens, file)
+        write_private(path, json.dumps(tokens).encode())
     except OSError as error:
         LOG.warning("cannot write %s, so VTube Studio will ask again: %s", path, error.strerror)

@@ -121,6 +121,15 @@ def test_reports_a_mistake_before_anything_starts(
     assert word in log
 
 
+def test_names_the_option_of_a_port_that_is_taken(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        environment = own_environment(tmp_path) | {"KOUXING_DRIVER_OUT": str(tmp_path / "out")}
+        result = kouxing("run", "--port", port, environment=environment)
+    assert result.returncode == 2
+    assert f"--port: another program uses port {port}" in result.stderr
+
+
 def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
     environment = {
         **ONE_THREAD,
