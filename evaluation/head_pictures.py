@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from kouxing.services.driver.config import HEAD_NAMES, Framing
-from kouxing.services.driver.head.head import DEFAULT_HEAD, Head
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.scene import place_camera
+from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX

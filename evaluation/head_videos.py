@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.evaluation.lips.scheme_videos import VIDEO_PX, write_video
-from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.heads import HEAD_NAMES
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel

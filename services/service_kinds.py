@@ -8,6 +8,7 @@ import socket
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from kouxing.services.heads import HeadConfig
 from kouxing.shared.config import (
     COMMON,
     BindAddress,
@@ -18,7 +19,7 @@ from kouxing.shared.config import (
 )
 from kouxing.shared.endpoints import WILDCARDS
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.config import CommonConfig
+from kouxing.shared.face.config import LiveConfig
 from kouxing.shared.service_kind import ServiceKind
 
 _FREE_PORTS = range(20_000, 32_000)  # below the range for outgoing connections
@@ -27,6 +28,12 @@ _PACKAGES = ("control", "recognizer", "synthesizer", "driver", "gateway")  # in 
 KINDS: dict[str, ServiceKind] = {
     package: pkgutil.resolve_name(f"kouxing.services.{package}.kind:KIND") for package in _PACKAGES
 }
+
+
+class CommonConfig(HeadConfig, LiveConfig):
+    """The keys of the table ``[common]``."""
+
+
 CONFIG_TYPES: dict[str, type[ServiceConfig]] = {
     COMMON: CommonConfig,
     **{kind.name: kind.config_type for kind in KINDS.values()},

@@ -15,9 +15,10 @@ from rich.console import Console
 
 from kouxing.evaluation.system.live import CHUNK
 from kouxing.evaluation.tables import format_number
-from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
+from kouxing.services.driver.head.head import ASSETS, Detail, Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.video_writer import VideoWriter
+from kouxing.services.heads import DEFAULT_HEAD
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz

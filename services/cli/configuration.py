@@ -26,8 +26,8 @@ The sources of a value, from weakest to strongest:
 4. the command line: `--set KEY=VALUE` of a service, `--set SERVICE.KEY=VALUE` of `kouxing run`
 
 Services also have the keys of `[common]`. To set such a key for all services, use the table
-`[common]` or the variable `KOUXING_<KEY>`. Only the synthesizer, the driver and the gateway have
-`idle_motion`, and only the recognizer and the synthesizer have `max_lag_s`.
+`[common]` or the variable `KOUXING_<KEY>`. Only the driver and the gateway have `head`. Only these
+and the synthesizer have `idle_motion`. Only the recognizer and the synthesizer have `max_lag_s`.
 Within one source, a value for one service overrides the value for all services.
 An unknown key, table or variable is an error.
 

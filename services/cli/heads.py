@@ -12,10 +12,9 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.cli.options import DEFAULT_HEAD, HeadName
-from kouxing.services.driver.config import HEAD_NAMES
+from kouxing.services.cli.options import HeadName
+from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES, page_file, page_heads_folder
 from kouxing.shared.errors import UserError
-from kouxing.shared.page_heads import page_heads_folder
 from kouxing.shared.terminal import Force, check_output, print_message
 
 _DRIVER_HEADS = Path(str(resources.files("kouxing.services.driver"))) / "head"
@@ -102,7 +101,7 @@ def ensure_page_heads() -> None:
 
 def _page_files() -> dict[str, str]:
     """Return the name of each head's file."""
-    return {name: "head.glb" if name == DEFAULT_HEAD else f"head-{name}.glb" for name in HEAD_NAMES}
+    return {name: page_file(name) for name in HEAD_NAMES}
 
 
 def _has_current_heads(folder: Path) -> bool:

@@ -10,7 +10,6 @@ import typer
 from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.options import (
     ACOUSTIC_MODEL,
-    DEFAULT_HEAD,
     AudioTrack,
     CaptionKind,
     CurveFormat,
@@ -24,6 +23,7 @@ from kouxing.services.cli.options import (
     WidthSource,
 )
 from kouxing.services.driver.config import Framing
+from kouxing.services.heads import DEFAULT_HEAD
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE

@@ -7,13 +7,12 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.driver.config import HEAD_NAMES, DriverConfig, Framing
+from kouxing.services.driver.config import Framing
+from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
 from kouxing.shared.phones.alphabets import Alphabet
 from kouxing.shared.phones.inventory import find_language, language_codes
-
-DEFAULT_HEAD = DriverConfig().head
 
 
 class Panel(StrEnum):

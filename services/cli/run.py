@@ -23,7 +23,10 @@ from kouxing.services.cli.running_system import (
 )
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
+from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
 from kouxing.services.service_kinds import (
+    CONFIG_TYPES,
     KINDS,
     available_port_environment,
     extra_worker_environments,
@@ -78,8 +81,7 @@ def run(
     settings = read_settings(config, given)
     for kind in KINDS.values():
         settings.load(kind.config_type)  # if a key is wrong, nothing starts
-    driver = settings.load(DriverConfig)
-    out = Path(driver.out)
+    out = Path(settings.load(DriverConfig).out)
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
     reservation = _enter(lock_output_folder(out))
     arguments = ["--config", str(config)] if config else []
@@ -91,8 +93,8 @@ def run(
     bound_control = addresses.get(BOUND_CONTROL_VARIABLE, control_config.bound_control)
     control = _control_address(bound_control)
     environment = {
-        **_assigned_environment(given),
-        **head_environment(head or driver.head, out),
+        **assigned_environment(given),
+        **head_environment(settings, head, out),
         **addresses,
         variable_name(COMMON, "control"): control,
         BOUND_CONTROL_VARIABLE: bound_control,
@@ -152,15 +154,19 @@ def _stop_at_interrupt() -> None:
     print_message("stopping")
 
 
-def head_environment(name: str, out: Path) -> dict[str, str]:
-    """Return the environment in which the driver and the page show a head of the package or a file.
+def head_environment(settings: Settings, option: str, out: Path) -> dict[str, str]:
+    """Return the environment in which the driver and the page show the same head.
 
-    The GLB for the page is in the folder ``out``. Raises ``UserError`` if there is no such head, or
-    the GLB cannot be written.
+    ``option`` overrides the settings. Otherwise, ``gateway.head`` may name another head for the
+    page. The page's file of an avatar is written to the folder ``out``. Raises ``UserError`` if
+    there is no such head, or the file cannot be written.
     """
-    environment = {variable_name("driver", "head"): name}
-    if name == DriverConfig().head:
+    head = option or settings.load(DriverConfig).head
+    environment = {variable_name("driver", "head"): head}
+    if not option and settings.load(GatewayConfig).head not in (head, DEFAULT_HEAD):
         return environment
+    if head in HEAD_NAMES:
+        return environment | {variable_name("gateway", "head"): head}
     from kouxing.services.driver.head.glb_export import export_glb
     from kouxing.services.driver.render.scene import load_head
 
@@ -169,17 +175,18 @@ def head_environment(name: str, out: Path) -> dict[str, str]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot create {out}: {error.strerror}; set driver.out") from None
-    export_glb(load_head(name), page_head)
+    export_glb(load_head(head), page_head)
     return environment | {variable_name("gateway", "head"): str(page_head)}
 
 
-def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
+def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
     """Return the environment that passes on ``--set``, so that it overrides all other sources."""
     environment = {}
     for name, value in assignments.items():
         table, _, key = name.partition(".")
-        for service in (COMMON, *KINDS) if table == COMMON else (table,):
-            environment[variable_name(service, key)] = value
+        for service, config_type in CONFIG_TYPES.items():
+            if service == table or (table == COMMON and key in config_type.model_fields):
+                environment[variable_name(service, key)] = value
     return environment
 
 

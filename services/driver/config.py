@@ -2,19 +2,13 @@
 
 import re
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
+from kouxing.services.heads import HeadConfig
 from kouxing.shared.config import KnownNames, Switch, ValueHint
-from kouxing.shared.face.config import FaceConfig
 from kouxing.shared.name_rules import NAME
-
-HEAD_NAMES = tuple(
-    sorted(path.stem for path in (Path(__file__).parent / "head" / "assets").glob("*.npz"))
-)
-
 
 COLORS = {
     "black": "#000000", "white": "#ffffff", "grey": "#808080", "green": "#00b140",
@@ -56,7 +50,7 @@ def _check_size(text: str) -> str:
     return text
 
 
-class DriverConfig(FaceConfig):
+class DriverConfig(HeadConfig):
     """The driver's configuration keys."""
 
     view: Literal["auto", "window", "none"] = "auto"
@@ -72,11 +66,6 @@ class DriverConfig(FaceConfig):
     max_videos: Annotated[int, Field(ge=1, le=1000)] = 8
     """Maximum number of videos that are written at the same time. One key can use at most three
     quarters."""
-    head: Annotated[
-        str,
-        KnownNames(lambda: HEAD_NAMES, r".*\.\w+", ", or a file (.glb, .gltf, .vrm or .npz)"),
-    ] = "woman"
-    """Built-in head, or an avatar."""
     background: Annotated[
         str, KnownNames(lambda: ("studio", *COLORS), "#?[0-9a-fA-F]{6}", ", or #rrggbb")
     ] = "studio"

@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator
 
+from kouxing.services.heads import HeadConfig
 from kouxing.shared.config import BoundHost, BoundPort, HostNames, TextList, ValueHint
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.config import FaceConfig
 
 ADDRESS_SHARE = 0.75  # maximum fraction of each quota for one address, which may be a proxy
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
@@ -53,7 +53,7 @@ Targets = Annotated[
 ]
 
 
-class GatewayConfig(FaceConfig):
+class GatewayConfig(HeadConfig):
     """Configuration keys of the gateway."""
 
     safe_alternative: ClassVar[str] = (
@@ -65,8 +65,6 @@ class GatewayConfig(FaceConfig):
     """Address at which the page is served."""
     port: BoundPort = 8080
     """Port at which the page is served; 0 uses any free port."""
-    head: str = ""
-    """GLB file with the page's head, written by 'kouxing head export'."""
     https: Annotated[
         str,
         AfterValidator(_check_https),

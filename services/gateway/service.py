@@ -113,7 +113,7 @@ class GatewayService(SessionService):
             web.post("/senders", self._senders.serve_post),
         )
         self._application = web_application.make_application(
-            head_file=config.head,
+            head=config.head,
             access=endpoint.access,
             frame_ancestors=" ".join(config.trusted_origins),
             routes=self._routes,

@@ -13,10 +13,10 @@ from aiohttp import WSCloseCode, WSMsgType, web
 import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.limits import ConnectionQuota
+from kouxing.services.heads import HEAD_NAMES, page_file, page_heads_folder
 from kouxing.services.lip_models import lip_models
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.logs import LOG
-from kouxing.shared.page_heads import page_heads_folder
 from kouxing.shared.phones.inventory import language_titles
 
 PAGE_FOLDER = Path(__file__).parent / "page"
@@ -125,14 +125,14 @@ class OpenWebSockets:
 
 def make_application(
     *,
-    head_file: str,
+    head: str,
     routes: Collection[web.RouteDef],
     access: AccessPolicy,
     frame_ancestors: str = "",
 ) -> web.Application:
     """Return the web application.
 
-    ``head_file`` is the GLB to serve as ``head.glb``; if empty, the file in the page's folder.
+    ``head`` is a built-in head or a GLB file, to serve as ``head.glb``.
     ``routes`` are private: sessions and uploads. Pages of ``frame_ancestors``, origins that are
     separated by spaces, may show the page in a frame.
     """
@@ -146,7 +146,7 @@ def make_application(
 
     async def serve_page(request: web.Request) -> web.StreamResponse:
         name = request.match_info.get("name", "index.html")
-        response = _page_file(name, head_file, frame_ancestors)
+        response = _page_file(name, head, frame_ancestors)
         if modules is None:
             raise web.HTTPServiceUnavailable(text=f"{_NO_MODULES}\n")
         return response
@@ -209,9 +209,11 @@ def _find(folder: Path, name: str, suffixes: Collection[str]) -> Path:
     return path
 
 
-def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamResponse:
-    if name.endswith(".glb"):
-        path = Path(head_file) if head_file and name == "head.glb" else _page_head(name)
+def _page_file(name: str, head: str, frame_ancestors: str) -> web.StreamResponse:
+    if name == "head.glb":
+        path = _page_head(page_file(head)) if head in HEAD_NAMES else Path(head)
+    elif name.endswith(".glb"):
+        path = _page_head("head.glb" if name == "head-woman.glb" else name)
     else:
         path = (
             LIGHT_SHADER if name == LIGHT_SHADER.name else _find(PAGE_FOLDER, name, _PAGE_SUFFIXES)
@@ -224,9 +226,8 @@ def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamRes
     return response
 
 
-def _page_head(name: str) -> Path:
+def _page_head(file: str) -> Path:
     """Return the file of a head, from the page's folder or from the cache folder."""
-    file = "head.glb" if name == "head-woman.glb" else name
     for folder in (PAGE_FOLDER, page_heads_folder()):
         with contextlib.suppress(web.HTTPNotFound):
             return _find(folder, file, {".glb"})

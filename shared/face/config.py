@@ -28,7 +28,3 @@ class LiveConfig(ServiceConfig):
     """Maximum lag of a live session, in seconds. If it is exceeded for 0.4 s, the recognizer skips
     audio, or the synthesizer skips frames. From three quarters of it, the recognizer uses the light
     acoustic model."""
-
-
-class CommonConfig(FaceConfig, LiveConfig):
-    """The keys of the table ``[common]``."""

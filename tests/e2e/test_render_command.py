@@ -14,20 +14,21 @@ from kouxing.services.cli.heads import import_mesh
 from kouxing.services.cli.offline import render as render_files
 from kouxing.services.cli.options import CurveFormat
 from kouxing.services.cli.run import head_environment
-from kouxing.services.driver.config import DriverConfig, Framing
+from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import ASSETS, Head
+from kouxing.services.heads import page_heads_folder
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
+from kouxing.services.service_kinds import read_settings
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
-from kouxing.shared.page_heads import page_heads_folder
 from tests.glb_writer import write_glb
 from tests.meshes import ORIGINAL, meshes
 from tests.system import VOWELS_FILE, kouxing
@@ -184,11 +185,29 @@ def test_renders_an_imported_mesh(face: Path, tmp_path: Path) -> None:
     assert len(list((tmp_path / "frames").iterdir())) == 10
 
 
-def test_the_page_loads_the_chosen_head(tmp_path: Path) -> None:
-    default = DriverConfig().head
-    assert head_environment(default, tmp_path) == {"KOUXING_DRIVER_HEAD": default}
+@pytest.mark.parametrize(
+    ("assignments", "option", "driver", "page"),
+    [
+        ({}, "", "woman", "woman"),
+        ({"common.head": "mika"}, "", "mika", "mika"),
+        ({"driver.head": "mika", "gateway.head": ""}, "man", "man", "man"),
+        ({"driver.head": "mika"}, "", "mika", "mika"),
+        ({"driver.head": "mika", "gateway.head": ""}, "", "mika", "mika"),
+        ({"driver.head": "mika", "gateway.head": "my.glb"}, "", "mika", None),
+    ],
+)
+def test_the_page_shows_the_head_of_the_driver(
+    tmp_path: Path, assignments: dict[str, str], option: str, driver: str, page: str | None
+) -> None:
+    environment = head_environment(read_settings(assignments=assignments), option, tmp_path)
+    assert environment["KOUXING_DRIVER_HEAD"] == driver
+    assert environment.get("KOUXING_GATEWAY_HEAD") == page
+
+
+def test_the_page_gets_a_file_of_an_avatar(tmp_path: Path) -> None:
     export_glb(Head.load("child", "coarse"), tmp_path / "my.glb")
-    environment = head_environment(str(tmp_path / "my.glb"), tmp_path / "out")
+    settings = read_settings(assignments={"common.head": str(tmp_path / "my.glb")})
+    environment = head_environment(settings, "", tmp_path / "out")
     page_head = tmp_path / "out" / "head.glb"
     assert environment == {
         "KOUXING_DRIVER_HEAD": str(tmp_path / "my.glb"),

@@ -7,6 +7,7 @@ from unittest import mock
 
 import pytest
 
+from kouxing.services.cli.run import assigned_environment
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.service_kinds import (
     KINDS,
@@ -52,6 +53,20 @@ def test_a_taken_default_and_port_0_are_replaced_by_a_free_port() -> None:
         for settings in (read_settings(), read_settings(assignments={"gateway.port": "0"})):
             port = int(available_port_environment(settings)["KOUXING_GATEWAY_PORT"])
             assert port not in (0, taken)
+
+
+def test_a_common_key_is_set_for_the_services_that_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    environment = assigned_environment({"common.head": "mika", "recognizer.acoustic": "light"})
+    assert environment == {
+        "KOUXING_HEAD": "mika",
+        "KOUXING_DRIVER_HEAD": "mika",
+        "KOUXING_GATEWAY_HEAD": "mika",
+        "KOUXING_RECOGNIZER_ACOUSTIC": "light",
+    }
+    for name, text in environment.items():
+        monkeypatch.setenv(name, text)
+    for kind in KINDS.values():
+        read_settings().load(kind.config_type)
 
 
 def test_more_workers_bind_other_ports_of_the_same_address() -> None:

@@ -50,7 +50,7 @@ SINE = 0.5 * np.sin(np.arange(32_000) * 0.1)
 @asynccontextmanager
 async def serve(uploads: UploadHandler) -> AsyncIterator[Post]:
     route = web.post("/upload", uploads.serve)
-    runner = web.AppRunner(make_application(head_file="", routes=[route], access=AccessPolicy()))
+    runner = web.AppRunner(make_application(head="woman", routes=[route], access=AccessPolicy()))
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
     address = f"http://127.0.0.1:{runner.addresses[0][1]}/upload"

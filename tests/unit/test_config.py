@@ -9,8 +9,9 @@ from pydantic import TypeAdapter
 
 from kouxing.services.cli.configuration import config, markdown_page
 from kouxing.services.control.config import ControlConfig
-from kouxing.services.driver.config import HEAD_NAMES, DriverConfig
+from kouxing.services.driver.config import DriverConfig
 from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.heads import HEAD_NAMES
 from kouxing.services.lip_models import lip_model_names
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.service_kinds import CONFIG_TYPES, read_settings
@@ -188,7 +189,7 @@ def test_an_error_in_a_file_is_located(tmp_path: Path, text: str, message: str) 
 @pytest.mark.parametrize(
     ("environment", "assignments", "error"),
     [
-        ({"KOUXING_HEAD": "1"}, {}, r"\$KOUXING_HEAD: .* the nearest is KOUXING_DRIVER_HEAD;"),
+        ({"KOUXING_VIEW": "1"}, {}, r"\$KOUXING_VIEW: .* the nearest is KOUXING_DRIVER_VIEW;"),
         ({"KOUXING_CONTROLL": "1"}, {}, "the nearest is KOUXING_CONTROL;"),
         ({}, {"recognizer.acustic": "gmm"}, "--set: .*; the nearest is .*acoustic;"),
     ],

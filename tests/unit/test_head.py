@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
+from kouxing.services.driver.head.head import ASSETS, Detail, Head
+from kouxing.services.heads import DEFAULT_HEAD
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.high_level_faps import expression_faps, viseme_faps
 from tests import heads

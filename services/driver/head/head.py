@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from kouxing.services.driver.config import HEAD_NAMES
 from kouxing.services.driver.head.normal_updater import NormalUpdater
+from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS, RADIANS_PER_ANGLE_UNIT
@@ -41,7 +41,6 @@ from kouxing.shared.user_file import check_content
 
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"
-DEFAULT_HEAD = "woman"
 MAX_BYTES = 512 * 1024 * 1024  # unpacked size of a file
 
 Detail = Literal["fine", "coarse"]

@@ -8,8 +8,9 @@ import numpy as np
 
 from kouxing.services.driver.config import COLORS, DriverConfig, Framing
 from kouxing.services.driver.head.glb_head import read_glb
-from kouxing.services.driver.head.head import DEFAULT_HEAD, Detail, Head
+from kouxing.services.driver.head.head import Detail, Head
 from kouxing.services.driver.render.renderer import BACKGROUND, Background, Camera, Renderer
+from kouxing.services.heads import DEFAULT_HEAD
 from kouxing.shared.errors import UserError
 
 # height of the picture's center above the eyes, and distance of the camera, in FAPU ES

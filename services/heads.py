@@ -1,0 +1,41 @@
+"""The built-in heads, the configuration key ``head``, and the files of heads for the page."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BeforeValidator
+
+from kouxing.shared.config import KnownNames
+from kouxing.shared.face.config import FaceConfig
+
+HEAD_NAMES = tuple(
+    sorted(path.stem for path in (Path(__file__).parent / "driver/head/assets").glob("*.npz"))
+)
+DEFAULT_HEAD = "woman"
+
+
+def page_file(name: str) -> str:
+    """Return the name of the GLB file with a built-in head, as the page loads it."""
+    return "head.glb" if name == DEFAULT_HEAD else f"head-{name}.glb"
+
+
+def page_heads_folder() -> Path:
+    """Return ``$XDG_CACHE_HOME/kouxing/heads``, by default ``~/.cache/kouxing/heads``.
+
+    It has the page's heads of an installed package, which contains no GLB files.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "kouxing" / "heads"
+
+
+class HeadConfig(FaceConfig):
+    """The keys of services that show a head."""
+
+    head: Annotated[
+        str,
+        BeforeValidator(lambda name: name or DEFAULT_HEAD),  # gateway.head was once empty
+        KnownNames(lambda: HEAD_NAMES, r".*\.\w+", ", or a file (.glb, .gltf, .vrm or .npz)"),
+    ] = DEFAULT_HEAD
+    """Head in windows, videos and the page: built in, or an avatar. A gateway without 'kouxing run'
+    needs a GLB file from 'kouxing head export' instead of an avatar."""
