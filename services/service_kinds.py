@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import pkgutil
 import secrets
 import socket
 from collections.abc import Collection, Mapping
@@ -23,10 +22,49 @@ from kouxing.shared.face.config import LiveConfig
 from kouxing.shared.service_kind import ServiceKind
 
 _FREE_PORTS = range(20_000, 32_000)  # below the range for outgoing connections
-_PACKAGES = ("control", "recognizer", "synthesizer", "driver", "gateway")  # in order of start
 
-KINDS: dict[str, ServiceKind] = {
-    package: pkgutil.resolve_name(f"kouxing.services.{package}.kind:KIND") for package in _PACKAGES
+KINDS: dict[str, ServiceKind] = {  # in order of start
+    "control": ServiceKind(
+        name="control",
+        role="control",
+        summary="Run control: it opens sessions and places them on the other services.",
+        config="kouxing.services.control.config:ControlConfig",
+        service="kouxing.services.control.service:ControlService",
+    ),
+    "recognizer": ServiceKind(
+        name="recognizer",
+        role="worker",
+        summary="Run a recognizer: audio in, phones with times out.",
+        config="kouxing.services.recognizer.config:RecognizerConfig",
+        service="kouxing.services.recognizer.service:RecognizerService",
+        provides=("audio", "unpaced_audio", "phones"),
+        needs=("phone_input",),
+    ),
+    "synthesizer": ServiceKind(
+        name="synthesizer",
+        role="worker",
+        summary="Run a synthesizer: phones in, FAP frames out.",
+        config="kouxing.services.synthesizer.config:SynthesizerConfig",
+        service="kouxing.services.synthesizer.service:SynthesizerService",
+        provides=("phone_input", "faps"),
+    ),
+    "driver": ServiceKind(
+        name="driver",
+        role="observer",
+        summary="Run a driver: FAP frames in, a window and videos out.",
+        config="kouxing.services.driver.config:DriverConfig",
+        service="kouxing.services.driver.service:DriverService",
+        needs=("phones", "faps"),
+    ),
+    "gateway": ServiceKind(
+        name="gateway",
+        role="observer",
+        summary="Run the gateway: the face and a microphone in a browser.",
+        config="kouxing.services.gateway.config:GatewayConfig",
+        service="kouxing.services.gateway.service:GatewayService",
+        needs=("phones", "faps"),
+        client_roles=("client",),
+    ),
 }
 
 

@@ -1,4 +1,4 @@
-"""The exception for users' mistakes, and helpers for its text."""
+"""The exceptions for mistakes of users and clients, and helpers for their texts."""
 
 import importlib.util
 import sys
@@ -11,6 +11,16 @@ class UserError(Exception):
 
     The command line prints the text without a traceback and exits with ``USER_ERROR``.
     """
+
+
+class Rejected(Exception):
+    """A message that a service rejects. The sender receives these fields in ``error``."""
+
+    def __init__(self, code: str, text: str, retry_after_s: float | None = None) -> None:
+        super().__init__(text)
+        self.code = code
+        self.text = text
+        self.retry_after_s = retry_after_s
 
 
 def install_command(package: str) -> str:

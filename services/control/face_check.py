@@ -1,7 +1,6 @@
 """Checks the names in the settings of a face; the synthesizer checks its lip models."""
 
-from kouxing.services.control.rejection import RequestRejected
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.face.expressions import check_expressions
 from kouxing.shared.face.shape_names import ShapeSetName
 from kouxing.shared.wire.face import FaceSettings
@@ -10,7 +9,7 @@ from kouxing.shared.wire.speech import AcousticModelName
 
 
 def check_face(settings: FaceSettings) -> None:
-    """Raise ``RequestRejected`` if a setting has an unknown name; the text lists the names."""
+    """Raise ``Rejected`` if a setting has an unknown name; the text lists the names."""
     known: list[tuple[str, str | None, list[str]]] = [
         ("acoustic model", settings.acoustic, [*AcousticModelName]),
         *(("set of shapes", name, [*ShapeSetName]) for name in settings.shapes or ()),
@@ -18,8 +17,8 @@ def check_face(settings: FaceSettings) -> None:
     for noun, name, names in known:
         if name is not None and name not in names:
             text = f"unknown {noun} {name!r}; use {', '.join(names)}"
-            raise RequestRejected(ErrorCode.BAD_FACE, text)
+            raise Rejected(ErrorCode.BAD_FACE, text)
     try:
         check_expressions(settings.expressions or {}, settings.hold_s)
     except UserError as error:
-        raise RequestRejected(ErrorCode.BAD_FACE, str(error)) from None
+        raise Rejected(ErrorCode.BAD_FACE, str(error)) from None

@@ -2,10 +2,10 @@
 
 from collections.abc import Collection, Mapping
 
-from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.service_registry import ServiceRecord, ServiceRegistry
 from kouxing.services.control.worker_load import EQUAL_LOAD, RETRY_AFTER_S
 from kouxing.services.service_kinds import PROVIDERS
+from kouxing.shared.errors import Rejected
 from kouxing.shared.wire.session import ErrorCode
 
 CLIENT_NEEDS = ("audio", "phones", "faps")  # endpoints that a client needs
@@ -33,7 +33,7 @@ class Placement:
         ``kept`` stay. If ``language`` is set, the workers must have this language. A moved session
         needs no room.
 
-        Raises ``RequestRejected`` if no ready worker provides an endpoint, or no worker has room
+        Raises ``Rejected`` if no ready worker provides an endpoint, or no worker has room
         for ``min_room`` sessions.
         """
         workers: dict[str, str] = {}
@@ -67,12 +67,12 @@ class Placement:
         kind = PROVIDERS.get(endpoint)
         if not names and providers and language is not None:
             text = f"no {kind} has the language {language}; choose another one"
-            raise RequestRejected(ErrorCode.BAD_LANGUAGE, text)
+            raise Rejected(ErrorCode.BAD_LANGUAGE, text)
         if not names:
             missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
             start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
             text = f"{missing}; {start} (or everything with 'kouxing run')"
-            raise RequestRejected(ErrorCode.NO_SERVICE, text)
+            raise Rejected(ErrorCode.NO_SERVICE, text)
         best = min(names, key=lambda name: self._rank(name, now_s))
         load = self._registry.load(best)
         if not load.has_room(min_room, now_s, self._max_load):
@@ -82,7 +82,7 @@ class Placement:
                 f"every {kind or f'provider of {endpoint}'} is busy: {needed:.0f} % of its time "
                 f"must be free, but only {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
             )
-            raise RequestRejected(ErrorCode.BUSY, text, RETRY_AFTER_S)
+            raise Rejected(ErrorCode.BUSY, text, RETRY_AFTER_S)
         return best
 
     def _rank(self, instance: str, now_s: float) -> tuple[int, int, str]:

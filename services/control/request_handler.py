@@ -4,8 +4,8 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from kouxing.services.control.rejection import RequestRejected
 from kouxing.shared.bus import Bus
+from kouxing.shared.errors import Rejected
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import Metrics
@@ -59,7 +59,7 @@ class RequestHandler:
             try:
                 self.check_role(sender, *roles)
                 answer = handle(message, sender)
-            except RequestRejected as rejection:
+            except Rejected as rejection:
                 if self._can_defer(rejection):
                     self._deferred.append((on_request, message, sender))
                     return
@@ -87,11 +87,11 @@ class RequestHandler:
     def check_role(self, sender: Peer, *roles: str) -> None:
         """Reject a sender unless its key has one of ``roles``; accept anyone if ``insecure``.
 
-        Raises ``RequestRejected`` if the key lacks these roles.
+        Raises ``Rejected`` if the key lacks these roles.
         """
         if roles and not self.has_role(sender.key, *roles):
             text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
-            raise RequestRejected(ErrorCode.NOT_ALLOWED, text)
+            raise Rejected(ErrorCode.NOT_ALLOWED, text)
 
     def has_role(self, key: str, *roles: str) -> bool:
         """Return whether a key has one of ``roles``; True if ``insecure``."""
@@ -124,7 +124,7 @@ class RequestHandler:
         for handle, message, sender in deferred:
             handle(message, sender)
 
-    def _can_defer(self, rejection: RequestRejected) -> bool:
+    def _can_defer(self, rejection: Rejected) -> bool:
         return (
             self.defers
             and rejection.code in TEMPORARY_ERRORS

@@ -14,18 +14,18 @@ from typing import Any
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.face_check import check_face
 from kouxing.services.control.fault_log import FaultLog
-from kouxing.services.control.kind import KIND
 from kouxing.services.control.placement import Placement
-from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.request_handler import RequestHandler
 from kouxing.services.control.restart_recovery import RestartRecovery
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_lifecycle import SessionLifecycle
 from kouxing.services.control.session_table import SessionTable
 from kouxing.services.control.status_reporter import StatusReporter
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.bus import COMMANDS
 from kouxing.shared.clock import StallDetector, now_ns
 from kouxing.shared.endpoints import with_key
+from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
@@ -60,7 +60,7 @@ SERVICE_EVENTS = (
 class ControlService(Service):
     """The control process."""
 
-    kind = KIND
+    kind = KINDS["control"]
 
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(config, has_control=False, extra_connections=config.max_sessions)
@@ -227,7 +227,7 @@ class ControlService(Service):
             self._requests.check_role(sender, f"service:{heartbeat.service}")
             self._registry.check(heartbeat, sender)
             is_other = self._registry.is_other_process(heartbeat, sender)
-        except RequestRejected as rejection:
+        except Rejected as rejection:
             self.warn(rejection.code, f"{instance}: {rejection.text}")
             self._commands.send(Error(code=rejection.code, text=rejection.text), to=sender)
             return

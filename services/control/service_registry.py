@@ -9,11 +9,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import itemgetter
 
-from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.worker_load import WorkerLoad
 from kouxing.services.service_kinds import PROVIDERS
 from kouxing.shared.endpoints import split_endpoint, with_key
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
@@ -87,7 +86,7 @@ class ServiceRegistry:
     def check(self, heartbeat: Heartbeat, peer: Peer) -> None:
         """Check that a heartbeat may register its service, or is from the registered service.
 
-        Raises ``RequestRejected`` if the instance belongs to another key, an endpoint is malformed
+        Raises ``Rejected`` if the instance belongs to another key, an endpoint is malformed
         or belongs to another kind of service, or there are too many services.
         """
         record = self._services.get(heartbeat.instance)
@@ -96,12 +95,12 @@ class ServiceRegistry:
         if record is None:
             is_full = len(self._services) >= MAX_SERVICES
             if is_full or self._num_per_key[peer.key] >= MAX_SERVICES_PER_KEY:
-                raise RequestRejected(
+                raise Rejected(
                     ErrorCode.TOO_MANY_SERVICES, "too many services are registered; stop some"
                 )
         elif record.peer.key != peer.key:
             text = f"{heartbeat.instance} is registered with another key"
-            raise RequestRejected(ErrorCode.NOT_ALLOWED, text)
+            raise Rejected(ErrorCode.NOT_ALLOWED, text)
 
     def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float, num_speaking: int = 0) -> None:
         """Register a service, or record its newest heartbeat.
@@ -311,18 +310,16 @@ def _check_endpoints(heartbeat: Heartbeat) -> None:
     if heartbeat.role != "worker":
         return
     if not heartbeat.endpoints:
-        raise RequestRejected(
-            ErrorCode.BAD_MESSAGE, "a worker must name the endpoints that it provides"
-        )
+        raise Rejected(ErrorCode.BAD_MESSAGE, "a worker must name the endpoints that it provides")
     for name, endpoint in heartbeat.endpoints.items():
         provider = PROVIDERS.get(name, heartbeat.service)
         if provider != heartbeat.service:
             text = f"only a {provider} may provide {name!r}, and this is a {heartbeat.service}"
-            raise RequestRejected(ErrorCode.NOT_ALLOWED, text)
+            raise Rejected(ErrorCode.NOT_ALLOWED, text)
         try:
             host, port = split_endpoint(endpoint, name)
         except UserError as error:
-            raise RequestRejected(ErrorCode.BAD_MESSAGE, str(error)) from None
+            raise Rejected(ErrorCode.BAD_MESSAGE, str(error)) from None
         if "*" in (host, port):
             text = f"{name}: {endpoint!r} is not a host and port to connect to"
-            raise RequestRejected(ErrorCode.BAD_MESSAGE, text)
+            raise Rejected(ErrorCode.BAD_MESSAGE, text)

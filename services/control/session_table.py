@@ -9,10 +9,9 @@ from itertools import count
 from operator import attrgetter
 
 from kouxing.services.control.placement import Placement
-from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import MAX_KEY_SHARE, Peer
 from kouxing.shared.phones.inventory import find_language
@@ -48,11 +47,11 @@ class SessionTable:
         return self._records.get(name)
 
     def find(self, name: str) -> SessionRecord:
-        """Return a session; raise ``RequestRejected`` if there is no such session."""
+        """Return a session; raise ``Rejected`` if there is no such session."""
         record = self._records.get(name)
         if record is None:
             text = f"session {name!r} does not exist; open it first"
-            raise RequestRejected(ErrorCode.UNKNOWN_SESSION, text)
+            raise Rejected(ErrorCode.UNKNOWN_SESSION, text)
         return record
 
     def listeners_of(self, name: str) -> list[SessionRecord]:
@@ -64,11 +63,11 @@ class SessionTable:
     def find_authorized(self, name: str, token: str) -> SessionRecord:
         """Return a session after checking its token.
 
-        Raises ``RequestRejected`` if there is no such session, or it has another token.
+        Raises ``Rejected`` if there is no such session, or it has another token.
         """
         record = self.find(name)
         if not secrets.compare_digest(record.token.encode(), token.encode()):
-            raise RequestRejected(
+            raise Rejected(
                 ErrorCode.BAD_TOKEN,
                 f"wrong token for session {name!r}; use the token from session-opened",
             )
@@ -117,20 +116,20 @@ class SessionTable:
     def open(self, opening: OpenSession, client: Peer, now_s: float) -> SessionRecord:
         """Place a new session.
 
-        Raises ``RequestRejected`` if the name is taken, there are too many sessions, a service is
+        Raises ``Rejected`` if the name is taken, there are too many sessions, a service is
         missing or busy, or no recognizer has the language.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
         if name in self._records:
             text = f"session {name!r} is open; choose another name"
-            raise RequestRejected(ErrorCode.SESSION_EXISTS, text)
+            raise Rejected(ErrorCode.SESSION_EXISTS, text)
         if len(self._records) >= self._max_sessions:
             text = f"the limit of control.max_sessions is reached: {self._max_sessions}"
-            raise RequestRejected(ErrorCode.TOO_MANY_SESSIONS, text)
+            raise Rejected(ErrorCode.TOO_MANY_SESSIONS, text)
         num_of_key = self._num_per_key[client.key]
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
             text = f"your key has {num_of_key} open sessions, the maximum; close one first"
-            raise RequestRejected(ErrorCode.TOO_MANY_SESSIONS, text)
+            raise Rejected(ErrorCode.TOO_MANY_SESSIONS, text)
         leaves_room = client.key and num_of_key and not opening.paced  # room for another client
         language = _language_of(opening)
         workers = self._placement.place({}, now_s, language, min_room=2 if leaves_room else 1)
@@ -257,7 +256,7 @@ class SessionTable:
         remaining = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:
             workers = self._placement.place(remaining, now_s, record.facts.language)
-        except RequestRejected:
+        except Rejected:
             return False
         record.deferred = {workers["audio"]}
         if "audio" not in remaining:
@@ -303,4 +302,4 @@ def _language_of(opening: OpenSession) -> str | None:
     try:
         return find_language(opening.language)
     except UserError as error:
-        raise RequestRejected(ErrorCode.BAD_LANGUAGE, str(error)) from None
+        raise Rejected(ErrorCode.BAD_LANGUAGE, str(error)) from None

@@ -31,7 +31,7 @@ class StatusReporter:
         """Return one page, or the state of one session and its services.
 
         The address of the web page contains its token only if ``shows_token``: with the token,
-        anyone can open sessions. Raises ``RequestRejected`` if there is no such session.
+        anyone can open sessions. Raises ``Rejected`` if there is no such session.
         """
         services: list[ServiceState] = []
         sessions: list[SessionState] = []

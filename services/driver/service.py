@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from kouxing.services.driver.config import DriverConfig
-from kouxing.services.driver.kind import KIND
 from kouxing.services.driver.pose_store import PoseStore
 from kouxing.services.driver.recorder_client import RecorderClient
 from kouxing.services.driver.video.video_writer import remove_unfinished
 from kouxing.services.driver.view import View
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.keys import Peer
@@ -49,7 +49,7 @@ class _FollowedSession:
 class DriverService(SessionService):
     """The driver process."""
 
-    kind = KIND
+    kind = KINDS["driver"]
 
     def __init__(self, config: DriverConfig) -> None:
         super().__init__(config)

@@ -19,7 +19,6 @@ from aiohttp import web
 from kouxing.services.gateway import browser_messages, web_application
 from kouxing.services.gateway.audio_sessions import AudioClient
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.gateway.kind import KIND
 from kouxing.services.gateway.microphone_handler import MicrophoneHandler
 from kouxing.services.gateway.mouth_learner import MouthLearner
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
@@ -30,6 +29,7 @@ from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.viewer_queue import MessageKind
 from kouxing.services.gateway.web_server import WebServer, bind_port
 from kouxing.services.gateway.whip_handler import WhipHandler
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
@@ -68,7 +68,7 @@ class GatewayService(SessionService):
     HTTP runs in an asyncio loop. The loop runs while the service waits for messages.
     """
 
-    kind = KIND
+    kind = KINDS["gateway"]
 
     def __init__(self, config: GatewayConfig) -> None:
         listener = bind_port(config.host, config.port)

@@ -17,7 +17,6 @@ from kouxing.services.recognizer.acoustic.languages import MODEL_LANGUAGES
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.audio_intake import AudioIntake
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live_batch_decoder import (
     MAX_BATCH_S,
@@ -27,9 +26,9 @@ from kouxing.services.recognizer.live_batch_decoder import (
 from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.pending_sessions import PendingSessions
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.resumption import Chunk
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
+from kouxing.services.service_kinds import KINDS
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
@@ -58,7 +57,7 @@ MAX_TICK_S = 0.05  # longer intervals between ticks mean that this process was b
 class RecognizerService(SessionService):
     """The recognizer process."""
 
-    kind = KIND
+    kind = KINDS["recognizer"]
 
     def __init__(self, config: RecognizerConfig) -> None:
         super().__init__(config)
@@ -103,7 +102,7 @@ class RecognizerService(SessionService):
             on_decoded=self._send_decoded,
             on_batch=self.send_heartbeat_if_due,
         )
-        self._intake = AudioIntake(self, self._on_chunk, self._on_end)
+        self._intake = AudioIntake(self)
         for socket in (self._audio, self._unpaced_audio):
             self.register(socket, {AudioChunk: partial(self._on_audio, socket)})
         self.register(self._phones, {})
@@ -275,15 +274,13 @@ class RecognizerService(SessionService):
     # --- audio -----------------------------------------------------------------------------------
 
     def _on_audio(self, socket: Socket, message: AudioChunk, sender: Peer) -> None:
-        self._intake.receive(self._sessions.get(message.session), socket, message, sender)
-
-    def _on_chunk(self, session: RecognizerSession, chunk: Chunk) -> None:
-        session.audio.append(chunk, time.monotonic())
+        session = self._sessions.get(message.session)
+        self._intake.receive(session, socket, message, sender)
+        if session is None:
+            return
         if not session.is_paced:
             self._limit_unpaced()
-
-    def _on_end(self, session: RecognizerSession) -> None:
-        if not session.is_decoding:
+        if session.end is not None and not session.is_decoding:
             self._finish(session)
 
     def _select_sessions(self, *, paced: bool) -> list[RecognizerSession]:

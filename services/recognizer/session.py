@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 from kouxing.services.recognizer.audio_queue import AudioQueue
-from kouxing.services.recognizer.front_end.pcm import BadAudio, decode_pcm
+from kouxing.services.recognizer.front_end.pcm import decode_pcm
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
@@ -15,7 +15,7 @@ from kouxing.services.recognizer.sound_packets import SoundPackets
 from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.encoding_check import EncodingCheck
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
@@ -46,14 +46,6 @@ RESEND_WAIT_S = 1.0  # wait for resent audio; then the session continues after t
 M = TypeVar("M", bound=Message)
 
 _CLIENT_CLOCK_RATE = 1.01  # a client's clock may run this much faster
-
-
-class AudioRejected(Exception):
-    """A client's audio message is rejected; the client gets the code and the text."""
-
-    def __init__(self, code: ErrorCode, text: str) -> None:
-        super().__init__(text)
-        self.code = code
 
 
 class RecognizerSession:
@@ -95,8 +87,7 @@ class RecognizerSession:
         )
         self.resume_filter: ResumeFilter | None = None  # after a lost recognizer
         if start.final_until:
-            silence = recognizer.model.inventory.silence
-            self.resume_filter = ResumeFilter(to_seconds(start.final_until), silence)
+            self.resume_filter = ResumeFilter(to_seconds(start.final_until))
         skip_policy = SkipPolicy(
             max_lag_s if opening.paced else math.inf,
             now_s + CATCH_UP_S if start.epoch > 1 else now_s,
@@ -160,30 +151,30 @@ class RecognizerSession:
         return True
 
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
-        """Raise ``AudioRejected`` if the sender may not send this message here."""
+        """Raise ``Rejected`` if the sender may not send this message here."""
         if not secrets.compare_digest(self.start.token.encode(), message.token.encode()):
             text = f"wrong token for session {self.name!r}; use the token from session-opened"
-            raise AudioRejected(ErrorCode.BAD_TOKEN, text)
+            raise Rejected(ErrorCode.BAD_TOKEN, text)
         if socket is not self.socket:
             text = f"send the audio of session {self.name!r} to the endpoint in session-opened"
-            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+            raise Rejected(ErrorCode.BAD_AUDIO, text)
         if message.sequence == 0:
             text = "the message has no sequence; number audio messages from 1"
-            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+            raise Rejected(ErrorCode.BAD_AUDIO, text)
 
     def check_open(self, message: AudioChunk) -> None:
-        """Raise ``AudioRejected`` if the session has ended or the media time is impossible."""
+        """Raise ``Rejected`` if the session has ended or the media time is impossible."""
         if message.media_time > MAX_MEDIA_TIME:
             text = f"media_time {message.media_time} is too large; count samples at 16 kHz from 0"
-            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+            raise Rejected(ErrorCode.BAD_AUDIO, text)
         if self.end is not None:
             text = f"session {self.name!r} has ended; open another"
-            raise AudioRejected(ErrorCode.FINISHED, text)
+            raise Rejected(ErrorCode.FINISHED, text)
 
     def read_chunk(self, chunk: AudioChunk, now_s: float) -> Chunk | None:
         """Return the audio of a message; None if all of it must be skipped.
 
-        Raises ``AudioRejected`` if the audio is not valid, or too early.
+        Raises ``Rejected`` if the audio is not valid, or too early.
         """
         opening, media_time = self.start.opening, chunk.media_time
         rate_hz = opening.sample_rate_hz
@@ -191,15 +182,15 @@ class RecognizerSession:
             samples = decode_pcm(chunk.pcm, opening.encoding, opening.num_channels)
             if self._encoding is not None:
                 self._encoding.check(chunk.pcm)
-        except (BadAudio, UserError) as error:
-            raise AudioRejected(ErrorCode.BAD_AUDIO, str(error)) from None
+        except UserError as error:
+            raise Rejected(ErrorCode.BAD_AUDIO, str(error)) from None
         duration_s = len(samples) / rate_hz
         if self.is_paced and not self._lead_limit.allows(to_seconds(media_time), duration_s, now_s):
             text = (
                 f"the audio is more than {MAX_LEAD_S:g} s ahead of the clock; to send faster than "
                 "real time, open the session with paced = false"
             )
-            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+            raise Rejected(ErrorCode.BAD_AUDIO, text)
         end = media_time + len(samples) * MEDIA_RATE_HZ // rate_hz
         self.replay_window.add(chunk.sequence, end)
         if self.resume_filter is None:

@@ -19,9 +19,9 @@ from operator import attrgetter
 import numpy as np
 
 from kouxing.services.lip_models import lip_model_names
+from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
-from kouxing.services.synthesizer.kind import KIND
 from kouxing.services.synthesizer.lateness import NO_LATENESS
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.services.synthesizer.modifiers.speech_motion import IdleMotionSettings
@@ -70,7 +70,7 @@ FAP_MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "lit
 class SynthesizerService(SessionService):
     """The synthesizer process."""
 
-    kind = KIND
+    kind = KINDS["synthesizer"]
 
     def __init__(self, config: SynthesizerConfig) -> None:
         super().__init__(config)

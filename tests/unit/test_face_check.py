@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from kouxing.services.control.face_check import check_face
-from kouxing.services.control.rejection import RequestRejected
+from kouxing.shared.errors import Rejected
 from kouxing.shared.wire.face import FaceSettings
 
 
@@ -29,6 +29,6 @@ def test_known_names_are_accepted() -> None:
 def test_an_unknown_name_is_refused_with_the_known_ones(
     settings: dict[str, Any], text: str
 ) -> None:
-    with pytest.raises(RequestRejected, match=text) as caught:
+    with pytest.raises(Rejected, match=text) as caught:
         check_face(FaceSettings(**settings))
     assert caught.value.code == "bad-face"

@@ -2,8 +2,8 @@
 
 import pytest
 
-from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.worker_load import MIN_SESSIONS, RETRY_AFTER_S, WorkerLoad
+from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.session import OpenSession
@@ -100,11 +100,11 @@ def test_refuses_a_session_without_room_and_says_when_to_try_again(system: Syste
     for instance in WORKERS:
         measure(system, instance, 0.75 if "recognizer" in instance else 0.1, 5.0)
     text = "every recognizer is busy: 38 % of its time must be free, but only 5 % is"
-    with pytest.raises(RequestRejected, match=text) as caught:
+    with pytest.raises(Rejected, match=text) as caught:
         open_at(system, 5.0)
     assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
     measure(system, "recognizer-2", 0.2, 6.0)
-    with pytest.raises(RequestRejected):
+    with pytest.raises(Rejected):
         open_at(system, 6.0)  # its two sessions may speak again
     measure(system, "recognizer-2", 0.2, 300.0)
     assert open_at(system, 300.0) == "recognizer-2"
@@ -114,7 +114,7 @@ def test_unpaced_sessions_of_one_key_leave_room_for_another_client(system: Syste
     opening, greedy = OpenSession(request="r", paced=False), Peer(b"a", "greedy")
     for _ in range(14):  # seven of the eight for which each recognizer has room
         system.sessions.open(opening, greedy, 0.0)
-    with pytest.raises(RequestRejected, match=r"20 % of its time must be free, but only 10 % is"):
+    with pytest.raises(Rejected, match=r"20 % of its time must be free, but only 10 % is"):
         system.sessions.open(opening, greedy, 0.0)
     assert system.sessions.open(opening, Peer(b"b", "other"), 0.0)
 
@@ -125,7 +125,7 @@ def test_never_refuses_the_first_sessions_nor_one_that_moves(system: System) -> 
             measure(system, instance, 1.0, 5.0)
         assert open_at(system, 5.0)
     for paced in (True, False):
-        with pytest.raises(RequestRejected):
+        with pytest.raises(Rejected):
             open_at(system, 5.0, paced=paced)
     record = next(iter(system.sessions))
     system.lose(record.workers["audio"])

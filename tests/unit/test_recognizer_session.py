@@ -15,9 +15,9 @@ from kouxing.services.recognizer.session import (
     MOVE_GRACE_S,
     RESEND_WAIT_S,
     STALLED_AFTER_S,
-    AudioRejected,
     RecognizerSession,
 )
+from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.sockets import Socket
@@ -62,7 +62,7 @@ def test_audio_of_a_wrong_sender_is_rejected(
     message: AudioChunk, socket: Socket, code: ErrorCode, text: str
 ) -> None:
     make_session().check_sender(chunk(), SOCKET)
-    with pytest.raises(AudioRejected, match=text) as rejection:
+    with pytest.raises(Rejected, match=text) as rejection:
         make_session().check_sender(message, socket)
     assert rejection.value.code == code
 
@@ -70,16 +70,16 @@ def test_audio_of_a_wrong_sender_is_rejected(
 def test_rejects_impossible_audio_and_audio_after_the_end() -> None:
     session = make_session()
     session.check_open(chunk())
-    with pytest.raises(AudioRejected, match="too large"):
+    with pytest.raises(Rejected, match="too large"):
         session.check_open(chunk(media_time=MAX_MEDIA_TIME + 1))
-    with pytest.raises(AudioRejected, match="are not a multiple of"):
+    with pytest.raises(Rejected, match="are not a multiple of"):
         session.read_chunk(chunk(pcm=b"123"), 0.0)
     float_pcm = (0.5 * samples_of_file(VOWELS_FILE)).astype("<f4").tobytes()
-    with pytest.raises(AudioRejected, match="perhaps 32-bit float samples") as rejection:
+    with pytest.raises(Rejected, match="perhaps 32-bit float samples") as rejection:
         session.read_chunk(chunk(pcm=float_pcm[: 16 * RATE_HZ]), 0.0)
     assert rejection.value.code == ErrorCode.BAD_AUDIO
     session.end = chunk(last=True)
-    with pytest.raises(AudioRejected, match="has ended"):
+    with pytest.raises(Rejected, match="has ended"):
         session.check_open(chunk(2))
 
 
@@ -96,7 +96,7 @@ class PacedClient:
             self.session.read_chunk(
                 chunk(duration_s=duration_s, time_s=self.end_s + gap_s), self.now_s
             )
-        except AudioRejected:
+        except Rejected:
             return False
         self.end_s += gap_s + duration_s
         return True

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from kouxing.services.control.placement import Placement
-from kouxing.services.control.rejection import RequestRejected
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
+from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import Heartbeat, SessionProgress
@@ -82,7 +82,7 @@ def system() -> System:
 
 @contextmanager
 def refused(code: str, text: str | None = None) -> Iterator[None]:
-    with pytest.raises(RequestRejected, match=text) as caught:
+    with pytest.raises(Rejected, match=text) as caught:
         yield
     assert caught.value.code == code
 
@@ -151,7 +151,7 @@ def test_the_error_names_a_missing_service(system: System, service: str) -> None
 def test_places_a_needed_worker_of_an_unknown_kind(system: System) -> None:
     system.lose("synthesizer-1")
     system.add(replace(worker("synthesizer", "synthesizer-1"), needs=["gaze"]))
-    with pytest.raises(RequestRejected, match="provides 'gaze'"):
+    with pytest.raises(Rejected, match="provides 'gaze'"):
         system.open()
     eyes = {"service": "eyes", "instance": "eyes-1", "endpoints": {"gaze": "tcp://eyes:1"}}
     system.add(replace(worker("synthesizer", "eyes-1"), **eyes, needs=[]))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
+from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Progress
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
@@ -15,19 +16,15 @@ FULL_SCALE = 32768.0
 SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
 
 
-class BadAudio(ValueError):
-    """Bytes that are not audio in the session's encoding."""
-
-
 def decode_pcm(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
     """Convert bytes to samples, shape (n, channels), clipped to [-1, 1].
 
-    Raises ``BadAudio`` if the bytes are not a whole number of sample frames, or a sample is not
+    Raises ``UserError`` if the bytes are not a whole number of sample frames, or a sample is not
     finite.
     """
     frame_bytes = SAMPLE_BYTES[encoding] * num_channels
     if len(pcm) % frame_bytes:
-        raise BadAudio(
+        raise UserError(
             f"{len(pcm)} bytes are not a multiple of {frame_bytes} bytes ({encoding}, channels: "
             f"{num_channels}); send the encoding and channels that the session was opened with"
         )
@@ -36,7 +33,7 @@ def decode_pcm(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float
         return scaled.reshape(-1, num_channels)
     samples = np.frombuffer(pcm, "<f4").astype(np.float32)
     if not np.isfinite(samples).all():
-        raise BadAudio("the chunk was dropped: it contains NaN or infinite samples")
+        raise UserError("the chunk was dropped: it contains NaN or infinite samples")
     return np.clip(samples, -1.0, 1.0).reshape(-1, num_channels)
 
 
