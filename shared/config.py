@@ -54,6 +54,7 @@ PREFIX = "KOUXING_"
 _MAX_FILE_BYTES = 64 << 10
 _MAX_DOTS = 1000  # per line; tomllib's memory grows with the square of a key's parts
 COMMON = "common"  # table of the keys of all services
+_DEFAULT = "default"  # origin of a value that no source sets
 
 
 class BindAddress(Enum):
@@ -94,21 +95,6 @@ class KnownNames:
         if not re.fullmatch(self.pattern, text):
             raise ValueError
         return text
-
-
-@dataclass(frozen=True, slots=True)
-class DependentDefault:
-    """Default factory of a key whose default depends on the value of an earlier key."""
-
-    key: str
-    names: Callable[[], Iterable[str]]  # values of the earlier key whose default may differ
-    default_for: Callable[[str], Any]
-    otherwise: Any
-
-    def __call__(self, values: dict[str, Any]) -> Any:
-        """Return the default for the values of earlier keys."""
-        name = values.get(self.key, "")
-        return self.default_for(name) if name in self.names() else self.otherwise
 
 
 def _check_endpoint(value: str) -> str:
@@ -239,7 +225,7 @@ class Setting:
     @property
     def is_default(self) -> bool:
         """Whether no source sets the key."""
-        return self.origin.startswith("default")
+        return self.origin == _DEFAULT
 
     @property
     def text(self) -> str:
@@ -291,14 +277,15 @@ class Settings:
     ) -> list[Setting]:
         """Return all keys of a service with their current values; raises as ``load``."""
         config, values = self._resolve(config_type, overrides or {})
+        defaults, meanings = config_type(), _key_docstrings(config_type)
         return [
             Setting(
                 key=key,
                 value=getattr(config, key),
-                origin=values[key].origin if key in values else _default_origin(config, field),
-                default=_default(field),
+                origin=values[key].origin if key in values else _DEFAULT,
+                default=getattr(defaults, key),
                 allowed=describe_allowed_values(field),
-                meaning=_key_help(config_type, key),
+                meaning=meanings.get(key, ""),
             )
             for key, field in config_type.model_fields.items()
         ]
@@ -435,33 +422,6 @@ def _as_text(value: object) -> str:
     if isinstance(value, list):
         return " ".join(map(str, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _default(field: FieldInfo) -> object:
-    factory = field.default_factory
-    return factory.otherwise if isinstance(factory, DependentDefault) else field.default
-
-
-def _default_origin(config: ServiceConfig, field: FieldInfo) -> str:
-    factory = field.default_factory
-    if isinstance(factory, DependentDefault):
-        chosen = getattr(config, factory.key)
-        if factory({factory.key: chosen}) != factory.otherwise:
-            return f"default with {factory.key} = {chosen}"
-    return "default"
-
-
-def _key_help(config_type: type[ServiceConfig], key: str) -> str:
-    meaning = _key_docstrings(config_type).get(key, "")
-    factory = config_type.model_fields[key].default_factory
-    if isinstance(factory, DependentDefault):
-        names: dict[float, list[str]] = {}
-        for name in factory.names():
-            if (value := factory.default_for(name)) != factory.otherwise:
-                names.setdefault(value, []).append(name)
-        others = [f"{v:g} with {factory.key} = {' or '.join(n)}" for v, n in names.items()]
-        meaning += f" Other defaults: {', '.join(others)}."
-    return meaning
 
 
 @cache

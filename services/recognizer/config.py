@@ -1,15 +1,20 @@
 """The recognizer's configuration."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
-from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames
+from kouxing.shared.config import BoundEndpoint, KnownNames
 from kouxing.shared.face.config import LiveConfig
 
-_DEFAULT_RULE = OutputRuleConfig()
 MODEL_NAMES = ("blocks", "light", "gmm", "universal")
+
+
+def _rule_of_model(values: Mapping[str, Any]) -> OutputRuleConfig:
+    """Return the default output rule for the values of earlier keys."""
+    return MODEL_RULES.get(values.get("acoustic", ""), OutputRuleConfig())
 
 
 class RecognizerConfig(LiveConfig):
@@ -28,23 +33,15 @@ class RecognizerConfig(LiveConfig):
     """Acoustic model: blocks has the fewest errors, light suits weak machines, and universal knows
     the phones of all languages."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
-        default_factory=DependentDefault(
-            "acoustic",
-            MODEL_RULES.keys,
-            lambda name: MODEL_RULES[name].num_stable_frames,
-            _DEFAULT_RULE.num_stable_frames,
-        )
+        default_factory=lambda values: _rule_of_model(values).num_stable_frames
     )
-    """Consecutive frames that must agree before a phone is emitted (N = 3 in Li 2011)."""
+    """Consecutive frames that must agree before a phone is emitted (N = 3 in Li 2011). Other
+    defaults: 1 with acoustic = light or gmm."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
-        default_factory=DependentDefault(
-            "acoustic",
-            MODEL_RULES.keys,
-            lambda name: MODEL_RULES[name].min_confidence,
-            _DEFAULT_RULE.min_confidence,
-        )
+        default_factory=lambda values: _rule_of_model(values).min_confidence
     )
-    """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011."""
+    """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011. Other
+    defaults: 0.9 with acoustic = light or gmm."""
 
     @property
     def output_rule(self) -> OutputRuleConfig:

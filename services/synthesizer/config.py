@@ -1,23 +1,23 @@
 """The synthesizer's configuration."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from kouxing.services.lip_models import lip_model_info, lip_model_names
-from kouxing.shared.config import BoundEndpoint, DependentDefault, KnownNames
+from kouxing.shared.config import BoundEndpoint, KnownNames
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig, LiveConfig
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 
-_DEFAULT_DELAY_MS = lip_model_info(DEFAULT_LIP_MODEL).delay_ms
 
-
-def _delay_ms(lip_model: str) -> float:
+def _delay_ms(values: Mapping[str, Any]) -> float:
+    """Return the default delay for the values of earlier keys."""
     try:
-        return lip_model_info(lip_model).delay_ms
+        return lip_model_info(values.get("lips", DEFAULT_LIP_MODEL)).delay_ms
     except UserError:  # a broken package; the synthesizer reports it when it loads the lip model
-        return _DEFAULT_DELAY_MS
+        return lip_model_info(DEFAULT_LIP_MODEL).delay_ms
 
 
 class SynthesizerConfig(FaceConfig, LiveConfig):
@@ -31,15 +31,9 @@ class SynthesizerConfig(FaceConfig, LiveConfig):
     """FAP frames per second."""
     lips: Annotated[str, KnownNames(lip_model_names)] = DEFAULT_LIP_MODEL
     """Default lip model. A client can choose another one for its session."""
-    delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(
-        default_factory=DependentDefault(
-            "lips",
-            lip_model_names,
-            _delay_ms,
-            _DEFAULT_DELAY_MS,
-        )
-    )
-    """Delay between a frame's audio and the frame, in steps of 20 ms."""
+    delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(default_factory=_delay_ms)
+    """Delay between a frame's audio and the frame, in steps of 20 ms. Other defaults: 160 with
+    lips = dynamic-visemes or ferguson."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""
     feeling: Annotated[float, Field(ge=0, le=1)] = 0.5

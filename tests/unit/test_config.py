@@ -14,6 +14,7 @@ from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.heads import HEAD_NAMES
 from kouxing.services.lip_models import lip_model_names
 from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.search.output_rule import MODEL_RULES
 from kouxing.services.service_kinds import CONFIG_TYPES, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.config import KnownNames, ServiceConfig, Settings
@@ -75,10 +76,17 @@ def test_a_default_may_depend_on_another_key() -> None:
     given = settings(recognizer__acoustic="gmm")
     (item,) = (one for one in given.describe(RecognizerConfig) if one.key == "num_stable_frames")
     assert (item.value, item.default) == (1, 2)
-    assert item.origin == "default with acoustic = gmm"
+    assert item.is_default
     assert item.meaning.endswith("Other defaults: 1 with acoustic = light or gmm.")
-    delays_ms = {name: settings(synthesizer__lips=name) for name in ("learned", "ferguson")}
-    assert [g.load(SynthesizerConfig).delay_ms for g in delays_ms.values()] == [60.0, 160.0]
+    assert {name for name, rule in MODEL_RULES.items() if rule.num_stable_frames == 1} == {
+        "light",
+        "gmm",
+    }
+    delays_ms = {
+        name: settings(synthesizer__lips=name).load(SynthesizerConfig).delay_ms
+        for name in lip_model_names()
+    }
+    assert delays_ms == {"learned": 60.0, "dynamic-visemes": 160.0, "ferguson": 160.0}
 
 
 @pytest.mark.parametrize(
