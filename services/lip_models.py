@@ -25,21 +25,14 @@ _BUILT_IN = "synthesizer", "lips"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LipModelInfo:
-    """Description of a lip model, available without loading it.
-
-    Attributes
-    ----------
-    delay_ms
-        Default delay: how much later than its audio a frame is made.
-    titles
-        Name for users by language, "en" and "zh".
-    load
-        Loads the lip model, a ``LipModel``, for a language. Only this imports its modules.
-    """
+    """Description of a lip model, available without loading it."""
 
     delay_ms: float
+    """default delay: how much later than its audio a frame is made"""
     titles: Mapping[str, str]
+    """name for users by the languages ``en`` and ``zh``"""
     load: Callable[[PhoneInventory], Any]
+    """loads the lip model, a ``LipModel``, for a language; only this imports its modules"""
 
 
 def lip_models() -> dict[str, LipModelInfo]:

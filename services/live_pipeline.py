@@ -43,25 +43,11 @@ def recognize_events(
 
 
 class LivePipeline:
-    """Computes the FAP frames of one session from its audio.
+    """Computes the FAP frames of one session from its audio, one channel.
 
-    Parameters
-    ----------
-    model
-        The acoustic model.
-    lip_model
-        The lip model, for the acoustic model's language.
-    sample_rate_hz
-        Rate of the audio, one channel.
-    synthesizer
-        Settings of the synthesizer. ``lips`` is ignored.
-    lip_predictor
-        Predicts the lip frames. If None, the recognizer's default predictor.
-
-    Attributes
-    ----------
-    events : list of SoundEvent
-        The events that the recognizer has emitted so far.
+    ``lip_model`` is for the acoustic model's language, so ``synthesizer.lips`` is ignored. If
+    ``lip_predictor`` is None, the recognizer's default predictor is used. ``events`` are the events
+    that the recognizer has emitted so far.
 
     Examples
     --------

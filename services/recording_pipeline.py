@@ -72,20 +72,10 @@ def analyze_recording(
     is_text_known: bool = True,
     with_progress: WithProgress = iter,
 ) -> AnalyzedRecording:
-    """Find the lip frames, voice activity and levels of a recording.
+    """Find the lip frames, voice activity and levels of a recording, 16 kHz mono, shape (n,).
 
-    Parameters
-    ----------
-    samples
-        16 kHz mono, shape (n,).
-    phones
-        The phones of the recording, recognized or of a known text.
-    lip_predictor
-        Predicts the lip frames; None: no lip frames.
-    is_text_known
-        Whether the phones come from a known text.
-    with_progress
-        Wraps the loop to show progress.
+    ``phones`` are recognized, or come from a known text. Without ``lip_predictor``, there are no
+    lip frames. ``with_progress`` wraps the loop to show progress.
     """
     lip_stream = None
     if lip_predictor is not None:

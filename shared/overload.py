@@ -29,12 +29,8 @@ ADAPTATION = 0.1  # fraction of the lateness to ignore if the newest audio is ju
 class SkipPolicy:
     """Decides when one live session skips audio. Times are in seconds, on any monotonic clock.
 
-    Parameters
-    ----------
-    max_lag_s
-        Maximum delay of the session. It may be exceeded for ``MAX_LATE_FOR_S``.
-    start_s
-        Time from which the session may skip audio. A moved session first catches up.
+    ``max_lag_s`` is the maximum delay of the session. It may be exceeded for ``MAX_LATE_FOR_S``.
+    From ``start_s`` on, the session may skip audio. A moved session first catches up.
     """
 
     def __init__(self, max_lag_s: float, start_s: float = -math.inf) -> None:

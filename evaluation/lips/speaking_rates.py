@@ -172,7 +172,7 @@ def _methods(
     table = load_table(inventory)
     by_endpoints = time_text(measure_slices(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
-        yield name, _curves_of(build_key_frames(timed, table, inventory.silence))
+        yield name, _curves_of(build_key_frames(timed, table))
     delays_s = {name: lip_model_info(name).delay_ms / 1e3 for name in lip_models()}
     events = live_events(model, samples, load_lip_predictor(), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():

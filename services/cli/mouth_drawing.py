@@ -145,7 +145,7 @@ def draw_mouth(
         samples=samples,
         phones=phones,
         syllables=write_syllables(phones, transcript, inventory),
-        key_frames=build_key_frames(phones, load_table(inventory), inventory.silence),
+        key_frames=build_key_frames(phones, load_table(inventory)),
         widths=widths,
         inventory=inventory,
     )
@@ -221,9 +221,7 @@ def _key_frame_mouths(
 ) -> list[drawing.LabeledMouth]:
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
-    anchors = build_anchors(mouth.phones, mouth.inventory.silence) or [
-        (0.0, mouth.inventory.silence)
-    ]
+    anchors = build_anchors(mouth.phones) or [(0.0, mouth.inventory.silence)]
     write = mouth.inventory.write
     middles_s = {phone.onset_s: phone.onset_s + phone.duration_s / 2 for phone in mouth.phones}
     widths = mouth.widths_at([middles_s.get(time_s, time_s) for time_s, _ in anchors])

@@ -37,12 +37,8 @@ class HopController:
     low expected load. It also increases while a session is behind, because other programs use the
     processor. It increases after one period and decreases after several.
 
-    Parameters
-    ----------
-    work
-        The work so far, which does not count toward the load.
-    now_s
-        The time, in seconds, on any monotonic clock.
+    ``work`` is the work so far, which does not count toward the load. Times are in seconds, on any
+    monotonic clock.
     """
 
     def __init__(self, work: ProcessorTime, now_s: float) -> None:

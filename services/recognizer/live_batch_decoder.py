@@ -19,22 +19,10 @@ NETWORK_WEIGHT = 0.25  # weight of the block network's time in the load of the s
 class LiveBatchDecoder:
     """Decodes live audio in batches. The load determines the hop of the block network.
 
-    Parameters
-    ----------
-    sessions
-        All sessions of the service.
-    recognizer
-        Decodes the streams of the sessions.
-    load_meter
-        Measures the load of the service; the network's time counts less.
-    wake
-        Called on the network's thread when sessions are decoded.
-    on_early
-        Called with a session whose lips are ready before its phones.
-    on_decoded
-        Called with the decoded sessions.
-    on_batch
-        Called after each batch.
+    ``sessions`` are all sessions of the service. In ``load_meter``, the network's time counts less.
+    The network's thread calls ``wake`` when sessions are decoded. ``on_early`` gets a session whose
+    lips are ready before its phones, and ``on_decoded`` the decoded sessions. ``on_batch`` is
+    called after each batch.
     """
 
     def __init__(

@@ -16,14 +16,8 @@ class NetworkThread:
     """Decodes sessions whose next audio is due for the block network (``waits_for_network``).
 
     While a session is on the thread (``is_scoring``), other threads may only use its stream as
-    ``SpeechStream.start_scoring`` describes, so that lips do not wait for the network.
-
-    Parameters
-    ----------
-    recognizer
-        Decodes the streams.
-    on_decoded
-        Called on the thread when sessions are decoded.
+    ``SpeechStream.start_scoring`` describes, so that lips do not wait for the network. The thread
+    calls ``on_decoded`` when sessions are decoded.
     """
 
     def __init__(self, recognizer: Recognizer, on_decoded: Callable[[], None]) -> None:

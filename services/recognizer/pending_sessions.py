@@ -13,12 +13,7 @@ from kouxing.shared.wire.face import FaceSettings
 class PendingSessions:
     """Queues sessions while a thread loads their acoustic model.
 
-    Parameters
-    ----------
-    language
-        The language of the model that is loaded already.
-    on_loaded
-        Called on the thread when a model is loaded.
+    The model for ``language`` is loaded already. The thread calls ``on_loaded`` after each model.
     """
 
     def __init__(self, language: str, on_loaded: Callable[[], None]) -> None:

@@ -64,20 +64,11 @@ class Recognizer:
     ) -> SpeechStream:
         """Create the stream of one session.
 
-        Parameters
-        ----------
-        sample_rate_hz, num_channels
-            Of the audio: 8000 to 48000 Hz; channels are averaged.
-        lip_predictor
-            Predicts lip frames. Without it, there are no lip frames.
-        face_delay_s
-            Delay of the face behind the audio. The lip frames get the longest delay that is in
-            time for the face.
-        speech_time
-            Media time at which current speech started, samples at 16 kHz, if another recognizer
-            processed its start. The networks' blocks then align with the other recognizer's.
-        language
-            Name of the language of the phones, as for :meth:`model_of`.
+        The rate is 8000 to 48000 Hz; channels are averaged. Without ``lip_predictor``, there are no
+        lip frames. Otherwise, they get the longest delay that is in time for a face with the delay
+        ``face_delay_s``. ``speech_time`` is the media time, samples at 16 kHz, at which the current
+        speech started at another recognizer. The networks' blocks then align with the other
+        recognizer's. ``language`` is as for :meth:`model_of`.
 
         Raises ``UserError`` if the rate or the channels are out of range, or no model has the
         language.

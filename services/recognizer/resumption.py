@@ -24,6 +24,7 @@ from kouxing.shared.phones.events import (
     Waveform,
 )
 from kouxing.shared.phones.final_time import FinalTimeTracker
+from kouxing.shared.phones.inventory import SILENCE
 
 WARM_UP_S = 2.8  # duration of the reprocessed audio; docs/recognition.md explains the choice
 # Audio starts at a multiple of this time. Network blocks and positions divide it, so they are
@@ -61,9 +62,8 @@ class ReplayWindow:
 class ResumeFilter:
     """Drops results before ``time_s``, which are already known. The middle of a phone counts."""
 
-    def __init__(self, time_s: float, silence: str) -> None:
+    def __init__(self, time_s: float) -> None:
         self._time_s = time_s
-        self._silence = silence
         self._emitted: set[int] = set()  # indices of phones that were emitted, not yet final
         self._is_speaking = False  # at ``time_s``, if known
         self._is_aligned = False
@@ -129,4 +129,4 @@ class ResumeFilter:
             self._emitted.add(phone.index)
         if is_new or (was_emitted and not phone.final):
             return phone
-        return replace(phone, symbol=self._silence, duration_s=0.0) if was_emitted else None
+        return replace(phone, symbol=SILENCE, duration_s=0.0) if was_emitted else None

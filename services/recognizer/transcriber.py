@@ -13,12 +13,10 @@ from kouxing.shared.errors import UserError, install_command
 class Transcriber:
     """Transcribes Mandarin with a model that the user provides.
 
-    Parameters
-    ----------
-    folder
-        A model as sherpa-onnx distributes it: ``tokens.txt``, and either encoder, decoder and
-        joiner (a transducer), or one model in a folder whose name contains ``paraformer`` or
-        ``sense-voice``. Of several files, the smallest is used, which has 8-bit weights.
+    ``folder`` contains a model as sherpa-onnx distributes it: ``tokens.txt``, and either encoder,
+    decoder and joiner (a transducer), or one model. In the second case, the name of the folder
+    contains ``paraformer`` or ``sense-voice``. Of several files, the smallest is used, which has
+    8-bit weights.
 
     Raises ``UserError`` if sherpa-onnx is not installed, or the folder does not contain a valid
     model.

@@ -178,7 +178,7 @@ def test_training_recovers_the_openings() -> None:
     true = dataclasses.replace(
         TABLE, opening={**TABLE.opening, "b": 0.0, "a": 5.0, "i": 1.5, "d": 2.5}
     )
-    opening = build_key_frames(phones, true, INVENTORY.silence).openings_at(time_s)
+    opening = build_key_frames(phones, true).openings_at(time_s)
     clip = clip_of(time_s, opening_to_faps(opening))
     relative = relative_openings([clip])[0]
     scale = 5.0 / np.percentile(opening, 98)  # the speaker's widest opening is 5

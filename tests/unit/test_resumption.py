@@ -55,7 +55,7 @@ def recognize(
 @pytest.fixture(scope="module")
 def whole(model: AcousticModel) -> list[list[StreamOutput]]:
     """The results of a session without a loss."""
-    return recognize(model, 0, ResumeFilter(0.0, "sil"))
+    return recognize(model, 0, ResumeFilter(0.0))
 
 
 def state_at_loss(
@@ -82,7 +82,7 @@ def test_two_recognizers_emit_the_phones_of_one(
 ) -> None:
     before, final_s, begin = state_at_loss(whole, lost_s)
     assert 0.0 < final_s < lost_s
-    after = [*chain.from_iterable(recognize(model, begin, ResumeFilter(final_s, "sil")))]
+    after = [*chain.from_iterable(recognize(model, begin, ResumeFilter(final_s)))]
     expected = final_phones([*chain.from_iterable(whole)])
     phones = final_phones(before) + final_phones(after)
     assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
@@ -98,7 +98,7 @@ def test_phones_come_as_early_as_without_a_loss(
     (start_s,) = (
         output.time_s for output in before if isinstance(output, SpeechChange) and output.active
     )
-    after = recognize(model, begin, ResumeFilter(final_s, "sil"), to_samples(start_s))
+    after = recognize(model, begin, ResumeFilter(final_s), to_samples(start_s))
     from_s = final_s + 0.3
     expected = first_chunks(whole[begin // CHUNK :], from_s)
     actual = first_chunks(after, from_s)
@@ -119,7 +119,7 @@ def first_chunks(outputs: Sequence[Sequence[StreamOutput]], from_s: float) -> li
 
 
 def test_withdraws_a_phone_that_turns_out_to_be_known() -> None:
-    resumption = ResumeFilter(1.0, "sil")
+    resumption = ResumeFilter(1.0)
     first, revised = (phone(0, 0.98, 0.1, final=False), phone(0, 0.8, 0.1, final=False))
     assert resumption.new_results([first])[1:] == [first]
     assert resumption.new_results([revised]) == [revised]  # it may change again
@@ -129,7 +129,7 @@ def test_withdraws_a_phone_that_turns_out_to_be_known() -> None:
 
 
 def test_aligns_the_first_audio_with_the_grid() -> None:
-    resumption = ResumeFilter(5.0, "sil")
+    resumption = ResumeFilter(5.0)
     samples = np.zeros((8820, 1), np.float32)
     media_time, rest = resumption.align((to_samples(1.0), samples), 44_100)
     assert media_time % to_samples(GRID_S) == 0

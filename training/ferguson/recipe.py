@@ -198,7 +198,7 @@ def measure_travel(clips: Sequence[LipClip]) -> Array:
 
 def _opening_weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneInventory) -> Array:
     """Compute the weight of each phone's opening in R at some times, (num_times, num_phones)."""
-    anchors = build_anchors(phones, inventory.silence)
+    anchors = build_anchors(phones)
     weights = np.zeros((len(times_s), len(inventory)))
     anchors_s = [time_s for time_s, _ in anchors]
     for number, (_, symbol) in enumerate(anchors):

@@ -41,15 +41,17 @@ def clip_state(state: FapState, lowest: Array, highest: Array) -> FapState:
 class Transition:
     """Blends two trajectories: their difference decays along a cubic, with one duration per FAP."""
 
-    difference: FapState
+    difference: FapState  # at ``start_s``
     duration_s: Array
+    start_s: float = 0.0
     longest_s: float = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "longest_s", float(self.duration_s.max()))
 
-    def at(self, elapsed_s: float) -> FapState:
-        """Return the remaining difference after ``elapsed_s``."""
+    def at(self, time_s: float) -> FapState:
+        """Return the remaining difference."""
+        elapsed_s = time_s - self.start_s
         if elapsed_s >= self.longest_s:
             return stationary_state(np.zeros(len(self.duration_s)))
         u = np.minimum(elapsed_s / self.duration_s, 1.0)
@@ -57,10 +59,11 @@ class Transition:
             -6.0 * u * self.difference.value / self.duration_s
             + (1.0 - 3.0 * u) * self.difference.velocity
         )
-        return FapState(self.value_at(elapsed_s), velocity)
+        return FapState(self.value_at(time_s), velocity)
 
-    def value_at(self, elapsed_s: float) -> Array:
+    def value_at(self, time_s: float) -> Array:
         """Return the value of the remaining difference."""
+        elapsed_s = time_s - self.start_s
         if elapsed_s >= self.longest_s:
             return np.zeros(len(self.duration_s))
         u = np.minimum(elapsed_s / self.duration_s, 1.0)
@@ -72,7 +75,9 @@ class Transition:
         return value
 
 
-NO_TRANSITION = Transition(stationary_state(np.zeros(NUM_MOUTH_FAPS)), np.ones(NUM_MOUTH_FAPS))
+NO_TRANSITION = Transition(
+    stationary_state(np.zeros(NUM_MOUTH_FAPS)), np.ones(NUM_MOUTH_FAPS), -np.inf
+)
 
 
 class RestTransition:

@@ -112,7 +112,7 @@ class VisemeStream:
         self._current = self._timeline  # with open phone extended and late closures moved
         self._active = self._timeline  # visemes that act at the time of the last frame
         self._sequence = build_sequence_parameters(parameters, self._timeline)
-        self._transition, self._transition_start_s = NO_TRANSITION, start_s
+        self._transition = NO_TRANSITION
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # set while media time does not advance
         self._time_s = start_s  # time of the last frame
@@ -151,10 +151,10 @@ class VisemeStream:
         *start, target = states_at(self._parameters, active, times_s, self._sequence)
         if start:
             self._start_transition(*start)
-        transition, elapsed_s = self._transition, time_s - self._transition_start_s
+        transition = self._transition
         # most frames need no velocity
-        self._mouth = lambda: self._clip_to_hull(target + transition.at(elapsed_s))
-        faps = self._clip(target.value + transition.value_at(elapsed_s))
+        self._mouth = lambda: self._clip_to_hull(target + transition.at(time_s))
+        faps = self._clip(target.value + transition.value_at(time_s))
         self._time_s = time_s
         self._closures.record_closures(active, time_s, faps)
         return self._frame(faps)
@@ -176,11 +176,12 @@ class VisemeStream:
         """Start a transition from the current mouth to ``target`` on the target trajectory."""
         requested_s = self._pending_s or _TRANSITION_S
         duration_s = _SLOW_TRANSITION_S if self._rest is not None else requested_s
+        durations_s = np.full(NUM_MOUTH_FAPS, duration_s)
         self._transition = Transition(
             self._mouth() - target,
-            self._closures.shorten(np.full(NUM_MOUTH_FAPS, duration_s), self._active, self._time_s),
+            self._closures.shorten(durations_s, self._active, self._time_s),
+            self._time_s,
         )
-        self._transition_start_s = self._time_s
         self._pending_s = self._rest = None
 
     def _clip_to_hull(self, state: FapState) -> FapState:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kouxing.services.synthesizer.lips.ferguson.phone_table import PhoneTable
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import SILENCE
 
 Array = NDArray[np.float64]
 
@@ -35,23 +36,23 @@ class KeyFrames:
         return openings
 
 
-def build_anchors(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]:
+def build_anchors(phones: Sequence[Phone]) -> list[tuple[float, str]]:
     """Return ascending times at which the mouth has the opening of a phone.
 
-    ``phones`` are sorted by time; gaps and ``silence``, the phone of a closed mouth, are pauses.
+    ``phones`` are sorted by time. Gaps and silence are pauses, with a closed mouth.
     """
-    spoken = [phone for phone in phones if phone.symbol != silence]
+    spoken = [phone for phone in phones if phone.symbol != SILENCE]
     anchors: list[tuple[float, str]] = []
     end_s = -np.inf
     for phone in spoken:
         if phone.onset_s - end_s > PAUSE_S:
             if anchors:
-                anchors.append((end_s, silence))
-            anchors.append((phone.onset_s - OPENING_TIME_S, silence))
+                anchors.append((end_s, SILENCE))
+            anchors.append((phone.onset_s - OPENING_TIME_S, SILENCE))
         anchors.append((phone.onset_s, phone.symbol))
         end_s = phone.onset_s + phone.duration_s
     if spoken:
-        anchors.append((end_s, silence))
+        anchors.append((end_s, SILENCE))
     rising: list[tuple[float, str]] = []
     for time_s, symbol in anchors:
         if not rising or time_s >= rising[-1][0] + _MIN_STEP_S:
@@ -59,9 +60,9 @@ def build_anchors(phones: Sequence[Phone], silence: str) -> list[tuple[float, st
     return rising
 
 
-def build_key_frames(phones: Sequence[Phone], table: PhoneTable, silence: str) -> KeyFrames:
+def build_key_frames(phones: Sequence[Phone], table: PhoneTable) -> KeyFrames:
     """Build key frames from ``build_anchors``; without phones, the mouth is closed."""
-    anchors = build_anchors(phones, silence) or [(0.0, silence)]
+    anchors = build_anchors(phones) or [(0.0, SILENCE)]
     return KeyFrames(
         np.array([time_s for time_s, _ in anchors]),
         np.array([table.opening[symbol] for _, symbol in anchors]),

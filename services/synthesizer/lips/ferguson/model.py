@@ -114,7 +114,7 @@ class FergusonStream:
         self._has_ended = True  # whether speech has ended
         self._has_expected = False  # whether the key frames end with an expected phone
         self._key_frames = KeyFrames(np.zeros(1), np.zeros(1))
-        self._transition, self._transition_start_s = NO_TRANSITION, start_s
+        self._transition = NO_TRANSITION
         self._pending_s: float | None = None  # duration of the transition for new events
         self._rest: RestTransition | None = None  # set while media time does not advance
         self._time_s = start_s  # time of the last frame
@@ -159,11 +159,11 @@ class FergusonStream:
         if self._pending_s is not None or self._rest is not None:
             duration_s = _SLOW_TRANSITION_S if self._rest is not None else self._pending_s
             difference = self._mouth - self._target_at(self._time_s)
-            self._transition = Transition(difference, np.full(NUM_MOUTH_FAPS, duration_s))
-            self._transition_start_s = self._time_s
+            self._transition = Transition(
+                difference, np.full(NUM_MOUTH_FAPS, duration_s), self._time_s
+            )
             self._pending_s = self._rest = None
-        difference = self._transition.at(time_s - self._transition_start_s)
-        self._mouth = _clip_to_limits(self._target_at(time_s) + difference)
+        self._mouth = _clip_to_limits(self._target_at(time_s) + self._transition.at(time_s))
         self._time_s = time_s
         return MouthFrame(self._mouth.value, self._articulation(phones))
 
@@ -224,8 +224,8 @@ class FergusonStream:
 
     def _make_key_frames(self, phones: Sequence[Phone]) -> KeyFrames:
         """Return the key frames of the known phones, followed by those of an expected phone."""
-        silence, opening = self._model.inventory.silence, self._model.table.opening
-        frames = [(time_s, opening[symbol]) for time_s, symbol in build_anchors(phones, silence)]
+        opening = self._model.table.opening
+        frames = [(time_s, opening[symbol]) for time_s, symbol in build_anchors(phones)]
         expected: list[tuple[float, float]] = []
         if not self._has_ended and not self._is_silent_after(phones):
             expected = self._expected_key_frames(frames, phones)

@@ -114,7 +114,7 @@ class LearnedStream:
         self._known_s = start_s  # end of the audio on which the newest lip frame depends
         self._track = LipTrack(self._neutral)
         self._on_track = stationary_state(self._neutral)  # the track at the last frame
-        self._transition, self._transition_start_s = NO_TRANSITION, start_s
+        self._transition = NO_TRANSITION
         self._rest: RestTransition | None = None  # set while media time does not advance
         self._resting = RestingLips()
         self._ajar = 0.0  # fraction of the ajar mouth at the last frame
@@ -193,14 +193,13 @@ class LearnedStream:
                 self._start_transition(now, _SLOW_TRANSITION_S)
             elif _is_different(self._on_track, now):
                 self._start_transition(now, _TRANSITION_S)
-        difference = self._transition.at(time_s - self._transition_start_s)
         self._on_track = self._track.at(time_s)
-        self._mouth = self._on_track + difference
+        self._mouth = self._on_track + self._transition.at(time_s)
 
     def _start_transition(self, target: FapState, duration_s: float) -> None:
         """Start a transition from the current mouth to a target."""
-        self._transition = Transition(self._mouth - target, np.full(NUM_MOUTH_FAPS, duration_s))
-        self._transition_start_s = self._time_s
+        durations_s = np.full(NUM_MOUTH_FAPS, duration_s)
+        self._transition = Transition(self._mouth - target, durations_s, self._time_s)
         self._rest = None
 
     def _extend_track(self, time_s: float) -> None:
