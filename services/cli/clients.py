@@ -12,11 +12,13 @@ import typer
 from rich.console import Console
 
 from kouxing.services.cli.options import (
+    SPEECH_FORMATS,
     AudioTrack,
     Language,
     ListenFormat,
     MouthFile,
     PhoneAlphabet,
+    reject_options,
 )
 from kouxing.services.cli.running_system import RunningSystem, find_control, other_systems
 from kouxing.services.service_kinds import read_settings
@@ -101,20 +103,17 @@ def speak(
     from kouxing.shared.sound_devices import open_microphone, open_monitor
 
     profile = b"" if mouth is None else read_mouth_profile(mouth)
-    if device and source not in ("mic", "monitor"):
-        raise UserError("--device applies to mic and monitor: kouxing speak mic --device NAME")
-    if source in ("mic", "monitor") and (raw or rate or channels or track):
-        raise UserError(
-            f"--raw, --rate, --channels and --track do not apply to {source}; leave them out"
-        )
-    if source in ("mic", "monitor") and fast:
-        raise UserError(
-            f"--fast does not apply to {source}: its sound arrives in real time; leave it out"
-        )
-    if (rate or channels) and not raw:
-        raise UserError("--rate and --channels apply to raw samples; add --raw")
-    if raw and track is not None:
-        raise UserError("--track does not apply to raw samples; leave out --raw or --track")
+    if source in ("mic", "monitor"):
+        reject_options(
+            f"does not apply to {source}; leave it out",
+            fast=fast, raw=raw, rate=rate, channels=channels, track=track,
+        )  # fmt: skip
+    else:
+        reject_options("applies to mic and monitor: kouxing speak mic --device", device=device)
+    if raw:
+        reject_options("does not apply to raw samples; leave it out", track=track)
+    else:
+        reject_options("applies to raw samples; add --raw", rate=rate, channels=channels)
     if source == "mic":
         audio = open_microphone(device)
     elif source == "monitor":
@@ -187,6 +186,12 @@ def listen(
     """
     from kouxing.services.cli.follow import follow
 
+    if form is not ListenFormat.PHONES:
+        reject_options("applies to phones; add --as phones", alphabet=alphabet)
+    if form in SPEECH_FORMATS:
+        reject_options(f"does not apply to {form}, which are only printed", output=output)
+    if form is ListenFormat.LIVELINK and output is None:
+        raise UserError("--as livelink is a table; add --output face.csv")
     check_output(output, force=force)
     with find_control_address(control) as endpoint:
         follow(_session_name(session), output, form, endpoint, alphabet)

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from kouxing.services.cli.options import ConfigFile, ServiceAssignments
+from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.shared.config import parse_assignments
 from kouxing.shared.errors import UserError, install_command
@@ -20,7 +20,7 @@ def cluster(
     recognizers: NumWorkers = None,
     synthesizers: NumWorkers = None,
     config: ConfigFile = None,
-    assignments: ServiceAssignments = None,
+    assignments: Assignments = None,
 ) -> None:
     """Scale the workers on a Ray cluster to the given numbers, then list them."""
     settings = read_settings(config, parse_assignments(assignments or []))

@@ -15,7 +15,7 @@ from kouxing.services.cli.curve_exporters import (
     FrameStream,
     json_line,
 )
-from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
+from kouxing.services.cli.options import SPEECH_FORMATS, CurveFormat, ExportOptions, ListenFormat
 from kouxing.services.cli.streaming import missed_warning
 from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import to_seconds
@@ -47,15 +47,9 @@ def follow(
 
     The frames go to ``output``. Without it, they are printed, or syllables, or phones in an
     ``alphabet``. Raises ``UserError`` if control does not answer, the file cannot be written, or
-    the options do not fit each other.
+    its format does not fit ``form``.
     """
-    if alphabet is not None and form is not ListenFormat.PHONES:
-        raise UserError("--alphabet applies to phones; add --as phones")
-    is_speech = form in (ListenFormat.PHONES, ListenFormat.SYLLABLES)
-    if is_speech and output is not None:
-        raise UserError(f"--as {form} is only printed; leave out --output")
-    if form is ListenFormat.LIVELINK and output is None:
-        raise UserError("--as livelink is a table; add --output face.csv")
+    is_speech = form in SPEECH_FORMATS
     curve_form = None if form is None or is_speech else CurveFormat(form)
     exporter = None if output is None else _open_exporter(output, curve_form)
     with connect_client(control) as client:

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import inspect
 import os
 import re
 import sys
@@ -24,6 +25,7 @@ from kouxing.shared.interrupt import clear_interrupt, is_interrupted
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.terminal import CONSOLE
 
+_LINE_END = re.compile(r"(?<!\n)\n(?!\n)")  # within a paragraph
 ENTRY_POINTS = "kouxing.commands"  # such as training and evaluation
 _VALUE_NAMES = {"bool": "", "str": "TEXT", "path": "PATH", "int": "NUMBER", "float": "NUMBER"}
 _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
@@ -51,9 +53,7 @@ class CommandGroup(TyperGroup):
             self._add_entry_points()
         command = super().get_command(ctx, cmd_name)
         if command is not None:
-            _name_values(command.get_params(ctx), ctx)
-            for subcommand in getattr(command, "commands", {}).values():
-                _name_values(subcommand.get_params(ctx), ctx)
+            _simplify_help(command, ctx)
         return command
 
     def get_params(self, ctx: Any) -> Any:
@@ -69,6 +69,14 @@ class CommandGroup(TyperGroup):
                 command.name = entry_point.name
                 command.rich_help_panel = command.rich_help_panel or Panel.MEASURE
                 self.add_command(command)
+
+
+def _simplify_help(command: Any, ctx: Any) -> None:
+    """Let the help of a command and of its subcommands fill the lines, without Python's types."""
+    command.help = command.help and _LINE_END.sub(" ", inspect.cleandoc(command.help))
+    _name_values(command.get_params(ctx), ctx)
+    for subcommand in getattr(command, "commands", {}).values():
+        _simplify_help(subcommand, ctx)
 
 
 def _name_values(parameters: Any, ctx: Any) -> None:

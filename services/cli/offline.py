@@ -21,6 +21,7 @@ from kouxing.services.cli.options import (
     PhoneAlphabet,
     TimingMethod,
     WidthSource,
+    reject_options,
 )
 from kouxing.services.driver.config import Framing
 from kouxing.services.heads import DEFAULT_HEAD
@@ -189,8 +190,9 @@ def render(
         from kouxing.services.cli.exporters import open_exporter
 
         if has_motion(source):
-            _check_no_sound_options(
-                source, lips=lips, live=live or None, text=text, mouth=mouth, language=language,
+            reject_options(
+                f"applies to sound; {source} already contains the lip motion",
+                lips=lips, live=live, text=text, mouth=mouth, language=language,
                 expressiveness=expressiveness, track=track, captions=captions,
             )  # fmt: skip
         elif sound is not None:
@@ -221,12 +223,6 @@ def render(
     process_all(pairs, render_file)
     if wrong_texts:
         raise typer.Exit(1)
-
-
-def _check_no_sound_options(source: Path, **options: object) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise UserError(f"--{name} applies to sound; {source} already contains the lip motion")
 
 
 def phones(

@@ -9,6 +9,7 @@ import typer
 
 from kouxing.services.driver.config import Framing
 from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
+from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
 from kouxing.shared.phones.alphabets import Alphabet
@@ -70,12 +71,10 @@ ConfigFile = Annotated[
 ]
 Assignments = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set one key of the service; repeatable."),
-]
-ServiceAssignments = Annotated[
-    list[str] | None,
     typer.Option(
-        "--set", metavar="SERVICE.KEY=VALUE", help="Set one key of a service; repeatable."
+        "--set",
+        metavar="[SERVICE.]KEY=VALUE",
+        help="Set one key; repeatable. The service can be left out if there is only one.",
     ),
 ]
 
@@ -104,6 +103,9 @@ class ListenFormat(StrEnum):
     PHONES = "phones"
 
 
+SPEECH_FORMATS = (ListenFormat.SYLLABLES, ListenFormat.PHONES)
+
+
 class CaptionKind(StrEnum):
     """Content of a video's captions."""
 
@@ -125,6 +127,13 @@ class TimingMethod(StrEnum):
 
     ENDPOINTS = "endpoints"  # energy and zero crossings
     ALIGN = "align"  # forced alignment with the acoustic model
+
+
+def reject_options(reason: str, **options: object) -> None:
+    """Raise ``UserError`` with a reason if one of the named options was given."""
+    for name, value in options.items():
+        if value not in (None, False, ""):
+            raise UserError(f"--{name.replace('_', '-')} {reason}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kouxing.services.cli.heads import ensure_page_heads
-from kouxing.services.cli.options import AudioTrack, ConfigFile, HeadName, ServiceAssignments
+from kouxing.services.cli.options import (
+    Assignments,
+    AudioTrack,
+    ConfigFile,
+    HeadName,
+    reject_options,
+)
 from kouxing.services.cli.running_system import (
     announce_system,
     lock_output_folder,
@@ -69,13 +75,13 @@ def run(
             " takes over immediately if one fails.",
         ),
     ] = 1,
-    assignments: ServiceAssignments = None,
+    assignments: Assignments = None,
 ) -> None:
     """Run all services on this machine, and restart any that crashes or hangs."""
     from kouxing.services.cli.supervisor import Supervisor
 
-    if play is None and (stop_after or track is not None):
-        raise UserError("--stop-after and --track need a file: kouxing run --play my.wav")
+    if play is None:
+        reject_options("needs --play FILE", stop_after=stop_after, track=track)
     chosen_port = {} if port is None else {"gateway.port": str(port)}
     given = parse_assignments(assignments or []) | chosen_port
     settings = read_settings(config, given)

@@ -161,7 +161,7 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["listen", "two words"], "letters, digits"),
         (["listen", "heard", "-o", "face.txt"], ".jsonl"),
         (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "this format holds faps"),
-        (["listen", "heard", "--as", "phones", "-o", "a.csv"], "is only printed"),
+        (["listen", "heard", "--as", "phones", "-o", "a.csv"], "--output does not apply to phones"),
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
         (["send", "http://127.0.0.1"], "write vmc://HOST"),
