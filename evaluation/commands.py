@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from kouxing.corpora.options import (
     Clips,
@@ -17,7 +16,9 @@ from kouxing.corpora.options import (
     OptionalSounds,
     Picture,
 )
-from kouxing.evaluation.system.commands import SENTENCE, attacks, faults
+from kouxing.evaluation.source_tree import SAMPLE
+from kouxing.evaluation.system.commands import attacks, faults
+from kouxing.evaluation.tables import figures_table, show_results
 from kouxing.services.cli.options import ACOUSTIC_MODEL
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import (
@@ -26,7 +27,6 @@ from kouxing.shared.terminal import (
     check_output,
     plural,
     print_message,
-    write_json,
 )
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def recognizer(
         held_out_music,
     )
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
-    from kouxing.evaluation.recognizer.report import print_figures
+    from kouxing.evaluation.report.recognition_table import speech_table
 
     check_output(json_file, inputs=[corpus], force=force)
     check_conditions(conditions or ())
@@ -99,8 +99,7 @@ def recognizer(
         name: {"split": split, **evaluate_recognizer(model, references, disturbances, rule)}
         for name, model, rule in models
     }
-    print_figures(results, split, Console())
-    write_json(json_file, results)
+    show_results(json_file, results, speech_table(results))
 
 
 @app.command(rich_help_panel=_RECOGNITION)
@@ -118,15 +117,15 @@ def languages(
     """
     from kouxing.corpora.speech_corpus import LANGUAGES
     from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
-    from kouxing.evaluation.recognizer.languages import evaluate_languages, print_languages
+    from kouxing.evaluation.recognizer.languages import evaluate_languages
+    from kouxing.evaluation.report.recognition_table import speech_table
     from kouxing.evaluation.rivals.tables import FOLDER
 
     check_output(json_file, force=force)
     ((_, model, rule),) = _models(["universal"])
     references = align_corpus(model, LANGUAGES, "test", audio)
     results = evaluate_languages(references, rule, with_hama=(FOLDER / ".venv").exists())
-    print_languages(results, Console())
-    write_json(json_file, results)
+    show_results(json_file, results, speech_table(results))
 
 
 @app.command(rich_help_panel=_RECOGNITION)
@@ -149,11 +148,8 @@ def voice(
         disturbances_for,
         held_out_music,
     )
-    from kouxing.evaluation.recognizer.voice_activity import (
-        evaluate_voice,
-        labeled_audio,
-        print_voice,
-    )
+    from kouxing.evaluation.recognizer.voice_activity import evaluate_voice, labeled_audio
+    from kouxing.evaluation.report.recognition_table import voice_table
 
     check_output(json_file, inputs=[corpus], force=force)
     ((name, model, _),) = _models(None)
@@ -162,9 +158,8 @@ def voice(
     references = align_corpus(model, corpus, split)
     disturbances = disturbances_for(references, music, (MUSIC, BABBLE))
     materials = labeled_audio(references, disturbances, music, recorded)
-    results = evaluate_voice({name: model}, materials)
-    print_voice(results, split, Console())
-    write_json(json_file, results)
+    results = evaluate_voice(model, materials)
+    show_results(json_file, {name: results}, voice_table(results))
 
 
 @app.command(rich_help_panel=_SYSTEM)
@@ -175,13 +170,12 @@ def face(
 ) -> None:
     """Measure the motion of a face apart from its lips: feeling, nods, brows, blinks, stillness."""
     from kouxing.corpora.emotions import read_emotions
-    from kouxing.evaluation.face_motion import measure_face, print_face
+    from kouxing.evaluation.face_motion import measure_face
     from kouxing.services.recognizer.acoustic.load import load_model
 
     check_output(json_file, force=force)
-    figures = measure_face(load_model("light"), read_emotions(recordings))
-    print_face(figures, Console())
-    write_json(json_file, asdict(figures))
+    results = asdict(measure_face(load_model("light"), read_emotions(recordings)))
+    show_results(json_file, results, figures_table({"value": results}))
 
 
 def _read_sounds(folders: list[Path] | None) -> list[Sound]:
@@ -232,8 +226,8 @@ def lips(
     explains how to score another program.
     """
     from kouxing.evaluation.lips.lip_scores import CONDITIONS, score_lips
-    from kouxing.evaluation.lips.lip_table import print_scores
     from kouxing.evaluation.recognizer.disturbances import check_conditions, held_out_music
+    from kouxing.evaluation.report.lip_tables import scores_table
 
     check_output(json_file, force=force)
     if tables and delay_ms and not lips:
@@ -242,8 +236,7 @@ def lips(
     check_conditions(conditions, CONDITIONS)
     music = held_out_music(_read_sounds(sounds))
     results = score_lips(clips, lips or (), delay_ms or (), music, conditions, tables or ())
-    print_scores(results, Console())
-    write_json(json_file, results)
+    show_results(json_file, results, scores_table(results))
 
 
 @app.command(name="lips-package", rich_help_panel=_LIPS)
@@ -257,12 +250,12 @@ def lips_package(
 
     Needs Node.
     """
-    from kouxing.evaluation.system.lips_package import compare, show
+    from kouxing.evaluation.report.system_tables import system_table
+    from kouxing.evaluation.system.lips_package import compare
 
     check_output(json_file, force=force)
-    comparison = compare(clips, corpus)
-    show(comparison, Console())
-    write_json(json_file, asdict(comparison))
+    results = asdict(compare(clips, corpus))
+    show_results(json_file, results, system_table(package=results))
 
 
 @app.command(name="pack-clips", rich_help_panel=_LIPS)
@@ -326,7 +319,8 @@ def report(
     """
     from kouxing.evaluation.report.page import write_page
     from kouxing.evaluation.report.run import run_steps
-    from kouxing.evaluation.report.steps import ROOT, STEPS
+    from kouxing.evaluation.report.steps import STEPS
+    from kouxing.evaluation.source_tree import ROOT
 
     unknown = {*(step or ())} - {*STEPS}
     if unknown:
@@ -375,9 +369,9 @@ def schemes(
     """
     from kouxing.evaluation.lips import sentences
     from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
-    from kouxing.evaluation.lips.scheme_report import print_comparison
     from kouxing.evaluation.lips.scheme_scores import score_schemes
     from kouxing.evaluation.lips.scheme_videos import write_videos
+    from kouxing.evaluation.report.paper_tables import schemes_table
     from kouxing.services.lip_models import lip_models
     from kouxing.services.recognizer.acoustic.load import load_model
 
@@ -392,13 +386,14 @@ def schemes(
     elif clips:
         chosen = sentences.clip_sentences(model, clips)
     else:
-        chosen = sentences.sample_sentences(model, SENTENCE.parent)
+        chosen = sentences.sample_sentences(model, SAMPLE.parent)
     recognizers = load_recognizers(acoustic or ["blocks", "gmm"], uses_paper_rule=paper_rule)
     names = lips or list(lip_models())
     recognized = recognize_all(recognizers, chosen)
-    comparison = score_schemes(recognized, recognizers, names)
-    print_comparison(comparison, Console())
-    write_json(json_file, asdict(comparison))
+    results = asdict(score_schemes(recognized, recognizers, names))
+    scores = results["scores"]
+    agreements = (schemes_table(scores, reference) for reference in ("scheme 1", "real lips"))
+    show_results(json_file, results, *(table for table in agreements if table.rows))
     if videos:
         written = write_videos(recognized, recognizers, names, videos, tables or ())
         print_message(f"wrote {plural(len(written), 'video')} to {videos}")
@@ -414,12 +409,12 @@ def ferguson(
     force: Force = False,
 ) -> None:
     """Compare lip models with tracked lips at several speaking rates, as in Zhang et al. 2021."""
-    from kouxing.evaluation.lips.speaking_rates import print_rates, score_rates
+    from kouxing.evaluation.lips.speaking_rates import score_rates
+    from kouxing.evaluation.report.paper_tables import ferguson_table
 
     check_output(json_file, force=force)
-    scores = score_rates(clips)
-    print_rates(scores, Console())
-    write_json(json_file, [asdict(score) for score in scores])
+    results = [asdict(score) for score in score_rates(clips)]
+    show_results(json_file, results, ferguson_table(results))
 
 
 @app.command(rich_help_panel=_LIPS)
@@ -431,21 +426,18 @@ def visemes(
 ) -> None:
     """Measure how well the visemes fit held-out lips, as in Wang & Cai 2003."""
     from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.lips.viseme_fit import (
-        fit_figure,
-        fit_folder,
-        print_errors,
-        viseme_errors,
-    )
+    from kouxing.evaluation.lips.viseme_fit import fit_figure, fit_folder, viseme_errors
+    from kouxing.evaluation.report.paper_tables import viseme_fit_table
 
     check_output(picture, json_file, force=force)
     fitted = fit_folder(clips)
-    errors = viseme_errors(fitted)
-    print_errors(errors, Console())
     if picture is not None:
         save_figure(fit_figure(fitted), picture)
-    names = [clip.clip.name for clip in fitted]
-    write_json(json_file, {"clips": names, "errors": [asdict(error) for error in errors]})
+    results = {
+        "clips": [clip.clip.name for clip in fitted],
+        "errors": [asdict(error) for error in viseme_errors(fitted)],
+    }
+    show_results(json_file, results, viseme_fit_table(results))
 
 
 app.command(rich_help_panel=_SYSTEM)(attacks)

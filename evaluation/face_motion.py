@@ -21,15 +21,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 from scipy.signal import find_peaks
 from scipy.stats import spearmanr
 
 from kouxing.corpora.emotions import FEELINGS, EmotionRecording, speakers_of
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.evaluation.lips.effort_measures import opening_range
-from kouxing.evaluation.tables import format_number, percent
+from kouxing.evaluation.lips.lip_measures import opening_range
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -38,7 +36,7 @@ from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.phones.events import Progress
-from kouxing.shared.terminal import CONSOLE, print_table
+from kouxing.shared.terminal import CONSOLE
 
 Floats = NDArray[np.float32]
 Times = NDArray[np.float64]  # (n,) media times, seconds
@@ -267,25 +265,3 @@ def _is_still(faps: Floats) -> NDArray[np.bool_]:
 def _longest_run(mask: NDArray[np.bool_]) -> int:
     changes = np.flatnonzero(~np.concatenate([[False], mask, [False]]))
     return int(np.diff(changes).max() - 1)
-
-
-def print_face(figures: FaceFigures, console: Console) -> None:
-    """Print the figures as one table."""
-    rows = [
-        *(
-            [f"rank correlation: {name}", f"{value:.2f}"]
-            for name, value in figures.correlations.items()
-        ),
-        ["nods per minute of speech", f"{figures.nods.per_minute:.0f}"],
-        ["brow raises per minute of speech", f"{figures.brow_raises.per_minute:.0f}"],
-        ["nods at the end of a phrase, %", percent(figures.nods.at_end)],
-        ["other nods after a stressed vowel, %", percent(figures.nods.matched)],
-        ["brow raises after a stressed vowel, %", percent(figures.brow_raises.matched)],
-        ["any time after a stressed vowel, %", percent(figures.chance)],
-        ["blinks per minute", f"{figures.blinks_per_minute:.0f}"],
-        ["median duration of a blink, s", format_number(figures.blink_s)],
-        ["still frames while speaking, %", percent(figures.still_speaking)],
-        ["still frames at rest, %", percent(figures.still_at_rest)],
-        ["longest still time, s", format_number(figures.longest_still_s)],
-    ]
-    print_table(console, "motion of the face", ("figure", ""), rows)

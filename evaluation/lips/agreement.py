@@ -46,7 +46,7 @@ def moments(pairs: Sequence[MouthPair], curve: str, lag_s: float = 0.0) -> Momen
 def lag_ms(pairs: Sequence[MouthPair]) -> float | None:
     """Return the lag of the opening with the highest correlation, ms; positive: late.
 
-    ViewerHandler notice sound that is 45 ms early or 125 ms late (ITU-R BT.1359-1).
+    Viewers notice sound that is 45 ms early or 125 ms late (ITU-R BT.1359-1).
 
     >>> time_s = np.arange(0.0, 4.0, 0.02)
     >>> real, late = (

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip, aligned_phones
-from kouxing.evaluation.lips.lip_measures import COMPARISONS, MEASURES
+from kouxing.evaluation.lips.lip_measures import MEASURES, REAL_MEASURES
 from kouxing.evaluation.lips.live_faces import Samples, live_events, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth
 from kouxing.evaluation.lips.other_programs import MouthFunction, load_programs
@@ -117,11 +117,8 @@ def score_lips(
                 scored_clips.setdefault((title, condition, group), []).append(scored)
     results: Results = {}
     for (title, condition, group), members in scored_clips.items():
-        scores = {
-            name: measure(members)
-            for name, measure in MEASURES.items()
-            if title != REAL or name not in COMPARISONS
-        }
+        measures = REAL_MEASURES if title == REAL else MEASURES
+        scores = {name: measure(members) for name, measure in measures.items()}
         by_group = results.setdefault(title, {}).setdefault(condition, {})
         by_group[group] = {"clips": len(members), **scores}
     return results

@@ -31,6 +31,7 @@ from kouxing.evaluation.lips.four_schemes import (
 )
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.alignment import drop_pauses
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -132,7 +133,7 @@ def _condition_score(
     like_aligned: Sequence[MouthPair],
     like_real: Sequence[MouthPair],
 ) -> ConditionScore:
-    p50, p95 = np.percentile(delays_s, [50, 95]) * 1e3 if delays_s else (None, None)
+    delay_ms = percentiles(1e3 * np.array(delays_s))
     is_live = condition.scheme > RECOGNIZED
     return ConditionScore(
         scheme=condition.scheme,
@@ -140,8 +141,8 @@ def _condition_score(
         recognizer=condition.recognizer,
         num_sentences=len(frames),
         face_delay_ms=lip_model_info(condition.lips).delay_ms if is_live else None,
-        phone_delay_p50_ms=p50,
-        phone_delay_p95_ms=p95,
+        phone_delay_p50_ms=delay_ms.get("p50"),
+        phone_delay_p95_ms=delay_ms.get("p95"),
         jerk=rms_jerk([predicted_mouth(faps).opening for faps in frames], FRAME_RATE_HZ),
         like_scheme_1=agreement_of(like_aligned) if like_aligned else None,
         like_real_lips=agreement_of(like_real) if like_real else None,

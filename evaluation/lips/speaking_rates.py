@@ -26,7 +26,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, openings_of, read_clips
@@ -49,7 +48,6 @@ from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import Syllable
 from kouxing.shared.phones.syllable_captions import group_syllables
-from kouxing.shared.terminal import print_table
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.float32]
@@ -189,20 +187,3 @@ def _curves_of(motion: KeyFrames) -> MouthCurve:
 
 def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:
     return np.stack([np.interp(times_s, frame_s, column) for column in mouths.T], axis=1)
-
-
-def print_rates(scores: Sequence[RateScore], console: Console) -> None:
-    """Print accuracies by speaking rate as in the paper's table 3, one row per method."""
-    for title, method_accuracies in _TITLES.items():
-        rows = [["syllables per second", *(f"{score.syllables_per_s:.1f}" for score in scores)]]
-        for name in method_accuracies(scores[0]):
-            rows.append(
-                [name, *(f"{100 * method_accuracies(score)[name]:.0f} %" for score in scores)]
-            )
-        print_table(console, "", (title, *(f"{score.rate:g}" for score in scores)), rows)
-
-
-_TITLES: dict[str, Callable[[RateScore], dict[str, float]]] = {
-    "accuracy over all frames": lambda score: score.of_frames,
-    "accuracy over the mean mouths of phones": lambda score: score.of_phones,
-}

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 
 from kouxing.corpora.figures import new_figure
@@ -30,7 +29,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_tim
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.terminal import print_table
 
 Array = NDArray[np.float64]
 
@@ -135,21 +133,6 @@ def _nearest_visemes(fitted: FittedClip) -> NDArray[np.intp]:
 
 def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
-
-
-def print_errors(errors: Sequence[VisemeError], console: Console) -> None:
-    """Print the errors, one row per viseme."""
-    rows = []
-    for viseme in dict.fromkeys(error.viseme for error in errors):
-        of_viseme = {error.measure: error for error in errors if error.viseme == viseme}
-        cells = {
-            measure: f"{error.learned:.0f} ({error.guessed:.0f}); {error.extent:.0f}"
-            for measure, error in of_viseme.items()
-        }
-        num_frames = max(error.num_frames for error in of_viseme.values())
-        rows.append([viseme, str(num_frames), *(cells.get(measure, "") for measure in CURVES)])
-    title = "error in FAP units: learned (initial); standard deviation of the measured values"
-    print_table(console, title, ("viseme", "frames", *CURVES), rows)
 
 
 def fit_figure(fitted: Sequence[FittedClip]) -> Any:

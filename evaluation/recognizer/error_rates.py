@@ -35,6 +35,7 @@ from kouxing.corpora.scoring import (
     final_hypothesis,
     first_hypothesis,
 )
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.recognizer.aligned_corpus import RATE_NAMES, AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import CLEAN, Disturb
 from kouxing.evaluation.recognizer.labials import LabialCounts
@@ -121,8 +122,7 @@ class ErrorStats:
                 rate = errors / max(1, out[hypothesis]["phone_errors"]["reference"])
                 out[hypothesis]["feature_error_rate"] = rate
         if self._delays_s:
-            p50, p95 = np.percentile(self._delays_s, [50, 95])
-            out["delay_ms"] = {"p50": 1000 * float(p50), "p95": 1000 * float(p95)}
+            out["delay_ms"] = percentiles(1000 * np.array(self._delays_s))
         return out
 
 

@@ -16,25 +16,22 @@ errors and viseme errors. The final hypothesis equals an offline search.
 import subprocess
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
 
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.error_rates import (
-    HYPOTHESES,
     ErrorStats,
     Recognition,
     recognize_live,
     score_live,
 )
 from kouxing.evaluation.rivals.tables import FOLDER, find_installed
-from kouxing.evaluation.tables import percent
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
@@ -42,13 +39,10 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import UNIVERSAL, find_language, load_inventory
 from kouxing.shared.phones.universal.segments import read_ipa
-from kouxing.shared.terminal import CONSOLE, plural, print_table
+from kouxing.shared.terminal import CONSOLE
 
 AUTO, OWN, HAMA = "auto", "own", "hama"
 _HAMA_LANGUAGE = "en"
-_LABEL = "language "  # as in evaluate_recognizer
-
-Figures = Mapping[str, Any]
 
 
 def evaluate_languages(
@@ -130,38 +124,3 @@ def _run_hama(references: Sequence[AlignedRecording]) -> Iterator[tuple[str, ...
         if unknown:
             raise UserError(f"hama wrote {unknown[0]!r}, which is not in other_ipa.tsv; add it")
         yield phones
-
-
-def print_languages(results: Mapping[str, Figures], console: Console) -> None:
-    """Print one table: a row for each language, a column for each recognizer and hypothesis."""
-    columns = [
-        (name, hypothesis)
-        for name, figures in results.items()
-        for hypothesis in HYPOTHESES
-        if hypothesis in next(iter(figures["speech"].values()))
-    ]
-    auto = results[AUTO]
-    print_table(
-        console,
-        f"{plural(auto['recordings'], 'recording')}, {plural(auto['speakers'], 'speaker')}.\n"
-        "features/visemes wrong, %; auto: any language, own: the language's model",
-        ("language", "phones", *(f"{name} {hypothesis}" for name, hypothesis in columns)),
-        _rows(results, columns),
-    )
-
-
-def _rows(
-    results: Mapping[str, Figures], columns: Iterable[tuple[str, str]]
-) -> Iterator[list[str]]:
-    for group, score in results[AUTO]["speech"].items():
-        cells = [results[name]["speech"].get(group, {}).get(part) for name, part in columns]
-        yield [
-            group.removeprefix(_LABEL),
-            str(score["final"]["phone_errors"]["reference"]),
-            *(
-                "/".join(percent(cell[f"{unit}_error_rate"]) for unit in ("feature", "viseme"))
-                if cell
-                else "-"
-                for cell in cells
-            ),
-        ]

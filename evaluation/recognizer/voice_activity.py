@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 
 from kouxing.corpora.feature_cache import as_floats
@@ -25,16 +24,14 @@ from kouxing.evaluation.recognizer import synthetic_sounds
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import Disturb, add_sound
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
-from kouxing.evaluation.tables import letters_of, percent
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.pcm import SLICE, split_slices
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.phones.events import Phone, Progress, SpeechChange
-from kouxing.shared.terminal import CONSOLE, print_table
+from kouxing.shared.terminal import CONSOLE
 
 Mask = NDArray[np.bool_]  # (slices,)
-Figures = Mapping[str, Any]
 
 _SLICE_S = SLICE / SAMPLE_RATE_HZ
 _PAUSE = 2 * SAMPLE_RATE_HZ  # samples of silence before and after a recording of speech
@@ -97,30 +94,29 @@ def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
 
 
 def evaluate_voice(
-    models: Mapping[str, AcousticModel], materials: Iterable[LabeledAudio]
+    model: AcousticModel, materials: Iterable[LabeledAudio]
 ) -> dict[str, dict[str, Any]]:
-    """Measure voice activity; return figures for a JSON file, by model and kind of audio.
+    """Measure voice activity; return figures for a JSON file, by kind of audio.
 
     The figures contain the seconds with and without a voice, and the fraction of each with voice
     activity. Without such audio, the share is missing: None. The shares with laughter and with
     breath refer to the whole time.
     """
-    results: dict[str, dict[str, Any]] = {name: {} for name in models}
+    results = {}
     for material in track(materials, "voice activity", console=CONSOLE, transient=True):
         voiced = np.concatenate([mask for _, mask in material.recordings])
-        for name, model in models.items():
-            states = [voice_states(model, samples) for samples, _ in material.recordings]
-            is_on, laughter, breath = np.concatenate(states).T
-            parts = {"voice": voiced, "no_voice": ~voiced}
-            results[name][material.kind] = {
-                "seconds": {part: float(mask.sum()) * _SLICE_S for part, mask in parts.items()},
-                "on": {
-                    part: float(is_on[mask].mean()) if mask.any() else None
-                    for part, mask in parts.items()
-                },
-                "laughter": float(laughter.mean()),
-                "breath": float(breath.mean()),
-            }
+        states = [voice_states(model, samples) for samples, _ in material.recordings]
+        is_on, laughter, breath = np.concatenate(states).T
+        parts = {"voice": voiced, "no_voice": ~voiced}
+        results[material.kind] = {
+            "seconds": {part: float(mask.sum()) * _SLICE_S for part, mask in parts.items()},
+            "on": {
+                part: float(is_on[mask].mean()) if mask.any() else None
+                for part, mask in parts.items()
+            },
+            "laughter": float(laughter.mean()),
+            "breath": float(breath.mean()),
+        }
     return results
 
 
@@ -143,31 +139,3 @@ def voice_states(model: AcousticModel, samples: Samples) -> Mask:
                 is_laughter, is_breath = event.is_laughter, event.is_breath
         states.append((is_active, is_laughter, is_breath))
     return np.array(states)
-
-
-def print_voice(results: Mapping[str, Figures], title: str, console: Console) -> None:
-    """Print one table for all models. ``results`` contains the figures of each model by name."""
-    letters, legend = letters_of(list(results))
-    print_table(
-        console,
-        f"{title}. {legend}\n"
-        "% of the time: voice activity with and without a voice, laughter, breath",
-        ("audio", "", "s", "voice", "no voice", "laughter", "breath"),
-        _rows(results, letters),
-    )
-
-
-def _rows(results: Mapping[str, Figures], letters: Mapping[str, str]) -> Iterator[list[str]]:
-    for kind in next(iter(results.values())):
-        label = kind
-        for name, figures in results.items():
-            shares = figures[kind]
-            yield [
-                label,
-                letters[name],
-                f"{sum(shares['seconds'].values()):.0f}",
-                *map(percent, shares["on"].values()),
-                percent(shares["laughter"]),
-                percent(shares["breath"]),
-            ]
-            label = ""

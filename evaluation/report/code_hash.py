@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from kouxing.evaluation.report.steps import ROOT
+from kouxing.evaluation.source_tree import ROOT
 
 _PACKAGES = {"kouxing": "", "kouxing_client": "clients/python/kouxing_client"}
 _SOURCES = {".py", ".js", ".mjs", ".ts", ".json", ".toml", ".tsv", ".npz", ".txt"}

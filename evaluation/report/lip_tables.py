@@ -1,18 +1,18 @@
-"""The tables of lips: agreement with tracked lips, closures, look-ahead, motion, and the papers."""
+"""The tables of lips: agreement with tracked lips, closures, look-ahead and motion."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
+from string import ascii_uppercase
 from typing import Any
 
-from kouxing.evaluation.lips.lip_scores import ALL, REAL
+from kouxing.evaluation.lips.lip_scores import ALL, MOCAP, REAL
 from kouxing.evaluation.lips.mouths import CURVES
-from kouxing.evaluation.lips.scheme_report import PAPER
 from kouxing.evaluation.recognizer.disturbances import BABBLE, CLEAN, MUSIC
-from kouxing.evaluation.report.markdown import Results, Table, display_floor_ms, join_values
-from kouxing.evaluation.tables import format_number, percent
+from kouxing.evaluation.tables import Figures, Table, format_number, join_values, percent
 
 _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new": "English, new"}
 _COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", ALL: "all clips"}
 _OUR_LIP_MODEL = "learned"
+_FRAME_MS, _TICK_MS = 20, 17  # frame of the face; tick of a display at 60 Hz
 _COMPARED = {  # compared measures, and whether higher is better
     "r_opening": ("correlation of the opening", True),
     "r_width": ("correlation of the width", True),
@@ -45,15 +45,37 @@ _CLOSURE_COLUMNS = {  # measures by title
     "closed at b p m": "labials_shut",
     "closed in speech": "share_shut",
 }
-_MOTION_COLUMNS = {  # measures and formats by title
-    "lag, ms": ("lag_ms", ".0f"),
-    "MTM, ms": ("mtm_ms", ".0f"),
-    "SLCC": ("slcc", ".2f"),
-    "effort": ("effort_correlation", ".2f"),
-    "opening at rest": ("rest_opening", ".0f"),
-    "closed after, ms": ("closing_time_ms", ".0f"),
-    "spread": ("phone_spread", ".0f"),
-    "turns per s": ("turns_per_s", ".1f"),
+_MOTION_COLUMNS = {  # measures by title
+    "lag, ms": "lag_ms",
+    "MTM, ms": "mtm_ms",
+    "SLCC": "slcc",
+    "effort": "effort_correlation",
+    "opening at rest": "rest_opening",
+    "closed after, ms": "closing_time_ms",
+    "spread": "phone_spread",
+    "turns per s": "turns_per_s",
+}
+_CONSOLE_COLUMNS = {  # measures by title
+    "r": ("r_opening", "r_width", "r_jaw"),
+    "F1/P/R": ("closure_f1", "closure_precision", "closure_recall"),
+    "P by class": ("precision_bpm", "precision_aei", "precision_uo", "precision_pause"),
+    "shut": ("labials_shut", "share_shut"),
+    "rest": ("rest_opening", "closing_time_ms"),
+    "effort": ("effort_correlation", "slcc"),
+    "spread": ("phone_spread", "turns_per_s", "mtm_ms"),
+}
+_LEGEND = """\
+First row of a group: real lips. new: speakers not in training. +b, +m: babble,
+music. In %: r of opening/width/jaw in speech; F1/precision/recall of closures;
+their precision at b p m/a e i/u o/pauses; lips shut at b p m/in speech; effort:
+r of range and level/SLCC, over clips. rest: opening, FAP units/ms to close in
+pauses. spread: within phone classes, FAP units/turns per s/MTM, ms."""
+_MARKS = {CLEAN: "", BABBLE: "+b", MUSIC: "+m"}
+_WHOLE_MEASURES = ("lag_ms", "mtm_ms", "rest_opening", "closing_time_ms", "phone_spread")
+_FORMATS = {  # of measures; not of correlations
+    **dict.fromkeys(_CLOSURE_COLUMNS.values(), "%"),
+    **dict.fromkeys(_WHOLE_MEASURES, ".0f"),
+    "turns_per_s": ".1f",
 }
 _MEASURE_NAMES = {name: title for name, (title, _) in _COMPARED.items()} | _REALISM_MEASURES
 _PROGRAM_TITLES = {
@@ -75,28 +97,98 @@ def title_of(face: str) -> str:
     return f"{name}, {rest}"
 
 
-def agreement_table(results: Results) -> Table:
-    """Return the correlations with tracked lips in speech, best opening first."""
-    faces = _clean_scores(results.get("rivals", {}))
-    columns = ("face, delay", *(f"{name}: opening / width / jaw" for name in _GROUPS.values()))
-    order = sorted(faces, key=lambda face: -(faces[face][ALL]["r_opening"] or 0.0))
-    return columns, [
-        [
-            title_of(face),
-            *(
-                join_values(
-                    format_number(faces[face].get(group, {}).get(f"r_{name}")) for name in CURVES
-                )
-                for group in _GROUPS
-            ),
-        ]
-        for face in order
+def scores_table(faces: Figures) -> Table:
+    """Return one table that fits a screen: the real lips and each face, by group of clips."""
+    titles = [title for title in faces if title != REAL]
+    is_single = len(titles) == 1  # a single face needs no letter
+    letters = {titles[0]: ""} if is_single else dict(zip(titles, _letters(), strict=False))
+    legend = ", ".join(
+        f"{letter}: {title}" if letter else title for title, letter in letters.items()
+    )
+    real = faces[REAL][CLEAN]
+    rows = []
+    for group in _main_groups(real):
+        rows.append([group, *_console_cells(real[group])])
+        for title, letter in letters.items():
+            for condition, scores in faces[title].items():
+                if condition == CLEAN or group == ALL:
+                    label = f"  {letter}{_MARKS[condition]}"
+                    rows.append([label, *_console_cells(scores[group])])
+    counts = ", ".join(f"{group} {real[group]['clips']}" for group in _main_groups(real))
+    title = f"{legend}\nclips: {counts}\n{_LEGEND}"
+    return Table(("clips", *_CONSOLE_COLUMNS), rows, title)
+
+
+def _letters() -> Iterator[str]:
+    """Yield A to Z, AA to AZ, and so on: titles of faces are too long for a column."""
+    for first in ("", *ascii_uppercase):
+        for last in ascii_uppercase:
+            yield first + last
+
+
+def _main_groups(real: Figures) -> list[str]:
+    """Return each language unless all its speakers are new, its new speakers, mocap and all."""
+    groups = []
+    for language in sorted(group for group in real if " " not in group):
+        if language not in (ALL, MOCAP):
+            has_known = f"{language} known" in real
+            groups += [language, f"{language} new"] if has_known else [f"{language} new"]
+    return [group for group in (*groups, MOCAP, ALL) if group in real]
+
+
+def _console_cells(scores: Figures) -> list[str]:
+    """Return short cells: correlations are in percent like closures."""
+    return [
+        "/".join(_format_measure(name, scores.get(name), default="%") for name in names)
+        for names in _CONSOLE_COLUMNS.values()
     ]
 
 
-def better_programs(results: Results) -> list[list[str]]:
+def _format_measure(name: str, value: float | None, default: str = ".2f") -> str:
+    """Format a measure; "%" is a percentage without its sign."""
+    format_spec = _FORMATS.get(name, default)
+    if format_spec == "%":
+        return percent(value, ".0f")
+    return format_number(value, format_spec)
+
+
+def agreement_table(faces: Figures) -> Table:
+    """Return the correlations with tracked lips in speech, best opening first."""
+    clean = _clean_scores(faces)
+    rows = []
+    for face in sorted(clean, key=lambda face: -(clean[face][ALL]["r_opening"] or 0.0)):
+        correlations = [
+            [clean[face].get(group, {}).get(f"r_{curve}") for curve in CURVES] for group in _GROUPS
+        ]
+        rows.append([title_of(face), *(join_values(map(format_number, r)) for r in correlations)])
+    titles = (f"{name}: opening / width / jaw" for name in _GROUPS.values())
+    return Table(("face, delay", *titles), rows)
+
+
+def closures_table(faces: Figures) -> Table:
+    """Return recall and precision of closures in percent, also by class of phones."""
+    return _measures_table(faces, _CLOSURE_COLUMNS)
+
+
+def motion_table(faces: Figures) -> Table:
+    """Return timing, effort and rest of the faces, and of real lips."""
+    return _measures_table(faces, _MOTION_COLUMNS)
+
+
+def _measures_table(faces: Figures, measures: Mapping[str, str]) -> Table:
+    """Return measures of all clips: real lips, own lip models, then other programs."""
+    scores = {title_of(face): groups[ALL] for face, groups in _clean_scores(faces).items()}
+    if REAL in faces:
+        scores = {"real lips": faces[REAL][CLEAN][ALL], **scores}
+    rows = [
+        [title, *(_format_measure(name, of_face.get(name)) for name in measures.values())]
+        for title, of_face in scores.items()
+    ]
+    return Table(("face, delay", *measures), rows)
+
+
+def better_programs(faces: Figures) -> list[list[str]]:
     """Return a row for each measure in which another program is better than ``_OUR_LIP_MODEL``."""
-    faces = results.get("rivals", {})
     scores = _clean_scores(faces)
     own = next((face for face in scores if face.startswith(f"{_OUR_LIP_MODEL}, ")), None)
     if own is None:
@@ -116,7 +208,7 @@ def better_programs(results: Results) -> list[list[str]]:
             }
             best = min(losses, key=lambda face: losses[face], default=own)
             if own in losses and losses[best] < losses[own]:
-                figures = [_format_measure(measure, values[face]) for face in (best, own)]
+                figures = [_format_compared(measure, values[face]) for face in (best, own)]
                 if "precision" in measure:
                     recalls = (scores[face][group].get("closure_recall") for face in (best, own))
                     figures = [
@@ -124,7 +216,7 @@ def better_programs(results: Results) -> list[list[str]]:
                         for figure, recall in zip(figures, recalls, strict=True)
                     ]
                 if measure in _REALISM_MEASURES:
-                    figures.append(f"real lips {_format_measure(measure, real[measure])}")
+                    figures.append(f"real lips {_format_compared(measure, real[measure])}")
                 program, ours = title_of(best), ", ".join(figures[1:])
                 rows.append([f"{group_title}, {name}", program, figures[0], ours])
     return rows
@@ -137,38 +229,16 @@ def _loss(measure: str, value: float, real: float | None) -> float:
     return -value if _COMPARED[measure][1] else value
 
 
-def _format_measure(measure: str, value: float | None) -> str:
+def _format_compared(measure: str, value: float | None) -> str:
     if measure.endswith("_ms"):
         return f"{format_number(value, '.0f')} ms"
     return format_number(value, ".0f" if measure in ("rest_opening", "phone_spread") else ".2f")
 
 
-def closures_table(results: Results) -> Table:
-    """Return recall and precision of closures in percent, also by class of phones."""
-    return ("face, delay", *_CLOSURE_COLUMNS), [
-        [title, *(percent(scores.get(name), ".0f") for name in _CLOSURE_COLUMNS.values())]
-        for title, scores in _all_faces(results)
-    ]
-
-
-def motion_table(results: Results) -> Table:
-    """Return timing, effort and rest of the faces, and of real lips."""
-    return ("face, delay", *_MOTION_COLUMNS), [
-        [
-            title,
-            *(
-                format_number(scores.get(name), format_spec)
-                for name, format_spec in _MOTION_COLUMNS.values()
-            ),
-        ]
-        for title, scores in _all_faces(results)
-    ]
-
-
-def disturbed_lips(results: Results) -> list[str]:
+def disturbed_lips(faces: Figures) -> list[str]:
     """Return a sentence for each lip model: its scores in clean audio, babble and music."""
     sentences = []
-    for face, scores in results.get("lips", {}).items():
+    for face, scores in faces.items():
         conditions = [name for name in (CLEAN, BABBLE, MUSIC) if name in scores]
         measures = ("r_opening", "closure_f1")
         figures = (
@@ -180,9 +250,9 @@ def disturbed_lips(results: Results) -> list[str]:
     return sentences
 
 
-def lookahead_table(results: Results) -> Table:
+def lookahead_table(faces: Figures) -> Table:
     """Return the correlation of the opening and the F1 of closures by look-ahead."""
-    curves = lookahead_curves(results)
+    curves = lookahead_curves(faces)
     delays = sorted({delay for points in curves.values() for delay in points})
     rows = []
     for lips, points in curves.items():
@@ -190,96 +260,22 @@ def lookahead_table(results: Results) -> Table:
             values = (format_number(points.get(delay, {}).get(measure)) for delay in delays)
             rows.append([f"{lips}, {name}", *values])
     rows.append(["floor of the latency, ms", *(str(display_floor_ms(delay)) for delay in delays)])
-    return ("lip model", *(f"{delay} ms" for delay in delays)), rows
+    return Table(("lip model", *(f"{delay} ms" for delay in delays)), rows)
 
 
-def lookahead_curves(results: Results) -> dict[str, dict[int, dict[str, Any]]]:
+def display_floor_ms(look_ahead_ms: int) -> int:
+    """Return the minimum time from a sound to its image: look-ahead, frame and display tick."""
+    return look_ahead_ms + _FRAME_MS + _TICK_MS
+
+
+def lookahead_curves(faces: Figures) -> dict[str, dict[int, dict[str, Any]]]:
     """Return the scores of all clips by lip model and delay, ms."""
     curves: dict[str, dict[int, dict[str, Any]]] = {}
-    for face, groups in _clean_scores(results.get("lookahead", {})).items():
+    for face, groups in _clean_scores(faces).items():
         lips, _, delay = face.partition(", ")
         curves.setdefault(lips, {})[int(float(delay.removesuffix(" ms")))] = groups[ALL]
     return curves
 
 
-def schemes_table(results: Results) -> Table:
-    """Return the four schemes of Li et al. 2011 with the paper's scores."""
-    columns = (
-        "lips",
-        "scheme",
-        "recognizer",
-        "r with scheme 1: opening / width / jaw",
-        "lag, ms",
-        "F1 of closures",
-        "phone delay p50 / p95, ms",
-        "paper: sync / realism",
-    )
-    return columns, [
-        [
-            score["lips"],
-            str(score["scheme"]),
-            score["recognizer"] or "(text)",
-            join_values(format_number(value) for value in like["correlation"].values()),
-            format_number(like["lag_ms"], ".0f"),
-            format_number(like["closure_f1"]),
-            join_values(format_number(score[f"phone_delay_{p}_ms"], ".0f") for p in ("p50", "p95")),
-            join_values(format_number(opinion) for opinion in PAPER[score["scheme"]][:2]),
-        ]
-        for step in ("schemes", "schemes-paper-rule")
-        for score in results.get(step, {}).get("scores", [])
-        if (like := score["like_scheme_1"])
-        and (step == "schemes" or score["recognizer"].endswith("-paper"))
-    ]
-
-
-def viseme_fit_table(results: Results) -> Table:
-    """Return the errors of the visemes of Wang & Cai 2003 by viseme and measure."""
-    errors = results.get("visemes", {}).get("errors", [])
-    measures = list(dict.fromkeys(error["measure"] for error in errors))
-    rows = []
-    for viseme in dict.fromkeys(error["viseme"] for error in errors):
-        of_viseme = {error["measure"]: error for error in errors if error["viseme"] == viseme}
-        frames = max(error["num_frames"] for error in of_viseme.values())
-        cells = (
-            join_values(
-                format_number(of_viseme[measure][key], ".0f")
-                for key in ("learned", "guessed", "extent")
-            )
-            if measure in of_viseme
-            else "-"
-            for measure in measures
-        )
-        rows.append([viseme, str(frames), *cells])
-    return ("viseme", "frames", *measures), rows
-
-
-def ferguson_table(results: Results) -> Table:
-    """Return the accuracies of Zhang et al. 2021 by method and speaking rate."""
-    scores: Sequence[Any] = results.get("ferguson", [])
-    columns = ("method", *(f"{s['rate']:g} ({s['syllables_per_s']:.1f} per s)" for s in scores))
-    methods = scores[0]["of_frames"] if scores else ()
-    return columns, [
-        [
-            method,
-            *(
-                join_values(
-                    percent(score[kind][method], ".0f") for kind in ("of_frames", "of_phones")
-                )
-                for score in scores
-            ),
-        ]
-        for method in methods
-    ]
-
-
-def _clean_scores(faces: Results) -> dict[str, dict[str, Any]]:
+def _clean_scores(faces: Figures) -> dict[str, dict[str, Any]]:
     return {face: scores[CLEAN] for face, scores in faces.items() if face != REAL}
-
-
-def _all_faces(results: Results) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield title and scores of all clips: real lips, own lip models, then other programs."""
-    faces = results.get("rivals", {})
-    if REAL in faces:
-        yield "real lips", faces[REAL][CLEAN][ALL]
-    for face, groups in _clean_scores(faces).items():
-        yield title_of(face), groups[ALL]

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.corpora.figures import new_figure, save_figure
-from kouxing.evaluation.report import lip_tables, system_tables
-from kouxing.evaluation.report.markdown import Results, Table, bullets, markdown
-from kouxing.evaluation.report.recognition_table import better_recognizers, recognition
+from kouxing.evaluation.report import lip_tables, paper_tables, recognition_table, system_tables
+from kouxing.evaluation.report.markdown import bullets, markdown
 from kouxing.evaluation.report.steps import STEPS
+from kouxing.evaluation.tables import Figures, Table
 
 PICTURE = "lookahead.png"
 _TEMPLATE = Path(__file__).with_name("template.md")
@@ -25,18 +25,20 @@ class ReportTable:
     """A table, with the steps whose results it shows."""
 
     steps: tuple[str, ...]
-    table: Callable[[Results], Table]
+    table: Callable[..., Table]  # takes the result of each step, empty if it is not measured
 
 
 TABLES = {
-    "recognition": ReportTable(("read", "conversation", "disturbed", "languages"), recognition),
+    "recognition": ReportTable(
+        ("read", "conversation", "disturbed", "languages"), recognition_table.recognition
+    ),
     "agreement": ReportTable(("rivals",), lip_tables.agreement_table),
     "closures": ReportTable(("rivals",), lip_tables.closures_table),
     "lookahead": ReportTable(("lookahead",), lip_tables.lookahead_table),
     "motion": ReportTable(("rivals",), lip_tables.motion_table),
-    "schemes": ReportTable(("schemes", "schemes-paper-rule"), lip_tables.schemes_table),
-    "visemes": ReportTable(("visemes",), lip_tables.viseme_fit_table),
-    "ferguson": ReportTable(("ferguson",), lip_tables.ferguson_table),
+    "schemes": ReportTable(("schemes", "schemes-paper-rule"), paper_tables.report_schemes),
+    "visemes": ReportTable(("visemes",), paper_tables.viseme_fit_table),
+    "ferguson": ReportTable(("ferguson",), paper_tables.ferguson_table),
     "system": ReportTable(
         ("chain", "load", "busy", "browser", "package", "sizes"), system_tables.system_table
     ),
@@ -55,9 +57,9 @@ def write_page(folder: Path, page: Path) -> None:
     steps = read_results(folder)
     results = {name: step["result"] for name, step in steps.items()}
     better = [
-        *lip_tables.better_programs(results),
-        *better_recognizers(results),
-        *system_tables.better_packages(results),
+        *lip_tables.better_programs(results.get("rivals", {})),
+        *recognition_table.better_recognizers(results.get("languages", {})),
+        *system_tables.better_packages(results.get("browser", {})),
     ]
     lines = [
         f"{measure}: {figure} ({program}); kouxing {own}"
@@ -67,10 +69,10 @@ def write_page(folder: Path, page: Path) -> None:
     parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _render_table(match[1], steps, results), text)
     page.write_text(parts, encoding="utf-8")
     if "lookahead" in results:
-        save_figure(_lookahead_figure(results), page.with_name(PICTURE))
+        save_figure(_lookahead_figure(results["lookahead"]), page.with_name(PICTURE))
 
 
-def _render_table(name: str, steps: Results, results: Results) -> str:
+def _render_table(name: str, steps: Figures, results: Figures) -> str:
     part = TABLES[name]
     missing = [step for step in part.steps if step not in steps]
     command = f'Not measured yet: `make report STEPS="{" ".join(missing)}"`'
@@ -79,22 +81,23 @@ def _render_table(name: str, steps: Results, results: Results) -> str:
     notes = [_describe_measurement(steps[step]) for step in part.steps if step in steps]
     notes += [command] if missing else []
     if name == "agreement" and "lips" in steps:
-        notes += [*lip_tables.disturbed_lips(results), _describe_measurement(steps["lips"])]
-    return f"{markdown(part.table(results))}\n{bullets(notes)}"
+        notes += [*lip_tables.disturbed_lips(results["lips"]), _describe_measurement(steps["lips"])]
+    table = part.table(*(results.get(step, {}) for step in part.steps))
+    return f"{markdown(table)}\n{bullets(notes)}"
 
 
-def _describe_measurement(step: Results) -> str:
+def _describe_measurement(step: Figures) -> str:
     commands = "`, `".join(step["commands"])
     measured = f"{step['machine']}, {step['date']}, commit {step['commit']}"
     cpu = f" ({step['cpu_seconds']} s of processor time)" if "cpu_seconds" in step else ""
     return f"`{commands}`: {measured}, {step['seconds']} s{cpu}, load {step['load']:.1f}"
 
 
-def _lookahead_figure(results: Results) -> Any:
+def _lookahead_figure(faces: Figures) -> Any:
     figure = new_figure(9.0, 3.6)
     axes = figure.subplots(1, 2, sharex=True)
     titles = {"r_opening": "correlation of the opening", "closure_f1": "F1 of closures"}
-    for lips, points in lip_tables.lookahead_curves(results).items():
+    for lips, points in lip_tables.lookahead_curves(faces).items():
         for axis, (measure, title) in zip(axes, titles.items(), strict=True):
             delays = sorted(points)
             axis.plot(delays, [points[delay][measure] for delay in delays], "o-", label=lips)

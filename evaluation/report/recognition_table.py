@@ -1,9 +1,20 @@
-"""The table of phones: errors and delays of the acoustic models."""
+"""The tables of recognition: errors and delays of the acoustic models, and voice activity."""
+
+from collections.abc import Iterator
 
 from kouxing.evaluation.recognizer.disturbances import CLEAN
-from kouxing.evaluation.report.markdown import Results, Table, join_values
-from kouxing.evaluation.tables import format_number, percent
+from kouxing.evaluation.tables import Figures, Table, format_number, join_values, percent
+from kouxing.shared.terminal import plural
 
+_COLUMNS = (
+    "speech",
+    "model",
+    "phones",
+    "errors of the final hypothesis, phones / visemes (/ features), %",
+    "of the first hypothesis",
+    "delay p50 / p95, ms",
+    "p b m f: recall / precision, %",
+)
 _RECOGNIZER_TITLES = {  # in the rows by language
     "auto": "`universal`, no language chosen",
     "own": "the language's own phones",
@@ -25,74 +36,89 @@ _SPEECH_TITLES = {
 }
 
 
-def recognition(results: Results) -> Table:
-    """Return the errors by kind of speech and model, one decimal."""
-    columns = (
-        "speech",
-        "model",
-        "phones",
-        "errors of the final hypothesis, phones / visemes (/ features), %",
-        "of the first hypothesis",
-        "delay p50 / p95, ms",
-        "p b m f: recall / precision, %",
-    )
-    rows = []
-    for speech in ("read", "conversation"):
-        for model, figures in results.get(speech, {}).items():
-            rows.append([speech, f"`{model}`", *_score_cells(figures["speech"][CLEAN])])
-    for model, figures in results.get("disturbed", {}).items():
-        for kind, score in figures["speech"].items():
-            if kind != CLEAN and not kind.endswith("/s"):
-                rows.append([f"read, {kind}", f"`{model}`", *_score_cells(score)])
-    for group, scores in _by_language(results).items():
-        for recognizer, score in scores.items():
-            rows.append(
-                [
-                    _SPEECH_TITLES.get(group, group),
-                    _RECOGNIZER_TITLES[recognizer],
-                    *_score_cells(score),
-                ]
-            )
-    paper = ["read, own corpus", "Li et al. 2011, N = 3", "", "26.3 / -", "", "45", ""]
-    return columns, [*rows, paper]
+def recognition(
+    read: Figures, conversation: Figures, disturbed: Figures, languages: Figures
+) -> Table:
+    """Return the errors by kind of speech and model, with those of the paper."""
+    rows = [
+        [speech, f"`{model}`", *_score_cells(figures["speech"][CLEAN])]
+        for speech, results in (("read", read), ("conversation", conversation))
+        for model, figures in results.items()
+    ]
+    for kind, model, score in _scores(disturbed):
+        if kind != CLEAN and not kind.endswith("/s"):
+            rows.append([f"read, {kind}", f"`{model}`", *_score_cells(score)])
+    for group, name, score in _scores(languages):
+        rows.append([_speech_title(group), _RECOGNIZER_TITLES[name], *_score_cells(score)])
+    rows.append(["read, own corpus", "Li et al. 2011, N = 3", "", "26.3 / -", "", "45", ""])
+    return Table(_COLUMNS, rows)
 
 
-def better_recognizers(results: Results) -> list[list[str]]:
+def speech_table(results: Figures) -> Table:
+    """Return the errors of recognizers by kind of speech. ``results`` has their figures by name."""
+    first = next(iter(results.values()))
+    counts = plural(first["recordings"], "recording"), plural(first["speakers"], "speaker")
+    rows = [[kind, name, *_score_cells(score)] for kind, name, score in _scores(results)]
+    return Table(_COLUMNS, rows, ", ".join(counts))
+
+
+def voice_table(results: Figures) -> Table:
+    """Return the percentages of the time with voice activity, laughter and breath."""
+    columns = ("audio", "s", "voice", "no voice", "laughter", "breath")
+    rows = [
+        [
+            kind,
+            f"{sum(shares['seconds'].values()):.0f}",
+            *map(percent, shares["on"].values()),
+            percent(shares["laughter"]),
+            percent(shares["breath"]),
+        ]
+        for kind, shares in results.items()
+    ]
+    title = "% of the time: voice activity with and without a voice, laughter, breath"
+    return Table(columns, rows, title)
+
+
+def better_recognizers(languages: Figures) -> list[list[str]]:
     """Return a row for each error rate of a language in which hama is better."""
     rows = []
-    for group, scores in _by_language(results).items():
-        for unit, name in _ERROR_TITLES.items() if "hama" in scores else ():
-            hama, own = (scores[key]["final"][f"{unit}_error_rate"] for key in ("hama", "own"))
-            if hama < own:
-                measure, figures = f"{_SPEECH_TITLES.get(group, group)}, {name}", (hama, own)
-                rows.append([measure, "hama 1.7.0, offline", *(f"{percent(f)} %" for f in figures)])
+    scores = {(group, name): score for group, name, score in _scores(languages)}
+    for group in dict.fromkeys(group for group, name in scores if name == "hama"):
+        hama, own = (scores[group, name]["final"] for name in ("hama", "own"))
+        for unit, title in _ERROR_TITLES.items():
+            rates = hama[f"{unit}_error_rate"], own[f"{unit}_error_rate"]
+            if rates[0] < rates[1]:
+                figures = (f"{percent(rate)} %" for rate in rates)
+                rows.append(
+                    [f"{_speech_title(group)}, {title}", _RECOGNIZER_TITLES["hama"], *figures]
+                )
     return rows
 
 
-def _by_language(results: Results) -> dict[str, dict[str, Results]]:
-    """Return the scores of each kind of speech by recognizer."""
-    scores: dict[str, dict[str, Results]] = {}
-    for recognizer, figures in results.get("languages", {}).items():
-        for group, score in figures["speech"].items():
-            scores.setdefault(group.removeprefix("language "), {})[recognizer] = score
-    return scores
+def _speech_title(group: str) -> str:
+    language = group.removeprefix("language ")
+    return _SPEECH_TITLES.get(language, language)
 
 
-def _score_cells(score: Results) -> list[str]:
-    delay = score.get("delay_ms", {})
-    errors = (
-        join_values(
-            percent(score[hypothesis][key])
-            for unit in _ERROR_TITLES
-            if (key := f"{unit}_error_rate") in score[hypothesis]
-        )
-        if hypothesis in score
-        else "-"
-        for hypothesis in ("final", "first")
-    )
+def _scores(results: Figures) -> Iterator[tuple[str, str, Figures]]:
+    """Yield kind of speech, recognizer and score, one kind after another."""
+    kinds = dict.fromkeys(kind for figures in results.values() for kind in figures["speech"])
+    for kind in kinds:
+        for name, figures in results.items():
+            if kind in figures["speech"]:
+                yield kind, name, figures["speech"][kind]
+
+
+def _score_cells(score: Figures) -> list[str]:
+    delay = score.get("delay_ms", {})  # missing if no phone was right
     return [
         str(score["final"]["phone_errors"]["reference"]),
-        *errors,
+        *(_error_cell(score.get(hypothesis, {})) for hypothesis in ("final", "first")),
         join_values(format_number(delay.get(key), ".0f") for key in ("p50", "p95")),
         join_values(percent(rate, ".0f") for rate in score["final"]["labials"].values()),
     ]
+
+
+def _error_cell(hypothesis: Figures) -> str:
+    rates = [hypothesis.get(f"{unit}_error_rate") for unit in _ERROR_TITLES]
+    return join_values(percent(rate) for rate in rates if rate is not None) or "-"

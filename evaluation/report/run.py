@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.evaluation.report.code_hash import code_hash
-from kouxing.evaluation.report.steps import FOLDER_OPTIONS, ROOT, STEPS
+from kouxing.evaluation.report.steps import FOLDER_OPTIONS, STEPS
+from kouxing.evaluation.source_tree import ROOT
 from kouxing.shared.terminal import print_message
 
 _OMITTED_KEYS = {

@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from kouxing.evaluation.rivals.tables import PROGRAMS
+from kouxing.evaluation.source_tree import ROOT, SAMPLE
 
-ROOT = Path(__file__).resolve().parents[2]  # root of the source tree, behind its links
 CONVERSATION = ROOT / "corpora" / "conversation.tsv"
-SAMPLE = ROOT / "shared" / "demo" / "hello-female.wav"
 
 # Options of ``kouxing evaluate report`` that give the folders of recordings.
 FOLDER_OPTIONS = {

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.attackers import ATTACKS
-from kouxing.evaluation.system.latency import percentiles, stream
+from kouxing.evaluation.system.latency import stream
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.evaluation.tables import format_number
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -35,7 +35,6 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import print_table
 
 PHASES = ("before", "during", "after")
 PHASE_S = 3.0
@@ -112,26 +111,6 @@ def measure(path: Path, console: Console) -> list[AttackResult]:
         return results
 
 
-def show(results: list[AttackResult], console: Console) -> None:
-    """Print the figures as a table, with the memory of the service that grew most."""
-    columns = ("attack", "target", "key", "service", "growth MB", "kept MB", "p95 ms by phase")
-    print_table(console, "", columns, map(_row, results))
-
-
-def _row(result: AttackResult) -> list[str]:
-    worst = max(result.growth_mb, key=lambda service: result.growth_mb[service])
-    notes = [f"{service} restarted" for service in result.restarted]
-    return [
-        "; ".join([result.attack, *notes]),
-        result.target,
-        "yes" if result.has_key else "no",
-        worst,
-        f"{result.growth_mb[worst]:.1f}",
-        f"{result.kept_mb[worst]:.1f}",
-        " / ".join(format_number(result.p95_ms[phase], ".0f") for phase in PHASES),
-    ]
-
-
 def _result(
     system: LocalSystem,
     name: str,
@@ -170,7 +149,7 @@ def _delays_ms(control: str, speech: NDArray[np.float32]) -> dict[str, float | N
     phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
     phase = np.digitize(times_s, phase_ends_s)
     delays_ms = [delays_s[phase == number] * 1e3 for number in range(len(PHASES))]
-    p95_ms = [percentiles(values)["p95"] if values.size else None for values in delays_ms]
+    p95_ms = [percentiles(values).get("p95") for values in delays_ms]
     return dict(zip(PHASES, p95_ms, strict=True))
 
 

@@ -29,7 +29,6 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import print_table
 
 LATE_S = 0.3  # lateness above which the face is behind
 RECOVERED_S = 0.05  # maximum lateness of a face that has recovered
@@ -38,7 +37,6 @@ QUIET_S = 5.0  # measured time before the load
 AFTER_S = 15.0  # measured time after the load
 STEP_S = 0.02  # interval of the lateness values
 _PROC = Path("/proc")
-_COLUMNS = 10  # seconds in a row of the table
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,15 +80,6 @@ class BusyRun:
             if max(after[start : start + num_steady]) <= RECOVERED_S:
                 return start * STEP_S
         return None
-
-    @property
-    def worst_by_second_s(self) -> list[float]:
-        """The largest lateness of each second."""
-        size = round(1.0 / STEP_S)
-        return [
-            max(self.lateness_s[start : start + size])
-            for start in range(0, len(self.lateness_s), size)
-        ]
 
     @property
     def summary(self) -> dict[str, float | None]:
@@ -264,59 +253,3 @@ def _read_usage(process_id: int) -> tuple[float, int]:
         if line.startswith("voluntary_ctxt_switches")
     )
     return cpu_s, wake_ups
-
-
-def show(busy: BusyResults, console: Console) -> None:
-    """Print the lateness by second, a summary, and the resources that each service uses."""
-    for run in busy.runs:
-        rows = run.worst_by_second_s
-        print_table(
-            console,
-            f"{run.num_programs} busy programs for {run.load_s:g} s: "
-            "largest lateness of each second, ms",
-            ("from s", *(f"+{second}" for second in range(_COLUMNS))),
-            (
-                [
-                    str(start),
-                    *(f"{max(0.0, 1e3 * late_s):.0f}" for late_s in rows[start : start + _COLUMNS]),
-                ]
-                for start in range(0, len(rows), _COLUMNS)
-            ),
-        )
-    print_table(
-        console,
-        "",
-        (
-            "busy programs",
-            "worst s",
-            f"longest over {LATE_S:g} s",
-            "recovered after s",
-            "frames missing",
-            "quiet median ms",
-        ),
-        (
-            [
-                str(run.num_programs),
-                f"{run.worst_s:.2f}",
-                f"{run.longest_s:.2f}",
-                "never" if run.recovery_s is None else f"{run.recovery_s:.2f}",
-                f"{run.missing:.0%}",
-                f"{1e3 * run.quiet_median_s:.0f}",
-            ]
-            for run in busy.runs
-        ),
-    )
-    names = [*busy.idle, "all"]
-    print_table(
-        console,
-        "",
-        ("per second", "silence: cores", "wake-ups", "one session: cores", "wake-ups"),
-        ([name, *_cells(busy.idle, name), *_cells(busy.speaking, name)] for name in names),
-    )
-    console.print(f"load average before: {busy.machine_load:.1f}")
-
-
-def _cells(usage: Mapping[str, UsageRate], name: str) -> tuple[str, str]:
-    services = [usage[name]] if name in usage else usage.values()
-    cpu_cores = sum(service.cpu_cores for service in services)
-    return f"{cpu_cores:.3f}", f"{sum(service.wake_ups for service in services):.0f}"

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from typer.core import TyperGroup
 
 from kouxing.corpora.options import OptionalClips, Picture
+from kouxing.evaluation.source_tree import SAMPLE
+from kouxing.evaluation.tables import figures_table, show_results
 from kouxing.services.cli.options import Language
 from kouxing.services.recognizer.hop_controller import MAX_HOP
-from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output, write_json
-
-SENTENCE = Path(__file__).parents[2] / "shared" / "demo" / "hello-female.wav"
+from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output
 
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
 AudioFiles = Annotated[
@@ -52,24 +51,16 @@ def measure_latency(
 
     If Chromium is installed, the page is also measured. --language applies only to latency.
     """
+    from kouxing.evaluation.report.system_tables import system_table
     from kouxing.evaluation.system import chromium, costs, latency, page
 
     check_output(json_file, force=force)
-    delays = latency.measure(audio, CONSOLE, language)
-    sessions = costs.measure_sessions(audio)
-    images = costs.measure_images()
+    results = asdict(latency.measure(audio, CONSOLE, language))
+    results["sessions"] = costs.measure_sessions(audio)
+    results["rendering"] = asdict(costs.measure_images())
     drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
-    console = Console()
-    latency.show(delays, console)
-    costs.show_sessions(sessions, console)
-    costs.show_images(images, console)
-    if drawings:
-        page.show(drawings, console)
-    page_figures = {"drawings": {name: asdict(drawing) for name, drawing in drawings.items()}}
-    write_json(
-        json_file,
-        {**asdict(delays), "sessions": sessions, "rendering": asdict(images), "page": page_figures},
-    )
+    results["page"] = {"drawings": {name: asdict(drawing) for name, drawing in drawings.items()}}
+    show_results(json_file, results, system_table(chain=results), figures_table({"value": results}))
 
 
 @app.command(name="lips-page")
@@ -84,25 +75,27 @@ def lips_page(
     The figures are download, time to load, processor time and, with clips, accuracy. Needs
     Chromium. Other packages are compared after `npm ci` in the folder of kouxing-lips.
     """
-    from kouxing.evaluation.system.lips_page import measure, show
+    from kouxing.evaluation.report.system_tables import system_table
+    from kouxing.evaluation.system.lips_page import measure
 
     check_output(json_file, force=force)
-    figures = measure(audio, clips)
-    show(figures, Console())
-    ours, *others = (asdict(page) for page in figures)
-    write_json(json_file, ours | {"others": others})
+    pages = [asdict(page) for page in measure(audio, clips)]
+    results = {**pages[0], "others": pages[1:]}
+    columns = {page["name"]: page for page in pages}
+    show_results(json_file, results, system_table(browser=results), figures_table(columns))
 
 
 @app.command()
 def sizes(json_file: JsonFile = None, force: Force = False) -> None:
     """Measure model sizes, and the minimum processor time of the networks on this machine."""
-    from kouxing.evaluation.system.sizes import measure, show
+    from kouxing.evaluation.report.system_tables import system_table
+    from kouxing.evaluation.system.sizes import measure
 
     check_output(json_file, force=force)
-    figures = measure()
-    show(figures, Console())
-    floors = {f"hop {hop}": figures.floor_cores(hop) for hop in (1, MAX_HOP)}
-    write_json(json_file, asdict(figures) | {"floor_cores": floors})
+    sizes = measure()
+    floors = {f"hop {hop}": sizes.floor_cores(hop) for hop in (1, MAX_HOP)}
+    results = {**asdict(sizes), "floor_cores": floors}
+    show_results(json_file, results, system_table(sizes=results), figures_table({"value": results}))
 
 
 @app.command()
@@ -123,15 +116,24 @@ def load(
     grows in up to 9 steps.
     """
     from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.system.load import draw, measure, show
+    from kouxing.evaluation.report.system_tables import system_table
+    from kouxing.evaluation.system.load import draw, measure
 
     check_output(picture, json_file, force=force)
-    paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
+    paths = audio or sorted(SAMPLE.parent.glob("*.wav"))
     figures = measure(paths, sessions, seconds, CONSOLE, language)
-    show(figures, Console())
     if picture is not None:
         save_figure(draw(figures), picture)
-    write_json(json_file, asdict(figures) | {"summary": figures.summary})
+    results = {**asdict(figures), "summary": figures.summary}
+    steps = {str(step["num_asked"]): step for step in results["steps"]}
+    summary = {"value": {"machine_load": figures.machine_load, **figures.summary}}
+    show_results(
+        json_file,
+        results,
+        figures_table(steps),
+        system_table(load=results),
+        figures_table(summary),
+    )
 
 
 @app.command()
@@ -150,13 +152,22 @@ def busy(
 
     Also measures the processor time and the wake-ups of each service. Needs Linux.
     """
-    from kouxing.evaluation.system.busy import measure, show
+    from kouxing.evaluation.report.system_tables import system_table
+    from kouxing.evaluation.system.busy import measure
 
     check_output(json_file, force=force)
-    paths = audio or sorted(SENTENCE.parent.glob("*.wav"))
+    paths = audio or sorted(SAMPLE.parent.glob("*.wav"))
     figures = measure(paths, programs or (0, 2, 6), seconds, CONSOLE, language)
-    show(figures, Console())
-    write_json(json_file, asdict(figures) | {"summary": [run.summary for run in figures.runs]})
+    results = {**asdict(figures), "summary": [run.summary for run in figures.runs]}
+    summaries = {f"{run.num_programs} programs": run.summary for run in figures.runs}
+    usage = {"silence": results["idle"], "one session": results["speaking"]}
+    show_results(
+        json_file,
+        results,
+        system_table(busy=results),
+        figures_table(summaries),
+        figures_table(usage),
+    )
 
 
 def attacks(
@@ -164,12 +175,12 @@ def attacks(
     force: Force = False,
 ) -> None:
     """Measure what attackers cost the services (memory) and other clients (delay)."""
-    from kouxing.evaluation.system.attacks import measure, show
+    from kouxing.evaluation.report.system_tables import attacks_table
+    from kouxing.evaluation.system.attacks import measure
 
     check_output(json_file, force=force)
-    results = measure(SENTENCE, CONSOLE)
-    show(results, Console())
-    write_json(json_file, [asdict(result) for result in results])
+    results = [asdict(result) for result in measure(SAMPLE, CONSOLE)]
+    show_results(json_file, results, attacks_table(results))
 
 
 def faults(
@@ -189,9 +200,10 @@ def faults(
     Faults between hosts: "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut
     off for 2 s", "hosts, recognizer gone for good, one more" and the same for "synthesizer".
     """
-    from kouxing.evaluation.system.faults import TIMING, measure, show
+    from kouxing.evaluation.report.system_tables import faults_table
+    from kouxing.evaluation.system.faults import TIMING, measure
 
     check_output(json_file, force=force)
-    outcomes = list(measure(SENTENCE, fault or (), logs, CONSOLE, TIMING))
-    show(outcomes, Console())
-    write_json(json_file, [asdict(outcome) for outcome in outcomes])
+    outcomes = measure(SAMPLE, fault or (), logs, CONSOLE, TIMING)
+    results = [asdict(outcome) for outcome in outcomes]
+    show_results(json_file, results, faults_table(results))

@@ -1,7 +1,7 @@
 """Effects of a fault on a live face: how long it stopped, what was lost, how far it jumped."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from kouxing.corpora.scoring import count_errors
 from kouxing.evaluation.system.live import ReceivedResults
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.face.faps import FAPS
 
 MIN_STEP = 1.0  # FAP units; a smaller step is invisible
 LATE_S = 0.06  # a frame is late if it arrives more than this after its audio
@@ -28,11 +27,8 @@ class Continuity:
     phones_changed: int
     frames_lost: int
     frames_doubled: int  # frames whose media time had been received before
-    rest_frames: int  # frames of a silent client, though the client was not silent
     largest_step: float  # maximum over all FAPs, relative to the largest step without a fault
-    largest_step_fap: str
-    late_p50_ms: float  # after the audio of a frame was due
-    late_p95_ms: float
+    late_p95_ms: float  # after the audio of a frame was due
 
 
 def compare(
@@ -43,7 +39,7 @@ def compare(
     times = np.array([frame.media_time for _, frame in received.frames], np.int64)
     newest = np.maximum.accumulate(np.concatenate([[-1], times]))[:-1]  # before each frame
     is_new = times > newest
-    is_rest = np.diff(times, prepend=-1) == 0
+    is_rest = np.diff(times, prepend=-1) == 0  # frames of a silent client
     reference, recognized = (
         [phone.symbol for phone in record.spoken_phones()] for record in (undisturbed, received)
     )
@@ -64,21 +60,15 @@ def compare(
         phones_changed=errors.substitutions,
         frames_lost=len({frame.media_time for _, frame in undisturbed.frames} - {*times.tolist()}),
         frames_doubled=int((~is_new & ~is_rest).sum()),
-        rest_frames=int((is_rest & (arrived_s < received.live_until_s)).sum()),
         largest_step=float(ratios.max()),
-        largest_step_fap=FAPS[int(ratios.argmax())].name,
-        late_p50_ms=float(np.percentile(late_s, 50)) * 1e3,
         late_p95_ms=float(np.percentile(late_s, 95)) * 1e3,
     )
 
 
 def worst(faces: Sequence[Continuity]) -> Continuity:
     """Return the worst value of each figure of several sessions."""
-    largest = max(faces, key=lambda face: face.largest_step)
-    numbers = {field.name for field in fields(Continuity)} - {"largest_step_fap"}
-    return replace(
-        largest, **{name: max(getattr(face, name) for face in faces) for name in numbers}
-    )
+    names = [field.name for field in fields(Continuity)]
+    return Continuity(**{name: max(getattr(face, name) for face in faces) for name in names})
 
 
 def _late_until_s(due_s: NDArray[np.float64], late_s: NDArray[np.float64], fault_s: float) -> float:

@@ -11,10 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from kouxing.evaluation.system.live import CHUNK
-from kouxing.evaluation.tables import format_number
 from kouxing.services.driver.head.head import ASSETS, Detail, Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.video_writer import VideoWriter
@@ -27,7 +25,6 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level_faps import VISEMES
-from kouxing.shared.terminal import print_table
 
 MODELS = ("blocks", "light")
 NUM_SESSIONS = (1, 16)
@@ -51,13 +48,6 @@ def measure_sessions(path: Path) -> dict[str, float]:
             for lips, note in ((None, ""), (load_lip_predictor(), " with lips")):
                 costs[f"{name}, {num}{note}"] = _cpu_s(recognizer, lips, samples, num)
     return costs
-
-
-def show_sessions(costs: dict[str, float], console: Console) -> None:
-    """Print the costs as a table."""
-    rows = ((name, f"{value:.3f}") for name, value in costs.items())
-    columns = ("model, sessions of a recognizer", "CPU s per s of audio, each")
-    print_table(console, "", columns, rows)
 
 
 def _cpu_s(
@@ -119,23 +109,6 @@ def measure_images() -> RenderingCosts:
         renderer.close()
     size_bytes = (ASSETS / f"{DEFAULT_HEAD}.npz").stat().st_size
     return RenderingCosts(opengl, rates, stages, size_bytes, load_s)
-
-
-def show_images(rendering: RenderingCosts, console: Console) -> None:
-    """Print the figures as a table."""
-    names = list(dict.fromkeys(stage for ms in rendering.stages_ms.values() for stage in ms))
-    rows = [
-        [
-            case,
-            f"{rate:.0f}",
-            *(format_number(rendering.stages_ms[case].get(name), ".1f") for name in names),
-        ]
-        for case, rate in rendering.images_per_s.items()
-    ]
-    columns = (f"rendering with {rendering.opengl}", "images per s", *(f"{n} ms" for n in names))
-    print_table(console, "", columns, rows)
-    loading = ", ".join(f"{detail} {seconds:.2f} s" for detail, seconds in rendering.load_s.items())
-    console.print(f"the head: {rendering.asset_bytes / 1e6:.2f} MB, load time: {loading}")
 
 
 def _moving_face(number: int) -> NDArray[np.float32]:

@@ -35,7 +35,6 @@ from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
-from kouxing.shared.terminal import print_table
 
 NUM_SESSIONS = 16
 SPIN = """
@@ -234,32 +233,6 @@ def _worst_outcome(outcomes: Sequence[FaultOutcome]) -> FaultOutcome:
         late_p95_ms=max(late_ms, default=None),
         **{name: max(getattr(outcome, name) for outcome in outcomes) for name in numbers},
     )
-
-
-def show(outcomes: Collection[FaultOutcome], console: Console) -> None:
-    """Print the figures as a table, and which sessions did not complete."""
-    columns = ("fault", "stopped s", "late s", "phones lost, doubled, changed")
-    more = ("frames lost, doubled, at rest", "largest step", "p50, p95 ms", "load")
-    print_table(console, "", (*columns, *more), map(_fault_row, outcomes))
-
-
-def _fault_row(outcome: FaultOutcome) -> list[str]:
-    notes = [f"not completed: {outcome.failure}"] if outcome.failure else []
-    if outcome.num_refused:
-        notes.append(f"{outcome.num_refused} refused")
-    name, face = "; ".join([outcome.fault, *notes]), outcome.face
-    if face is None:
-        return [name, "no frame"]
-    return [
-        name,
-        f"{face.stood_s:.2f}",
-        f"{face.late_s:.2f}",
-        f"{face.phones_lost}, {face.phones_doubled}, {face.phones_changed} of {face.phones}",
-        f"{face.frames_lost}, {face.frames_doubled}, {face.rest_frames}",
-        f"{face.largest_step:.1f} x {face.largest_step_fap}",
-        f"{face.late_p50_ms:.0f}, {outcome.late_p95_ms:.0f}",
-        f"{outcome.load:.1f}",
-    ]
 
 
 @contextlib.contextmanager

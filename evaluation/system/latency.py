@@ -22,6 +22,7 @@ from kouxing_client import Client
 from numpy.typing import NDArray
 from rich.console import Console
 
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK_S, speak
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -30,7 +31,6 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import print_table
 
 NUM_REPEATS = 3  # number of times that the file is streamed
 
@@ -73,18 +73,6 @@ def measure(path: Path, console: Console, language: str | None = None) -> Latenc
     )
 
 
-def show(latency: Latency, console: Console) -> None:
-    """Print the figures as tables."""
-    delays = {
-        "chunk to frame": latency.chunk_to_frame_ms,
-        f"sound to frame ({latency.delay_ms:g} ms delay)": latency.sound_to_frame_ms,
-    }
-    rows = [[name, *(f"{ms:.1f}" for ms in row.values())] for name, row in delays.items()]
-    print_table(console, "", ("delay", "p50 ms", "p95 ms", "p99 ms"), rows)
-    costs = ((name, f"{value:.3f}") for name, value in latency.cpu_s_per_audio_s.items())
-    print_table(console, "", ("service", "CPU s per s of audio"), costs)
-
-
 def stream(
     client: Client, sound: NDArray[np.float32], delay_s: float, language: str | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -108,11 +96,6 @@ def stream(
             to_frame.append(arrival_s - received.sent_s[max(0, last_needed)])
             from_sound.append(arrival_s - received.sent_s[last_shown])
     return np.array(times), np.array(to_frame), np.array(from_sound)
-
-
-def percentiles(values_ms: NDArray[np.float64]) -> dict[str, float]:
-    """Return the 50th, 95th and 99th percentile."""
-    return {f"p{percent}": float(np.percentile(values_ms, percent)) for percent in (50, 95, 99)}
 
 
 def _cpu_s(client: Client) -> dict[str, float]:

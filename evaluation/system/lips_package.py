@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 
 from kouxing.corpora.scoring import ErrorCounts, count_errors
@@ -26,7 +25,7 @@ from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mout
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording, align_corpus
 from kouxing.evaluation.rivals.tables import find_node
-from kouxing.evaluation.tables import format_number, percent
+from kouxing.evaluation.source_tree import ROOT
 from kouxing.services.cli.web_model import web_model
 from kouxing.services.live_pipeline import recognize_events
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -37,13 +36,13 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent
-from kouxing.shared.terminal import CONSOLE, print_table
+from kouxing.shared.terminal import CONSOLE
 
 Samples = NDArray[np.float32]
 Faps = NDArray[np.float32]
 
 SERVER, PACKAGE, DIFFERENCE = "server", "package", "difference"
-_SCRIPT = Path(__file__).resolve().parents[2] / "clients/kouxing-lips/demo/frames.mjs"
+_SCRIPT = ROOT / "clients/kouxing-lips/demo/frames.mjs"
 _PHONES = {"light": True, "blocks": "final"}  # the package's option for each acoustic model
 _LIMIT_S = 600.0
 
@@ -190,16 +189,3 @@ def _compare_phones(
         counts[PACKAGE] += count_errors(truth, package_symbols)
         counts[DIFFERENCE] += count_errors(server_symbols, package_symbols)
     return counts
-
-
-def show(comparison: Comparison, console: Console) -> None:
-    """Print the figures as a table."""
-    correlation, f1 = comparison.opening_correlation, comparison.closure_f1
-    rows = [
-        ["opening r", *(format_number(correlation[name], ".3f") for name in (SERVER, PACKAGE))],
-        ["closures F1", *(format_number(f1[name], ".3f") for name in (SERVER, PACKAGE))],
-    ]
-    for model, rates in comparison.phone_error_rate.items():
-        names = SERVER, PACKAGE, DIFFERENCE
-        rows.append([f"{model}, wrong phones, %", *(percent(rates[name], ".2f") for name in names)])
-    print_table(console, "", ["figure", SERVER, PACKAGE, DIFFERENCE], rows)

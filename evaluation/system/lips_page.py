@@ -25,7 +25,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
@@ -33,21 +32,20 @@ from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_faps, real_mouth
 from kouxing.evaluation.lips.references import read_parts
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.rivals.tables import find_node
+from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone, write_wav
-from kouxing.evaluation.tables import format_number
 from kouxing.services.cli.web_model import web_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.terminal import print_table
 
 Array = NDArray[np.float64]
 
 OURS = "kouxing-lips"
 _NONE = "none"  # a page without lip sync
-_ROOT = Path(__file__).resolve().parents[2]  # root of the source tree, behind its links
-_OURS_FOLDER = _ROOT / "clients" / OURS
+_OURS_FOLDER = ROOT / "clients" / OURS
 MEASURE_S = 20.0
 _SIZE_PX = (400, 300)
 _CODE = ("index.js", "worker.js", "worklet.js", "frame-track.js", "engine")
@@ -187,7 +185,7 @@ def _build_site(profile: bytes | None) -> Iterator[Path]:
             (folder / file).symlink_to(_OURS_FOLDER / file)
         (folder / _PACKAGES).symlink_to(_OURS_FOLDER / "node_modules")
         (folder / "rivals.js").symlink_to(_OURS_FOLDER / "demo" / "rivals.js")
-        (folder / "visemes.tsv").symlink_to(_ROOT / "shared/face/high_level.tsv")
+        (folder / "visemes.tsv").symlink_to(ROOT / "shared/face/high_level.tsv")
         (folder / "models").mkdir()
         for file, content in web_model().items():
             (folder / "models" / file).write_bytes(content)
@@ -202,7 +200,7 @@ def _recordings(clips: Sequence[LipClip]) -> list[NDArray[np.float32]]:
 
 
 def _demo_samples() -> list[NDArray[np.float32]]:
-    files = sorted((_ROOT / "shared/demo").glob("*.wav"))
+    files = sorted((ROOT / "shared/demo").glob("*.wav"))
     return [read_audio(file)[0].reshape(-1) for file in files]
 
 
@@ -255,9 +253,7 @@ def _measure_page(folder: Path, voice: Path, origin: str, name: str, page_share:
             download_bytes=sum(len(gzip.compress(path.read_bytes())) for path in files),
             loaded_ms=browser.evaluate("window.loadedMs"),
             first_movement_ms=browser.evaluate("window.movedMs"),
-            delay_ms={f"p{p}": float(np.percentile(delays_ms, p)) for p in (50, 95)}
-            if name == OURS
-            else None,
+            delay_ms=percentiles(delays_ms) if name == OURS else None,
             processor_share=processor_share,
             page_share=page_share,
         )
@@ -308,35 +304,3 @@ def _shown_mouth(rows: Array, column: int, lag_s: float) -> Mouth:
     faps = np.zeros((len(time_s), NUM_FAPS))
     faps[:, _LOWER_LIP] = -np.interp(time_s + lag_s, rows[:, 0], rows[:, column])
     return predicted_mouth(faps)
-
-
-def show(pages: Sequence[LipsPage], console: Console) -> None:
-    """Print the figures as a table."""
-    columns = "package", "download kB", "loaded ms", "first movement ms", "core %", "of it page"
-    accuracy = "lag ms", "opening r", "closures F1"
-    rows = [
-        [
-            page.name,
-            f"{page.download_bytes / 1e3:.0f}",
-            f"{page.loaded_ms:.0f}",
-            f"{page.first_movement_ms:.0f}",
-            f"{100 * page.processor_share:.1f}",
-            f"{100 * page.page_share:.1f}",
-            *(
-                format_number(value, format_spec)
-                for value, format_spec in (
-                    (page.lag_ms, ".0f"),
-                    (page.opening_correlation, ".2f"),
-                    (page.closure_f1, ".2f"),
-                )
-                if page.num_clips
-            ),
-        ]
-        for page in pages
-    ]
-    has_accuracy = any(page.num_clips for page in pages)
-    print_table(console, "", [*columns, *(accuracy if has_accuracy else ())], rows)
-    for page in pages:
-        if page.delay_ms is not None:
-            delays = ", ".join(f"{name} {ms:.0f} ms" for name, ms in page.delay_ms.items())
-            console.print(f"{page.name}, from the sound to its weights: {delays}")

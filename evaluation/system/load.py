@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.corpora.figures import new_figure
-from kouxing.evaluation.system.latency import percentiles
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK, CHUNK_S
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.evaluation.tables import format_number
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -31,7 +30,6 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.client_connection import connect_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import plural, print_table
 
 LIMIT_MS = 60.0  # latency limit for 95 % of the frames
 CLIENT = "client"  # this process
@@ -204,57 +202,6 @@ def usage_of(client: Client) -> dict[str, CumulativeUsage]:
             missing = ", ".join({*KINDS} - usage.keys())
             raise UserError(f"no heartbeat for {MAX_LOST_S:g} s: {missing}")
         time.sleep(0.1)
-
-
-def show(load: Load, console: Console) -> None:
-    """Print the figures as tables, with a summary."""
-    services = list(load.steps[0].memory_mb)
-    print_table(
-        console,
-        "",
-        ("sessions", "refused", "p50 ms", "p95 ms", "worst p95", "at rest", "sent late"),
-        (
-            [
-                str(step.num_sessions),
-                ", ".join(f"{count} {code}" for code, count in step.refusals.items()) or "0",
-                *(format_number(step.delay_ms.get(key), ".1f") for key in ("p50", "p95")),
-                f"{step.worst_p95_ms:.1f}",
-                str(step.num_rest_frames),
-                f"{step.client_late_ms:.1f}",
-            ]
-            for step in load.steps
-        ),
-    )
-    print_table(
-        console,
-        "",
-        ("sessions", *(f"{name}: cores, MB" for name in services), "client: cores", "all: cores"),
-        (
-            [
-                str(step.num_sessions),
-                *(
-                    f"{step.cpu_cores.get(name, 0):.2f}, {step.memory_mb.get(name, 0):.0f}"
-                    for name in services
-                ),
-                f"{step.cpu_cores[CLIENT]:.2f}",
-                f"{sum(step.cpu_cores.values()):.2f}",
-            ]
-            for step in load.steps
-        ),
-    )
-    figures = load.summary
-    if load.best is None:
-        console.print(f"not even one session has 95 % of its frames within {LIMIT_MS:g} ms")
-        return
-    console.print(
-        f"With {plural(round(figures['sessions']), 'session')}, 95 % of the frames are within "
-        f"{LIMIT_MS:g} ms plus "
-        f"{load.delay_ms:g} ms of delay, on {load.cores} cores (load before: "
-        f"{load.machine_load:.1f}): {figures['sessions_per_core']:.1f} sessions per core, "
-        f"{figures['sessions_per_busy_core']:.1f} per used core. A session needs "
-        f"{figures['recognizer_mb_per_session']:.1f} MB in the recognizer and "
-        f"{figures['synthesizer_mb_per_session']:.1f} MB in the synthesizer."
-    )
 
 
 def draw(load: Load) -> Any:

@@ -17,9 +17,7 @@ from rich.console import Console
 
 from kouxing.evaluation.system.chromium import Chromium, write_microphone
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.evaluation.tables import format_number
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import print_table
 
 SIZE_PX = (1100, 800)
 SETTLE_S = 12.0  # the page needs this to choose its resolution and its playout delay
@@ -55,25 +53,6 @@ def measure(path: Path, console: Console) -> dict[str, Drawing]:
                 raise UserError(f"the page did not respond in time: {error}") from None
             finally:
                 browser.close()
-
-
-def show(drawings: dict[str, Drawing], console: Console) -> None:
-    """Print the figures as a table."""
-    columns = ("pictures per s", "size", "ms", "CPU ms", "voice to frame", "to picture ms", "load")
-    rows = [
-        [
-            name,
-            f"{drawing.pictures_per_s:.1f}",
-            "{} x {}".format(*drawing.size_px),
-            f"{drawing.picture_ms:.0f}",
-            f"{drawing.picture_cpu_ms:.0f}",
-            format_number(drawing.voice_to_frame_ms, ".0f"),
-            format_number(drawing.voice_to_picture_ms, ".0f"),
-            f"{drawing.load:.1f}",
-        ]
-        for name, drawing in drawings.items()
-    ]
-    print_table(console, "", ("page of {} x {}".format(*SIZE_PX), *columns), rows)
 
 
 def _measure(browser: Chromium, url: str) -> dict[str, Drawing]:

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from kouxing_client.messages import encode
-from rich.console import Console
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import MODELS_FOLDER, load_model
 from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.terminal import print_table
 
 _MATRIX_SIZE, _MEASURE_S = 512, 0.5
 _POSITIONS_PER_S = 50
@@ -79,18 +77,3 @@ def _gemm_gflops() -> float:
         _ = matrix @ matrix
         num += 1
     return _OPERATIONS * num * _MATRIX_SIZE**3 / (time.process_time() - start_s) / 1e9
-
-
-def show(sizes: Sizes, console: Console) -> None:
-    """Print the figures as a table."""
-    rows = [(f"model {name}", f"{size / 1e6:.2f} MB") for name, size in sizes.model_bytes.items()]
-    rows += [
-        (f"{name}, per second of speech", f"{gflop:.1f} Gflop")
-        for name, gflop in sizes.network_gflop_per_s.items()
-    ]
-    rows += [
-        ("message with a FAP frame", f"{sizes.frame_bytes} bytes"),
-        ("matrix product, one core", f"{sizes.gemm_gflops:.0f} Gflop/s"),
-        ("floor of both networks", f"{sizes.floor_cores():.2f} cores"),
-    ]
-    print_table(console, "", ("figure", "value"), rows)

@@ -25,7 +25,6 @@ def test_the_summary_has_worst_lateness_and_recovery_time() -> None:
     assert run.worst_s == 0.6
     assert run.longest_s == pytest.approx(0.7)
     assert run.recovery_s == pytest.approx(1.0)
-    assert run.worst_by_second_s == [0.0, 0.6, 0.6, 0.04, 0.04]
     assert _run([(5.0, 0.1)], 2.0).recovery_s is None
 
 

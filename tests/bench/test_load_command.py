@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from kouxing.evaluation.system.commands import app
+from kouxing.evaluation.tables import format_figure
 from kouxing.services.service_kinds import KINDS
 from tests.system import VOWELS_FILE
 
@@ -37,5 +38,5 @@ def test_the_command_prints_writes_and_plots_the_same_figures(
         assert 0 < step["delay_ms"]["p50"] <= step["delay_ms"]["p95"]
         assert set(step["cpu_cores"]) == {*KINDS, "client"}
         assert step["memory_mb"]["recognizer"] > 50
-    assert f"{load['steps'][0]['delay_ms']['p50']:.1f}" in result.stdout
+    assert format_figure(load["steps"][0]["delay_ms"]["p50"]) in result.stdout
     assert picture.read_bytes().startswith(b"\x89PNG")

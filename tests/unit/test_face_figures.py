@@ -1,16 +1,14 @@
 """Figures of a face's motion."""
 
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
-from rich.console import Console
 
 from kouxing.corpora.emotions import read_emotions
 from kouxing.evaluation import face_motion
-from kouxing.evaluation.face_motion import measure_face, print_face
+from kouxing.evaluation.face_motion import measure_face
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
@@ -41,9 +39,6 @@ def test_a_moving_face_has_all_figures(folder: Path, monkeypatch: pytest.MonkeyP
     assert figures.still_at_rest < 0.5
     assert figures.longest_still_s < 2.0
     assert 0.0 < (figures.chance or 0.0) < 0.5
-    output = io.StringIO()
-    print_face(figures, Console(file=output, width=80))
-    assert "nods per minute of speech" in output.getvalue()
 
 
 def test_movements_match_the_stressed_vowels_that_they_follow() -> None:

@@ -1,17 +1,15 @@
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from kouxing.corpora.scoring import align_symbols
 from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
 from kouxing.evaluation.recognizer.disturbances import check_conditions, disturbances_for
 from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
-from kouxing.evaluation.recognizer.report import print_figures
 from kouxing.evaluation.recognizer.synthetic_sounds import varying_noise as noise
+from kouxing.evaluation.report.recognition_table import speech_table
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
@@ -58,9 +56,11 @@ def test_a_corpus_with_bad_rows_is_evaluated(
     disturbances = disturbances_for(references, noise(1.0), ["room"])
     results = evaluate_recognizer(model, references, disturbances, OutputRuleConfig(1, 0.9))
     json.dumps(results)  # everything is plain
-    output = io.StringIO()
-    print_figures({"blocks": results}, "dev", Console(file=output, width=80))
-    assert "dev: 1 recording, 1 speaker. " in output.getvalue()
+    table = speech_table({"blocks": results})
+    assert table.title == "1 recording, 1 speaker"
+    assert [row[:3] for row in table.rows] == [
+        [kind, "blocks", "6"] for kind in ("clean", "room", "5.5 to 7/s")
+    ]
     assert list(results["speech"]) == ["clean", "room", "5.5 to 7/s"]
     assert set(results["rules"]) == {"N = 3", "N = 3, conf. 0.99"}
     clean = results["speech"]["clean"]

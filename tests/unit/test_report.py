@@ -14,7 +14,8 @@ from kouxing.evaluation.report import run
 from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.page import TABLES
 from kouxing.evaluation.report.run import run_steps, write_result
-from kouxing.evaluation.report.steps import ROOT, STEPS, Step
+from kouxing.evaluation.report.steps import STEPS, Step
+from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.commands import app as bench_app
 from kouxing.shared.errors import UserError
 

@@ -7,6 +7,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from kouxing.evaluation.tables import figures_table
 from kouxing.shared.terminal import print_table
 
 COLUMNS = ("scale", "condition", "all scores", "without outliers", "judges", "outliers")
@@ -24,3 +25,17 @@ def test_a_table_fits_and_keeps_words_whole(width: int) -> None:
     words = {word for cell in itertools.chain(COLUMNS, *ROWS) for word in cell.split()}
     assert words <= set(re.split(r"[\s:]+", printed))
     assert max(map(len, printed.splitlines())) <= width
+
+
+def test_the_table_of_figures_has_a_column_for_each_result() -> None:
+    one = {"num": 3, "delay_ms": {"p50": 1.234, "p95": 12.34}, "size": (4, 3)}
+    two = {"num": 1234.5, "delay_ms": {}, "note": None}
+    table = figures_table({"1": one, "2": two})
+    assert table.columns == ("figure", "1", "2")
+    assert table.rows == [
+        ["num", "3", "1234"],
+        ["delay_ms, p50", "1.23", "-"],
+        ["delay_ms, p95", "12.3", "-"],
+        ["size", "4 / 3", "-"],
+        ["note", "-", "-"],
+    ]

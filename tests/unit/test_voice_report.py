@@ -1,13 +1,11 @@
 """Shares of time with voice activity, and the sounds that they are measured with."""
 
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 from numpy.typing import NDArray
-from rich.console import Console
 
 from kouxing.corpora.sounds import Sound, read_sounds
 from kouxing.corpora.speech_corpus import Utterance
@@ -19,9 +17,9 @@ from kouxing.evaluation.recognizer.voice_activity import (
     LabeledAudio,
     evaluate_voice,
     labeled_audio,
-    print_voice,
     voice_states,
 )
+from kouxing.evaluation.report.recognition_table import voice_table
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
@@ -66,16 +64,13 @@ def test_measures_parts_with_and_without_a_voice(monkeypatch: pytest.MonkeyPatch
     pieces = [(np.zeros(4, np.float32), mask) for mask in masks]
     voiced = (np.zeros(2, np.float32), np.full(2, True))
     materials = [LabeledAudio("mixed", pieces), LabeledAudio("voice", [voiced])]
-    results = evaluate_voice({"one": load_model("gmm")}, materials)
-    shares = results["one"]["mixed"]
+    results = evaluate_voice(load_model("gmm"), materials)
+    shares = results["mixed"]
     assert shares["seconds"] == {"voice": pytest.approx(0.08), "no_voice": pytest.approx(0.08)}
     assert shares["on"] == {"voice": 0.75, "no_voice": 0.25}
     assert (shares["laughter"], shares["breath"]) == (0.5, 0.0)
-    assert results["one"]["voice"]["on"]["no_voice"] is None
-    output = io.StringIO()
-    print_voice(results | {"two": results["one"]}, "dev", Console(file=output, width=80))
-    assert "dev. A: one, B: two" in output.getvalue()
-    assert output.getvalue().splitlines()[-1].split() == ["B", "0", "50.0", "-", "50.0", "0.0"]
+    assert results["voice"]["on"]["no_voice"] is None
+    assert voice_table(results).rows[1] == ["voice", "0", "50.0", "-", "50.0", "0.0"]
 
 
 def test_materials_have_a_voice_where_the_text_has_phones(
