@@ -12,10 +12,9 @@ from kouxing.training.blocks import batches, recipe
 from kouxing.training.blocks.recipe import train_blocks
 from kouxing.training.networks import optimizer, teacher
 from kouxing.training.networks.network import ReadoutShape
+from tests.corpora import write_noises, write_speech
 from tests.system import HELLO
 from tests.unit.test_block_model import SMALL
-from tests.unit.test_encoder_training import write_sounds
-from tests.unit.test_whisper_weights import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -43,7 +42,7 @@ def test_trains_resumes_and_writes_model_and_card(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr("kouxing.training.networks.whisper.EncoderShape", SMALL)
-    corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
+    corpus = write_speech(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
     output = tmp_path / "blocks.npz"
     train = partial(
         train_blocks,
@@ -52,7 +51,7 @@ def test_trains_resumes_and_writes_model_and_card(
         whisper=write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6)),
         start=model_path(start),
         untranscribed=[corpus],
-        sounds=[write_sounds(tmp_path / "sounds")],
+        sounds=[write_noises(tmp_path / "sounds")],
         seed=1,
     )
     with monkeypatch.context() as patch:

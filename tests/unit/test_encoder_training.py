@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 import torch
 
 from kouxing.corpora.feature_cache import as_integers
@@ -23,9 +22,9 @@ from kouxing.training.encoder.teachers import POSITION_SAMPLES
 from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import EncoderShape
+from tests.corpora import write_noises, write_speech
 from tests.system import HELLO
 from tests.unit.test_lips_training import name_for, write_clip
-from tests.unit.test_whisper_weights import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -80,17 +79,6 @@ def test_exported_steps_follow_pytorch() -> None:
         np.testing.assert_allclose(features[0, :128], expected.early[0, number], atol=0.05)
 
 
-def write_sounds(folder: Path) -> Path:
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    lines = ["path\tkind\tlicense"]
-    for kind in ("babble", "laughter"):
-        soundfile.write(folder / f"{kind}.wav", rng.normal(0, 0.1, 32_000), 16_000)
-        lines.append(f"{kind}.wav\t{kind}\tCC0")
-    (folder / "manifest.tsv").write_text("\n".join(lines) + "\n")
-    return folder
-
-
 def test_trains_resumes_and_writes_a_model(
     tmp_path: Path,
     whisper: Path,
@@ -102,13 +90,13 @@ def test_trains_resumes_and_writes_a_model(
     monkeypatch.setattr(targets, "CHUNK_SIZE", 2)
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
     monkeypatch.setattr(lip_teacher, "NUM_EPOCHS", 1)
-    corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
+    corpus = write_speech(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
     clips = tmp_path / "clips"
     clips.mkdir()
     write_clip(clips, name_for("train"), "anna", "CC0")
     write_clip(clips, name_for("choice"), "berta", "MIT")
     output = tmp_path / "encoder.npz"
-    sounds = [write_sounds(tmp_path / "sounds")]
+    sounds = [write_noises(tmp_path / "sounds")]
     train = partial(train_encoder, [corpus], output, whisper=whisper, clips=clips, sounds=sounds)
     train(untranscribed=[corpus], num_steps=2)
     train(untranscribed=[corpus], num_steps=3)
@@ -123,6 +111,6 @@ def test_trains_resumes_and_writes_a_model(
 def test_training_needs_speech_and_sounds(
     tmp_path: Path, whisper: Path, name: str, problem: str
 ) -> None:
-    corpus = write_corpus(tmp_path / "corpus", {name: HELLO})
+    corpus = write_speech(tmp_path / "corpus", {name: HELLO})
     with pytest.raises(UserError, match=problem):
         train_encoder([corpus], tmp_path / "encoder.npz", whisper=whisper, clips=tmp_path)

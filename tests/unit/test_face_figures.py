@@ -11,20 +11,22 @@ from kouxing.evaluation import face_motion
 from kouxing.evaluation.face_motion import measure_face
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
+from tests.corpora import write_manifest
 from tests.system import VOWELS_FILE
 
-COLUMNS = "path\tspeaker\tlicense\tseconds\tnote\tphones_path\n"
+COLUMNS = "path speaker license seconds note phones_path"
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Return a folder with one speaker's calm and loud vowels."""
     samples, rate_hz = soundfile.read(VOWELS_FILE, dtype="float32")
-    rows = COLUMNS
+    rows = []
     for name, gain, emotion in (("calm", 0.1, "boredom"), ("loud", 0.9, "anger"), ("x", 0.3, "")):
         soundfile.write(tmp_path / f"{name}.wav", gain * samples[:40_000], rate_hz)
-        rows += f"{name}.wav\tann\tCC0\t2.5\t{emotion and f'emotion {emotion}'}\tphones.tsv\n"
-    (tmp_path / "manifest.tsv").write_text(rows, encoding="utf-8")
+        note = emotion and f"emotion {emotion}"
+        rows.append(f"{name}.wav\tann\tCC0\t2.5\t{note}\tphones.tsv")
+    write_manifest(tmp_path, COLUMNS, rows)
     (tmp_path / "phones.tsv").write_text(
         "start_s\tmarks\n0.5\t2\n0.9\t+sth\n1.5\t+sth,3\n", encoding="utf-8"
     )
@@ -57,13 +59,11 @@ def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
     calm, loud, other = read_emotions(folder, only_distributable=True)
     assert (calm.emotion, loud.emotion, other.emotion) == ("boredom", "anger", None)
     assert calm.stressed_s == (0.5, 1.5)
-    manifest = folder / "manifest.tsv"
-    manifest.write_text(COLUMNS + "calm.wav\tann\tCC0\t2.5\tcalm\t\n", encoding="utf-8")
-    with pytest.raises(UserError, match="names no emotion"):
-        read_emotions(folder)
-    manifest.write_text("path\tspeaker\ncalm.wav\tann\n", encoding="utf-8")
-    with pytest.raises(UserError, match="lacks the columns license, seconds, note; it has "):
-        read_emotions(folder)
-    manifest.write_text(COLUMNS + "calm.wav\tann\tCC0\tlong\temotion fear\t\n", encoding="utf-8")
-    with pytest.raises(UserError, match="write the seconds as a number"):
-        read_emotions(folder)
+    for columns, row, problem in (
+        (COLUMNS, "calm.wav\tann\tCC0\t2.5\tcalm\t", "names no emotion"),
+        ("path speaker", "calm.wav\tann", "lacks the columns license, seconds, note; it has "),
+        (COLUMNS, "calm.wav\tann\tCC0\tlong\temotion fear\t", "write the seconds as a number"),
+    ):
+        write_manifest(folder, columns, [row])
+        with pytest.raises(UserError, match=problem):
+            read_emotions(folder)

@@ -11,6 +11,7 @@ from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.four_schemes import delay_by_one_phone, without_corrections
 from kouxing.shared.audio_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from tests.corpora import write_manifest
 from tests.lips import phone
 from tests.system import DEMO
 
@@ -70,23 +71,15 @@ def test_scheme_4_delays_each_phone_by_one() -> None:
 def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
     samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=11_200)
     soundfile.write(tmp_path / "hello.wav", samples, rate_hz)
-    (tmp_path / "manifest.tsv").write_text(
-        "utt_id\tpath\tspeaker\tsplit\ttext\nhello\thello.wav\tA\ttest\t你好\n", encoding="utf-8"
-    )
+    row = "hello\thello.wav\tA\ttest\t你好"
+    write_manifest(tmp_path, "utt_id path speaker split text", [row])
     videos = tmp_path / "videos"
     conditions = ["scheme1-learned", *(f"scheme{number}-learned-blocks" for number in (2, 3, 4))]
     for name in conditions[1:]:
         (videos / name).mkdir(parents=True)
         (videos / name / "hello.mp4").write_bytes(b"made before")
-    arguments = [
-        "schemes",
-        "--manifest",
-        str(tmp_path),
-        "--acoustic",
-        "blocks",
-        "--lips",
-        "learned",
-    ]
+    arguments = ["schemes", "--manifest", str(tmp_path)]
+    arguments += ["--acoustic", "blocks", "--lips", "learned"]
     outputs = ["--videos", str(videos), "--json", str(tmp_path / "figures.json")]
     result = CliRunner().invoke(app, [*arguments, *outputs], catch_exceptions=False)
     assert result.exit_code == 0, result.output

@@ -18,20 +18,18 @@ from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import find_language, load_inventory
 from kouxing.shared.phones.universal.segments import read_ipa
+from tests.corpora import write_manifest
 from tests.system import HELLO
 
 RULE = OutputRuleConfig(2, 0.95)
 
 
-def write_manifest(folder: Path) -> Path:
+def write_recordings(folder: Path) -> Path:
     """Write three recordings of the same short sound."""
     soundfile.write(folder / "a.wav", HELLO, 16_000)
     rows = [("a", "en-native", "nixaʊ"), ("b", "zh", "ni xaʊ"), ("c", "en-native", "nixaʊ")]
-    lines = [f"{name}\ta.wav\t{language}\t{name}\ttest\t-\t{ipa}" for name, language, ipa in rows]
-    path = folder / "manifest.tsv"
-    columns = "utt_id\tpath\tlanguage\tspeaker\tsplit\ttext\tipa"
-    path.write_text("\n".join([columns, *lines]) + "\n", encoding="utf-8")
-    return path
+    cells = [f"{name}\ta.wav\t{language}\t{name}\ttest\t-\t{ipa}" for name, language, ipa in rows]
+    return write_manifest(folder, "utt_id path language speaker split text ipa", cells)
 
 
 def test_listed_recordings_have_phones_and_a_language() -> None:
@@ -53,7 +51,7 @@ def test_listed_recordings_have_phones_and_a_language() -> None:
 def test_measures_each_recognizer_by_language(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    manifest = write_manifest(tmp_path)
+    manifest = write_recordings(tmp_path)
     references = align_corpus(load_model_for_language("universal"), manifest, "test")
     monkeypatch.setattr(
         languages, "_run_hama", lambda english: iter([("n", "i", "h", "a", "uh"), ()])

@@ -8,10 +8,7 @@ import pytest
 import soundfile
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, split_of
-from kouxing.services.recognizer.lip_predictor import (
-    LIP_FAPS,
-    load_lip_predictor,
-)
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.shared.errors import UserError
 from kouxing.training.lips.recipe import DELAYS_S, train_lips
 from tests.system import VOWELS_FILE, samples_of_file
@@ -60,7 +57,3 @@ def test_rejects_clips_without_a_free_license(tmp_path: Path) -> None:
     write_clip(tmp_path, "closed", "dora", "academic use only")
     with pytest.raises(UserError, match=r"no clip .* may be used"):
         train_lips(tmp_path, tmp_path / "lips.npz")
-
-
-NUM_PHRASE_POSITIONS, NUM_FEATURES, NUM_DELAYS = 400, 5, 2
-JAW, WIDTH, CORNER = (LIP_FAPS.index(fap) for fap in (3, 6, 59))

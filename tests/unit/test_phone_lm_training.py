@@ -19,6 +19,7 @@ from kouxing.training.phone_lm.recipe import (
     phones_of_text,
     train_phone_lm,
 )
+from tests.corpora import write_manifest
 from tests.languages import MANDARIN, NUM_PHONES, SIL, START, Table, step
 
 INDEX = MANDARIN.index
@@ -164,9 +165,6 @@ def test_rejects_a_word_model_of_wrong_files(
 @pytest.fixture
 def corpus(tmp_path: Path) -> Path:
     """One sentence that counts, and a word, synthetic speech and a sentence for dev."""
-    folder = tmp_path / "corpus"
-    folder.mkdir()
-    (folder / "a.wav").touch()
     sentence = "mei3 yi2 ge4 zi4 dou1 you2"
     rows = [
         f"a\ta.wav\tA\tCC0-1.0\ttrain\t9\t{sentence}",
@@ -176,8 +174,9 @@ def corpus(tmp_path: Path) -> Path:
         f"e\ta.wav\tA\tCC0-1.0\tdev\t9\t{sentence} zao3",
         f"f\tnone.wav\tA\tCC0-1.0\ttrain\t9\t{sentence} zao3",
     ]
-    header = "utt_id\tpath\tspeaker\tlicense\tsplit\tseconds\tpinyin"
-    (folder / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    columns = "utt_id path speaker license split seconds pinyin"
+    folder = write_manifest(tmp_path / "corpus", columns, rows).parent
+    (folder / "a.wav").touch()
     return folder
 
 

@@ -13,6 +13,7 @@ from kouxing.evaluation.report.recognition_table import speech_table
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
+from tests.corpora import write_manifest
 from tests.system import VOWELS_FILE
 
 
@@ -36,19 +37,17 @@ def test_aligns_random_strings_with_the_fewest_errors() -> None:
 def test_a_corpus_with_bad_rows_is_evaluated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    vowels = VOWELS_FILE
     (tmp_path / "noise.wav").write_bytes(b"no sound")
     rows = [
-        f"v\t{vowels}\tm\ttest\t2.2\t啊喔鹅衣乌迂\t",
+        f"v\t{VOWELS_FILE}\tm\ttest\t2.2\t啊喔鹅衣乌迂\t",
         "none\tnone.wav\tm\ttest\t2.2\t啊\ta1",
-        f"unknown\t{vowels}\tm\ttest\t2.2\t啊\txa1 kzo2",
-        f"long\t{vowels}\tm\ttest\t2.2\t啊\t" + "a1 " * 90,
-        f"lying\t{vowels}\tm\ttest\t60\t啊\t" + "bao1 " * 60,
+        f"unknown\t{VOWELS_FILE}\tm\ttest\t2.2\t啊\txa1 kzo2",
+        f"long\t{VOWELS_FILE}\tm\ttest\t2.2\t啊\t" + "a1 " * 90,
+        f"lying\t{VOWELS_FILE}\tm\ttest\t60\t啊\t" + "bao1 " * 60,
         "broken\tnoise.wav\tm\ttest\t2.2\t啊\ta1",
-        f"other\t{vowels}\tm\ttrain\t2.2\t啊\txa1",
+        f"other\t{VOWELS_FILE}\tm\ttrain\t2.2\t啊\txa1",
     ]
-    header = "utt_id\tpath\tspeaker\tsplit\tseconds\ttext\tpinyin"
-    (tmp_path / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    write_manifest(tmp_path, "utt_id path speaker split seconds text pinyin", rows)
     model = load_model()
     references = align_corpus(model, tmp_path, "test")
     reasons = "".join(capsys.readouterr().err.splitlines())

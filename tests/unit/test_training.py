@@ -15,6 +15,7 @@ from kouxing.shared.errors import UserError
 from kouxing.training.commands import app
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
+from tests.corpora import write_manifest
 from tests.languages import MANDARIN, SIL
 
 
@@ -27,13 +28,12 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write_corpus(folder: Path, rows: list[str], num_audio: int = 3) -> None:
-    folder.mkdir(exist_ok=True)
+    columns = "utt_id path speaker source licence split seconds text pinyin"
+    write_manifest(folder, columns, rows)
     rng = np.random.default_rng(0)
     for number in range(num_audio):
         sound = np.concatenate([np.zeros(4000), rng.normal(0, 0.1, 12_000), np.zeros(4000)])
         soundfile.write(folder / f"{number}.wav", sound, 16_000)
-    header = "utt_id\tpath\tspeaker\tsource\tlicence\tsplit\tseconds\ttext\tpinyin"
-    (folder / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
 
 
 def test_reads_a_manifest_and_reports_bad_rows(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_reads_an_aishell_folder(tmp_path: Path) -> None:
 def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not a corpus"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
-    (tmp_path / "manifest.tsv").write_text("utt_id\tpath\n")
+    write_manifest(tmp_path, "utt_id path")
     with pytest.raises(UserError, match="lacks the column pinyin or text"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_bytes("utt_id\tpath\tpinyin\n你".encode("gb18030"))

@@ -17,6 +17,7 @@ from kouxing.shared.phones.universal.segments import (
     read_ipa,
     symbol_to_ipa,
 )
+from tests.corpora import write_manifest
 from tests.languages import MANDARIN
 from tests.system import HELLO
 
@@ -135,8 +136,8 @@ def test_unreadable_labels_are_rejected(row: dict[str, str], message: str) -> No
 
 def test_each_row_of_a_corpus_has_its_language(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "a.wav", HELLO, 16_000)
-    lines = ["utt_id\tpath\tlanguage\ttext\tipa", "a\ta.wav\tde\t-\tja", "b\ta.wav\txx\tja\t"]
-    (tmp_path / "manifest.tsv").write_text("\n".join(lines) + "\n")
+    rows = ["a\ta.wav\tde\t-\tja", "b\ta.wav\txx\tja\t"]
+    write_manifest(tmp_path, "utt_id path language text ipa", rows)
     errors, inventory = RowErrors(), load_inventory("universal")
     (row,) = read_corpus(tmp_path, errors, inventory)
     assert row.language == "de"

@@ -12,12 +12,13 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.networks import optimizer
 from kouxing.training.universal import alignment, recipe, trainer
 from kouxing.training.universal.recipe import train_universal
+from tests.corpora import write_manifest
 from tests.system import HELLO
 from tests.unit.test_block_training import interrupt
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-COLUMNS = "utt_id path language speaker license split seconds text ipa phones_path".split()
+COLUMNS = "utt_id path language speaker license split seconds text ipa phones_path"
 
 
 @pytest.fixture(autouse=True)
@@ -28,7 +29,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer, "_NUM_CROPS", 2)
 
 
-def write_corpus(folder: Path, *, with_labels: bool = True) -> Path:
+def write_corpus(folder: Path) -> Path:
     folder.mkdir()
     soundfile.write(folder / "a.wav", HELLO, 16_000)
     labels = [("0", "0.2", "<p:>"), ("0.2", "0.6", "a"), ("0.6", "1.4", "aI"), ("1.4", "1.5", "n")]
@@ -39,12 +40,10 @@ def write_corpus(folder: Path, *, with_labels: bool = True) -> Path:
         {"utt_id": "b", "language": "fr", "speaker": "b", "ipa": "nina sa"},
         {"utt_id": "c", "language": "it", "speaker": "c", "ipa": "mama"},  # held out
         {"utt_id": "d", "language": "de", "speaker": "emodb_03", "ipa": "mama"},  # held out
+        {"utt_id": "emodb_a", "language": "de", "speaker": "emodb_08", "phones_path": "labels.tsv"},
     ]
-    if with_labels:
-        row = {"utt_id": "emodb_a", "language": "de", "speaker": "emodb_08"}
-        rows.append(row | {"phones_path": "labels.tsv"})
-    lines = ["\t".join((common | row).get(name, "") for name in COLUMNS) for row in rows]
-    (folder / "manifest.tsv").write_text("\n".join(["\t".join(COLUMNS), *lines]) + "\n")
+    cells = ["\t".join((common | row).get(name, "") for name in COLUMNS.split()) for row in rows]
+    write_manifest(folder, COLUMNS, cells)
     return folder
 
 

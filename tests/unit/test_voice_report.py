@@ -22,21 +22,21 @@ from kouxing.evaluation.recognizer.voice_activity import (
 from kouxing.evaluation.report.recognition_table import voice_table
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.events import Phone
+from tests.corpora import RATE_HZ, write_manifest
+from tests.lips import phone
 from tests.system import VOWELS_FILE
 
-RATE_HZ = 16_000
 PER_S = 50  # slices
 
 
 @pytest.fixture
 def sounds(tmp_path: Path) -> list[Sound]:
     """Return two pieces of music, of which the loud one is held out, and laughter."""
-    rows = ["path\tkind\tlicense"]
+    rows = []
     for name, kind, level in (("a", "music", 0.5), ("b", "music", 0.1), ("ha", "laughter", 0.2)):
         soundfile.write(tmp_path / f"{name}.flac", np.full(RATE_HZ, level), RATE_HZ)
         rows.append(f"{name}.flac\t{kind}\tCC0")
-    (tmp_path / "manifest.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    write_manifest(tmp_path, "path kind license", rows)
     return read_sounds([tmp_path], only_distributable=True)
 
 
@@ -77,8 +77,8 @@ def test_materials_have_a_voice_where_the_text_has_phones(
     sounds: list[Sound], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(voice_activity, "_SYNTHETIC_S", 1.0)
-    phone = Phone(index=0, symbol="a", onset_s=0.2, duration_s=0.4, confidence=1.0, final=True)
-    reference = AlignedRecording(Utterance(utterance_id="vowels", path=VOWELS_FILE), [phone])
+    vowels = Utterance(utterance_id="vowels", path=VOWELS_FILE)
+    reference = AlignedRecording(vowels, [phone(0, "a", 0.2, 0.4)])
     materials = labeled_audio([reference], {"clean": np.copy}, varying_noise(1.0), sounds)
     by_kind = {material.kind: material.recordings for material in materials}
     ((_, mask),) = by_kind["speech, clean"]
@@ -103,13 +103,12 @@ def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> No
 @pytest.mark.parametrize(
     ("rows", "problem"),
     [
-        ("", "lists no sounds"),
-        ("a.flac\t\n", "lacks the column license"),
-        ("short row", "cannot read a sound in"),
+        ([], "lists no sounds"),
+        (["a.flac\t"], "lacks the column license"),
+        (["short row"], "cannot read a sound in"),
     ],
 )
-def test_reports_an_unusable_list_of_sounds(tmp_path: Path, rows: str, problem: str) -> None:
-    columns = "path\tkind" if "license" in problem else "kind\tlicense\tpath"
-    (tmp_path / "manifest.tsv").write_text(f"{columns}\n{rows}", encoding="utf-8")
+def test_reports_an_unusable_list_of_sounds(tmp_path: Path, rows: list[str], problem: str) -> None:
+    write_manifest(tmp_path, "path kind" if "license" in problem else "kind license path", rows)
     with pytest.raises(UserError, match=problem):
         read_sounds([tmp_path], only_distributable=False)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 import torch
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
@@ -69,20 +68,3 @@ def test_rejects_files_of_other_kinds_and_sizes(tmp_path: Path) -> None:
     refused("conv1/weight is quantized")
     (tmp_path / "model.bin").write_bytes(b"")
     refused("not a Whisper model")
-
-
-def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
-    """Recordings of one text; those whose name begins with d are for dev."""
-    folder.mkdir(exist_ok=True)
-    header = "utt_id\tpath\tspeaker\tlicense\tsplit\tseconds\tpinyin\n"
-    rows = ""
-    for name, sound in sounds.items():
-        soundfile.write(folder / f"{name}.wav", sound, 16_000)
-        split = "dev" if name.startswith("d") else "train"
-        pinyin = "ni3 hao3 huan1 ying2 lai2 dao4"
-        rows += f"{name}\t{name}.wav\tS\tCC0-1.0\t{split}\t1.5\t{pinyin}\n"
-    (folder / "manifest.tsv").write_text(header + rows, encoding="utf-8")
-    return folder
-
-
-# --- training
