@@ -6,8 +6,21 @@ from pathlib import Path
 
 import av
 import numpy as np
+import soundfile
 from numpy.typing import NDArray
 
+from kouxing.shared.audio_file import AudioSource
+
+SUFFIXES = {  # of each codec, for formats that soundfile cannot write
+    "aac": "aac m4a mp4 flv ts latm",
+    "libopus": "webm opus",
+    "pcm_s16le": "avi mkv voc sf",
+    "mp2": "nut mp2 wtv",
+    **{"pcm_bluray": "m2ts", "ac3": "rm", "wavpack": "wv", "sbc": "sbc", "pcm_s32le": "sox"},
+    **{"adpcm_yamaha": "mmf", "pcm_s16be_planar": "ast", "libopencore_amrnb": "amr"},
+    **{"wmav2": "wma", "adpcm_adx": "adx"},
+}
+CODECS = {suffix: codec for codec, suffixes in SUFFIXES.items() for suffix in suffixes.split()}
 Part = tuple[float, NDArray[np.float32]]  # start in seconds, and samples
 
 
@@ -23,6 +36,20 @@ def write_media(
 ) -> None:
     """Write mono samples, with a black video of ``video_s`` from 0 s if it is not 0."""
     write_tracks(path, codec, [[(start_s, samples)]], rate_hz, video_s=video_s, options=options)
+
+
+def write_sound(path: Path, samples: NDArray[np.float32], rate_hz: int, **options: str) -> bytes:
+    """Write mono samples in the format of the name's suffix; return the bytes of the file."""
+    if codec := CODECS.get(path.suffix[1:]):
+        write_media(path, codec, samples, rate_hz, options=options)
+    else:
+        soundfile.write(path, samples, rate_hz)
+    return path.read_bytes()
+
+
+def samples_of(source: AudioSource) -> NDArray[np.float32]:
+    """Return all samples (N, channels) of a source."""
+    return np.concatenate([*source.blocks])
 
 
 def write_tracks(

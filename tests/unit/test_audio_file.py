@@ -9,7 +9,7 @@ from kouxing.services.mono_audio import read_mono_16k
 from kouxing.shared.audio_file import open_audio, read_audio
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
-from tests.unit.media import write_media
+from tests.unit.media import samples_of, write_media
 from tests.videos import write_video
 
 
@@ -89,7 +89,7 @@ def test_reads_a_wav_file_whose_header_states_no_length(
     data[place : place + 4] = data_bytes.to_bytes(4, "little")
     path.write_bytes(data)
     source = open_audio(path)
-    np.testing.assert_allclose(np.concatenate([*source.blocks])[:, 0], sine, atol=1e-4)
+    np.testing.assert_allclose(samples_of(source)[:, 0], sine, atol=1e-4)
     assert source.warnings == []
 
 
@@ -121,8 +121,7 @@ def test_uses_one_channel_of_two_that_cancel_each_other(tmp_path: Path) -> None:
     sine = 0.5 * np.sin(np.arange(8000) * 0.1)
     soundfile.write(tmp_path / "a.wav", np.stack([sine, -0.95 * sine], axis=1), 16000)
     source = open_audio(tmp_path / "a.wav")
-    read = np.concatenate([*source.blocks])
-    np.testing.assert_allclose(read.mean(axis=1), sine, atol=1e-4)
+    np.testing.assert_allclose(samples_of(source).mean(axis=1), sine, atol=1e-4)
     (warning,) = source.warnings
     assert "only channel 1 is used" in warning
 

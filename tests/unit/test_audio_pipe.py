@@ -4,17 +4,19 @@ import io
 import os
 import sys
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pytest
 import soundfile
+from numpy.typing import NDArray
 
 from kouxing.shared.audio_file import AudioSource, open_audio, read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import RawFormat
 from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, is_sound
 from tests.system import DEMO
-from tests.unit.media import write_media
+from tests.unit.media import CODECS, samples_of, write_sound
 
 SPEECH = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
 RATE_HZ = 16_000
@@ -33,23 +35,44 @@ class Pipe(io.RawIOBase):
         return self._data.readinto(buffer[:777])
 
 
-def _open(monkeypatch: pytest.MonkeyPatch, data: bytes, **options: object) -> AudioSource:
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BufferedReader(Pipe(data))))
-    return open_audio(Path("-"), **options)  # type: ignore[arg-type]
+class Open(Protocol):
+    def __call__(self, data: bytes, raw: RawFormat | None = None) -> AudioSource: ...
 
 
-CODECS = {  # of formats that soundfile cannot write
-    **{"aac": "aac", "m4a": "aac", "webm": "libopus", "ts": "aac", "avi": "pcm_s16le"},
-    **{"m2ts": "pcm_bluray", "rm": "ac3", "voc": "pcm_s16le", "nut": "mp2", "wv": "wavpack"},
-    **{"latm": "aac", "sbc": "sbc", "sf": "pcm_s16le", "wtv": "mp2", "sox": "pcm_s32le"},
-    **{
-        "mmf": "adpcm_yamaha",
-        "ast": "pcm_s16be_planar",
-        "amr": "libopencore_amrnb",
-        "wma": "wmav2",
-    },
-    **{"adx": "adpcm_adx", "mp2": "mp2"},
-}
+@pytest.fixture
+def open_pipe(monkeypatch: pytest.MonkeyPatch) -> Open:
+    """Open data that arrives from standard input."""
+
+    def open_stdin(data: bytes, raw: RawFormat | None = None) -> AudioSource:
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BufferedReader(Pipe(data))))
+        return open_audio(Path("-"), raw=raw)
+
+    return open_stdin
+
+
+@pytest.fixture(params=["file", "pipe"])
+def open_either(request: pytest.FixtureRequest, tmp_path: Path, open_pipe: Open) -> Open:
+    """Open data in a file or from standard input."""
+
+    def open_file(data: bytes, raw: RawFormat | None = None) -> AudioSource:
+        (tmp_path / "a.wav").write_bytes(data)
+        return open_audio(tmp_path / "a.wav", raw=raw)
+
+    return open_file if request.param == "file" else open_pipe
+
+
+def wav_file(
+    samples: NDArray[np.floating],
+    rate_hz: int = RATE_HZ,
+    *,
+    subtype: str = "PCM_16",
+    format: str = "WAV",  # noqa: A002 - the name of the option in soundfile
+) -> bytes:
+    file = io.BytesIO()
+    soundfile.write(file, samples, rate_hz, subtype, format=format)
+    return file.getvalue()
+
+
 RATES_HZ = {"amr": 8_000, "mmf": 8_000, "sbc": 16_000, "mp2": 16_000}
 
 
@@ -58,22 +81,17 @@ RATES_HZ = {"amr": 8_000, "mmf": 8_000, "sbc": 16_000, "mp2": 16_000}
     ["a.mp3", "a.ogg", "a.flac", "a.wav", "a.aiff", "a.au", "a.caf", "a.w64", "rf64.rf64",
      "fast.m4a", *(f"a.{suffix}" for suffix in CODECS)],
 )  # fmt: skip
-def test_decodes_a_pipe_like_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_decodes_a_pipe_like_a_file(tmp_path: Path, open_pipe: Open, name: str) -> None:
     path, suffix = tmp_path / name, name.rpartition(".")[2]
-    if codec := CODECS.get(suffix):
-        options = {"movflags": "faststart"} if name == "fast.m4a" else {}
-        rate_hz = RATES_HZ.get(suffix, 48_000)
-        write_media(path, codec, SPEECH.repeat(3), rate_hz, options=options)
-    else:
-        soundfile.write(path, SPEECH, RATE_HZ)
+    options = {"movflags": "faststart"} if name == "fast.m4a" else {}
+    rate_hz = RATES_HZ.get(suffix, 48_000 if suffix in CODECS else RATE_HZ)
+    data = write_sound(path, SPEECH, rate_hz, **options)
     expected, rate_hz = read_audio(path)
-    assert is_sound(path.read_bytes()[:NUM_BEGIN_BYTES])
-    source = _open(monkeypatch, path.read_bytes())
-    samples = np.concatenate([*source.blocks])
+    assert is_sound(data[:NUM_BEGIN_BYTES])
+    source = open_pipe(data)
+    samples = samples_of(source)
     assert source.sample_rate_hz == rate_hz
-    is_read_first = suffix in ("caf", "m4a", "wv", "wtv")
+    is_read_first = suffix in ("caf", "m4a", "mp4", "wv", "wtv")
     assert is_read_first or source.duration_s is None
     assert len(samples) == len(expected) or suffix == "mp3"  # its padding at the end
     np.testing.assert_array_equal(samples[: len(expected)], expected)
@@ -85,79 +103,48 @@ def test_decodes_a_pipe_like_a_file(
     [("a.mp3", 20_000, 0), ("a.mp3", 0, 700), ("a.flac", 100_000, 0), ("a.m4a", 999, 0)],
 )
 def test_finds_a_format_after_padding_and_within_an_mp3_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, num_zeros: int, num_lost: int
+    tmp_path: Path, open_pipe: Open, name: str, num_zeros: int, num_lost: int
 ) -> None:
     path = tmp_path / name
-    if name == "a.m4a":
-        write_media(path, "aac", SPEECH, RATE_HZ, options={"movflags": "faststart"})
-    else:
-        soundfile.write(path, SPEECH, RATE_HZ)
+    data = write_sound(path, SPEECH, RATE_HZ, movflags="faststart")
     expected, _ = read_audio(path)
-    source = _open(monkeypatch, bytes(num_zeros) + path.read_bytes()[num_lost:])
-    samples = np.concatenate([*source.blocks])[:, 0]
+    source = open_pipe(bytes(num_zeros) + data[num_lost:])
+    samples = samples_of(source)[:, 0]
     assert source.notices == []
     part = expected[16_000:20_000, 0]  # at another time, if the first frame is missing
     assert np.correlate(samples, part).max() > 0.99 * float(part @ part)
 
 
 @pytest.mark.parametrize("subtype", ["G721_32", "NMS_ADPCM_32"])
-def test_wav_codecs_that_ffmpeg_misidentifies_are_rejected(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, subtype: str
-) -> None:
-    path = tmp_path / "a.wav"
-    soundfile.write(path, SPEECH, RATE_HZ, subtype=subtype)
+def test_wav_codecs_that_ffmpeg_misidentifies_are_rejected(open_either: Open, subtype: str) -> None:
     with pytest.raises(UserError, match=r"ADPCM is not supported; export"):
-        open_audio(path)
-    with pytest.raises(UserError, match=r"ADPCM is not supported; export"):
-        _open(monkeypatch, path.read_bytes())
-
-
-def test_reports_a_caf_file_that_is_cut_off(tmp_path: Path) -> None:
-    path = tmp_path / "a.caf"
-    soundfile.write(path, SPEECH, RATE_HZ)
-    path.write_bytes(path.read_bytes()[:-32_000])
-    source = open_audio(path)
-    assert sum(map(len, source.blocks)) == 16_000
-    (warning,) = source.warnings
-    assert warning.startswith(f"{path}: the file is cut off after 1.0 s of")
+        open_either(wav_file(SPEECH, subtype=subtype))
 
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT", "PCM_24", "PCM_U8", "ALAW", "ULAW"])
-def test_reads_every_encoding_of_a_wav_pipe(monkeypatch: pytest.MonkeyPatch, subtype: str) -> None:
-    file = io.BytesIO()
-    soundfile.write(file, np.full((3000, 2), 0.25), 24000, subtype=subtype, format="WAV")
-    data = file.getvalue() + b"LIST\4\0\0\0abcd"  # which is not sound
-    source = _open(monkeypatch, data)
-    assert (source.sample_rate_hz, source.num_channels) == (24000, 2)
-    samples = np.concatenate([*source.blocks])
+def test_reads_every_encoding_of_a_wav_pipe(open_pipe: Open, subtype: str) -> None:
+    data = wav_file(np.full((3000, 2), 0.25), 24_000, subtype=subtype)
+    source = open_pipe(data + b"LIST\4\0\0\0abcd")  # which is not sound
+    assert (source.sample_rate_hz, source.num_channels) == (24_000, 2)
+    samples = samples_of(source)
     assert len(samples) == 3000
     np.testing.assert_allclose(samples, 0.25, atol=0.01)
 
 
-def test_reads_all_parts_of_a_wav_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    path = tmp_path / "a.wav"
-    soundfile.write(path, SPEECH, RATE_HZ)
-    data = path.read_bytes()
+def test_reads_all_parts_of_a_wav_file(open_either: Open) -> None:
+    data = wav_file(SPEECH)
     data = data[:4] + (2 * len(data)).to_bytes(4, "little") + data[8:]
-    path.write_bytes(data + b"LIST\4\0\0\0abcd" + data[data.index(b"data") :])
-    for source in (open_audio(path), _open(monkeypatch, path.read_bytes())):
-        samples = np.concatenate([*source.blocks])[:, 0]
-        np.testing.assert_allclose(samples, np.tile(SPEECH, 2), atol=1e-4)
-        assert source.warnings == []
+    source = open_either(data + b"LIST\4\0\0\0abcd" + data[data.index(b"data") :])
+    np.testing.assert_allclose(samples_of(source)[:, 0], np.tile(SPEECH, 2), atol=1e-4)
+    assert source.warnings == []
 
 
 @pytest.mark.parametrize(("bits", "valid_bits"), [(32, 24), (32, 20), (32, 16), (24, 20)])
-def test_reads_wav_samples_with_unused_bits(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bits: int, valid_bits: int
-) -> None:
-    file = io.BytesIO()
-    soundfile.write(file, SPEECH, RATE_HZ, f"PCM_{bits}", format="WAVEX")
-    data = bytearray(file.getvalue())
+def test_reads_wav_samples_with_unused_bits(open_either: Open, bits: int, valid_bits: int) -> None:
+    data = bytearray(wav_file(SPEECH, subtype=f"PCM_{bits}", format="WAVEX"))
     place = data.find(b"fmt ") + 8 + 18
     data[place : place + 2] = valid_bits.to_bytes(2, "little")
-    (tmp_path / "a.wav").write_bytes(data)
-    for source in (open_audio(tmp_path / "a.wav"), _open(monkeypatch, bytes(data))):
-        np.testing.assert_allclose(np.concatenate([*source.blocks])[:, 0], SPEECH, atol=1e-4)
+    np.testing.assert_allclose(samples_of(open_either(data))[:, 0], SPEECH, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -170,42 +157,30 @@ def test_reads_wav_samples_with_unused_bits(
     ],
 )
 def test_reports_a_wrong_wav_header(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, place: int, field: bytes, message: str
+    open_either: Open, place: int, field: bytes, message: str
 ) -> None:
-    path = tmp_path / "a.wav"
-    soundfile.write(path, np.full(8000, 0.25), 16_000)
-    data = bytearray(path.read_bytes())
+    data = bytearray(wav_file(np.full(8000, 0.25)))
     data[place : place + len(field)] = field
     data[4:8] = (32_036).to_bytes(4, "little")
-    path.write_bytes(data)
-    for is_pipe in (False, True):
-        try:
-            source = _open(monkeypatch, bytes(data)) if is_pipe else open_audio(path)
-            assert sum(map(len, source.blocks)) == 8000
-            text = source.warnings[0]
-        except UserError as error:
-            text = str(error)
-        assert message in text
+    try:
+        source = open_either(data)
+        assert len(samples_of(source)) == 8000
+        text = source.warnings[0]
+    except UserError as error:
+        text = str(error)
+    assert message in text
 
 
-def test_reports_the_length_of_a_cut_wav_pipe_with_a_high_rate(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    soundfile.write(tmp_path / "a.wav", np.full(4 * 96_000, 0.25), 96_000)
-    source = _open(monkeypatch, (tmp_path / "a.wav").read_bytes()[: 2 * 96_000 * 2 + 44])
-    for _ in source.blocks:
-        pass
+def test_reports_the_length_of_a_cut_wav_pipe_with_a_high_rate(open_pipe: Open) -> None:
+    source = open_pipe(wav_file(np.full(4 * 96_000, 0.25), 96_000)[: 2 * 96_000 * 2 + 44])
+    samples_of(source)
     assert "cut off after 2.0 s of 4.0 s" in source.warnings[0]
 
 
 @pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])
 def test_samples_arrive_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
-    if path.suffix == ".webm":
-        write_media(path, "libopus", SPEECH.repeat(3), 48_000)
-    else:
-        soundfile.write(path, SPEECH, RATE_HZ)
-    data = path.read_bytes()
+    data = write_sound(path, SPEECH.repeat(3), 48_000)
     os.mkfifo(tmp_path / "fifo")
     writer = os.open(tmp_path / "fifo", os.O_RDWR)
     os.write(writer, data[: len(data) // 3])
@@ -215,33 +190,28 @@ def test_samples_arrive_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     [*source.blocks]  # noqa: B018 - it ends in the middle of a packet
 
 
-def test_reports_a_cut_flv_pipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    path = tmp_path / "a.flv"
-    write_media(path, "aac", SPEECH.repeat(3), 48_000)
+def test_reports_a_cut_flv_pipe(open_pipe: Open, tmp_path: Path) -> None:
+    data = write_sound(tmp_path / "a.flv", SPEECH.repeat(3), 48_000)
     for share in np.linspace(0.4, 0.9, 20):  # FFmpeg takes some of these ends for a new track
-        source = _open(monkeypatch, path.read_bytes()[: int(path.stat().st_size * share)])
-        assert len([*source.blocks]) > 0
+        assert [*open_pipe(data[: int(len(data) * share)]).blocks]
 
 
-def test_raw_samples_are_read_with_a_notice_if_no_format_fits(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_raw_samples_are_read_with_a_notice_if_no_format_fits(open_pipe: Open) -> None:
     values = np.arange(-1000, 1000, dtype="<i2")
-    source = _open(monkeypatch, values.tobytes() + b"\x01")
-    np.testing.assert_allclose(np.concatenate([*source.blocks]).ravel() * 32768, values)
+    source = open_pipe(values.tobytes() + b"\x01")
+    np.testing.assert_allclose(samples_of(source).ravel() * 32768, values)
     (notice,) = source.notices
     assert "raw samples: 16-bit, mono, 16000 Hz" in notice
-    source = _open(monkeypatch, values.tobytes(), raw=RawFormat(24_000, 2))
+    source = open_pipe(values.tobytes(), RawFormat(24_000, 2))
     assert (source.sample_rate_hz, source.num_channels, source.notices) == (24_000, 2, [])
-    source = _open(monkeypatch, b"RIFF" + values.tobytes(), raw=RawFormat())
-    assert len(np.concatenate([*source.blocks])) == 2002
+    assert len(samples_of(open_pipe(b"RIFF" + values.tobytes(), RawFormat()))) == 2002
 
 
-def test_a_voice_in_one_of_many_raw_channels_stays_loud(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_voice_in_one_of_many_raw_channels_stays_loud(open_pipe: Open) -> None:
     channels = np.zeros((3200, 8), "<i2")
     channels[:, 5] = 16_384 * np.sin(np.arange(3200) * 0.1)
-    source = _open(monkeypatch, channels.tobytes(), raw=RawFormat(16_000, 8))
-    samples = np.concatenate([*source.blocks])
+    source = open_pipe(channels.tobytes(), RawFormat(16_000, 8))
+    samples = samples_of(source)
     assert source.num_channels == samples.shape[1] == 2
     np.testing.assert_allclose(samples.mean(axis=1) * 32_768, channels[:, 5], atol=1)
 
@@ -255,20 +225,20 @@ def test_quiet_raw_samples_are_not_taken_for_frames() -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "options", "message"),
+    ("data", "raw", "message"),
     [
-        (b"", {}, "no sound arrived"),
-        (b'{"error": "invalid key"}', {}, 'this is text, not sound: \'{"error": "invalid key'),
-        (b"\x1f\x8b\x08" + bytes(99), {}, "gzip archive; unpack"),
-        (b"\2#!SILK_V3" + bytes(99), {}, "SILK voice message"),
-        (b"\0" * 99, {"raw": RawFormat(4_000)}, "4000 Hz is too low"),
+        (b"", None, "no sound arrived"),
+        (b'{"error": "invalid key"}', None, 'this is text, not sound: \'{"error": "invalid key'),
+        (b"\x1f\x8b\x08" + bytes(99), None, "gzip archive; unpack"),
+        (b"\2#!SILK_V3" + bytes(99), None, "SILK voice message"),
+        (b"\0" * 99, RawFormat(4_000), "4000 Hz is too low"),
     ],
 )
 def test_rejects_a_pipe_that_is_not_sound(
-    monkeypatch: pytest.MonkeyPatch, data: bytes, options: dict[str, object], message: str
+    open_pipe: Open, data: bytes, raw: RawFormat | None, message: str
 ) -> None:
     with pytest.raises(UserError, match=f"standard input: .*{message}"):
-        _open(monkeypatch, data, **options)
+        open_pipe(data, raw)
 
 
 @pytest.mark.parametrize("num_bytes", [0, 300, 3000, 9000])
@@ -283,8 +253,7 @@ def test_ctrl_c_ends_reading_at_any_place(
                 raise KeyboardInterrupt
             return size
 
-    soundfile.write(tmp_path / name, SPEECH, RATE_HZ)
-    pipe = InterruptedPipe((tmp_path / name).read_bytes()[:num_bytes])
+    pipe = InterruptedPipe(write_sound(tmp_path / name, SPEECH, RATE_HZ)[:num_bytes])
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BufferedReader(pipe)))
     with pytest.raises(KeyboardInterrupt):
         [*open_audio(Path("-")).blocks]

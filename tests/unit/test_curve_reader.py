@@ -13,7 +13,7 @@ from kouxing.services.cli.options import CurveFormat, ExportOptions
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT
-from kouxing.shared.phones.events import Phone
+from tests.lips import phone
 
 RATE_HZ = 50.0
 JAW = FAP_NUMBER["open_jaw"] - 1
@@ -27,8 +27,7 @@ def face_curves() -> FrameStream:
         row[:] = ARKIT.faps(np.where(np.array(ARKIT.names) == "jawOpen", jaw_open, 0.0))
         row[HEAD_YAW] = 5000.0
     rows = [(number / RATE_HZ, number, row) for number, row in enumerate(faps)]
-    phone = Phone(index=0, symbol="a", onset_s=0.1, duration_s=0.195, confidence=1.0, final=True)
-    return FrameStream(rows, RATE_HZ, [phone])
+    return FrameStream(rows, RATE_HZ, [phone(0, "a", 0.1, 0.195)])
 
 
 @pytest.mark.parametrize(

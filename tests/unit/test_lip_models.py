@@ -14,8 +14,9 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
-from kouxing.shared.phones.events import Phone, Progress, SoundEvent
+from kouxing.shared.phones.events import Progress, SoundEvent
 from tests.documents import code_blocks
+from tests.lips import phone
 from tests.system import ROOT
 
 GUIDE = ROOT / "docs" / "extending.md"
@@ -63,8 +64,7 @@ def test_the_lip_model_of_the_guide_runs(tmp_path: Path, monkeypatch: pytest.Mon
     def jaw_after(event: SoundEvent) -> list[float]:
         return [float(faps[2]) for _, faps in face.process(event)]
 
-    vowel = Phone(index=0, symbol="a", onset_s=0.5, duration_s=0.5, confidence=1.0, final=True)
-    face.process(vowel)
+    face.process(phone(0, "a", 0.5, 0.5))
     jaw = jaw_after(Progress(time_s=2.0, level_db=-20.0))
     assert max(jaw[:25]) == 0.0  # before the vowel
     assert max(jaw[25:50]) == pytest.approx(300.0, abs=30.0)

@@ -44,6 +44,15 @@ def messages_of(outputs: Sequence[StreamOutput]) -> list[Message]:
     return [event_to_message(output) for output in outputs if not isinstance(output, Waveform)]
 
 
+def assert_same(
+    kinds: tuple[type, ...], outputs: Sequence[StreamOutput], expected: Sequence[StreamOutput]
+) -> None:
+    """Compare the events of each kind; events of different kinds may have another order."""
+    for kind in kinds:
+        assert of_kind(kind, expected)
+        assert messages_of(of_kind(kind, outputs)) == messages_of(of_kind(kind, expected))
+
+
 @pytest.mark.parametrize(("rate_hz", "size"), [(16_000, 97), (44_100, 1021)])
 def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
     expected, outputs = (
@@ -100,9 +109,7 @@ def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
         stream.stream.set_light_model(number == 1)
         outputs += stream.feed(part, chunk=320)
     outputs += stream.finish()
-    for kind in (LipPositions, SpeechChange, Progress):
-        one, two = (messages_of(of_kind(kind, results)) for results in (expected, outputs))
-        assert one == two
+    assert_same((LipPositions, SpeechChange, Progress), outputs, expected)
     phones = [phone for phone in of_kind(Phone, outputs) if phone.final]
     assert [phone.index for phone in phones] == list(range(len(phones)))
     end_s = 0.0
@@ -183,9 +190,7 @@ def test_lips_may_be_early_and_phones_are_the_same() -> None:
     recognizer.decode_streams([stream])
     outputs += recognizer.get_result(stream)
     assert num_early > 20
-    for kind in (Phone, LipPositions, Progress, SpeechChange):
-        same = [messages_of(of_kind(kind, results)) for results in (outputs, expected)]
-        assert same[0] == same[1]
+    assert_same((Phone, LipPositions, Progress, SpeechChange), outputs, expected)
 
 
 def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
@@ -219,10 +224,7 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
                 results += recognizer.get_result(stream)
         outputs.append(results)
     assert num_early > 5
-    for kind in (Phone, LipPositions, Progress, SpeechChange):
-        same = [messages_of(of_kind(kind, results)) for results in outputs]
-        assert same[0]
-        assert same[0] == same[1]
+    assert_same((Phone, LipPositions, Progress, SpeechChange), outputs[1], outputs[0])
 
 
 def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
@@ -251,33 +253,30 @@ def test_a_longer_hop_changes_only_the_phones() -> None:
     stream = LiveStream(MODEL, **FACE)
     stream.stream.set_hop(4)
     outputs = [*stream.feed(SAMPLES, chunk=320), *stream.finish()]
-    for kind in (LipPositions, Progress, SpeechChange):
-        same = [messages_of(of_kind(kind, results)) for results in (outputs, expected)]
-        assert same[0] == same[1]
-    symbols = [
+    assert_same((LipPositions, Progress, SpeechChange), outputs, expected)
+    found, wanted = (
         [phone.symbol for phone in of_kind(Phone, results) if phone.final and phone.is_spoken]
         for results in (outputs, expected)
-    ]
-    assert symbols[0] == symbols[1]
+    )
+    assert found == wanted
 
 
 def hello_phones() -> list[Phone]:
-    outputs = recognize_live(load_model(), HELLO, 320)
-    return [output for output in outputs if isinstance(output, Phone)]
+    return of_kind(Phone, recognize_live(MODEL, HELLO, 320))
 
 
 @pytest.mark.slow
 def test_silence_and_noise_have_no_phones() -> None:
     noise = np.random.default_rng(0).normal(0, 0.01, 32_000).astype(np.float32)
-    outputs = recognize_live(load_model(), noise, 320)
+    outputs = recognize_live(MODEL, noise, 320)
     assert not any(isinstance(output, Phone | SpeechChange) for output in outputs)
-    assert recognize_recording(load_model(), noise, 16_000) == []
+    assert recognize_recording(MODEL, noise, 16_000) == []
 
 
 @pytest.mark.slow
 def test_warm_up_compiles_everything_and_changes_no_result() -> None:
     expected = hello_phones()
-    Recognizer(load_model()).warm_up()
+    Recognizer(MODEL).warm_up()
     assert frame_search.advance_frames.signatures
     assert path_records.count_record_paths.signatures
     assert path_records.compact_records.signatures
