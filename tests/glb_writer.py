@@ -2,13 +2,31 @@
 
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+BONES = (
+    *("hips", "spine", "head", "leftEye", "rightEye"),
+    *(side + limb for side in ("left", "right") for limb in ("UpperArm", "LowerArm", "Hand")),
+    *(side + limb for side in ("left", "right") for limb in ("UpperLeg", "LowerLeg", "Foot")),
+)
+VRM_0_NAMES = {"aa": "a", "ih": "i", "ou": "u", "ee": "e", "oh": "o"}
+LOOK_SIDES = ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
+LOOK_RANGES = [f"rangeMap{side}" for side in LOOK_SIDES]
+LOOK_RANGE = {"inputMaxValue": 90.0, "outputScale": 90.0}
+TRANSFORMS: dict[str, dict[str, list[float]]] = {  # of whole files; the unit is 1 cm
+    "z up": {"scale": [100, 100, 100], "rotation": [2**-0.5, 0, 0, 2**-0.5]},
+    "sideways": {"scale": [100, 100, 100], "rotation": [0, 2**-0.5, 0, 2**-0.5]},
+    "oblique": {"scale": [100, 100, 100], "rotation": [0, np.sin(0.3), 0, np.cos(0.3)]},
+    "upside down": {"scale": [100, 100, 100], "rotation": [0, 0, 1, 0]},
+    "turned": {"scale": [100, 100, 100], "rotation": [0, 1, 0, 0]},
+    "mirrored": {"scale": [100, 100, -100]},
+}
 
 
 @dataclass
@@ -104,6 +122,62 @@ def read_chunks(path: Path) -> tuple[dict[str, Any], bytearray]:
     return json.loads(data[20 : 20 + size]), bytearray(data[28 + size :])
 
 
+def edit(path: Path, change: Callable[[dict[str, Any], bytearray], object]) -> Path:
+    """Change the description and the binary chunk of a GLB."""
+    document, binary = read_chunks(path)
+    change(document, binary)
+    write_chunks(path, document, binary)
+    return path
+
+
+def wrap_scene(document: dict[str, Any], **transform: Any) -> None:
+    """Put the whole scene under one node with a transform."""
+    document["nodes"].append({"children": document["scenes"][0]["nodes"], **transform})
+    document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+
+
+def add_vrm(
+    document: dict[str, Any],
+    version: int,
+    expressions: Mapping[str, Sequence[tuple[int, int]]],
+    bones: Mapping[str, int],
+) -> None:
+    """Describe a GLB as VRM 0 or 1.
+
+    ``expressions`` are (mesh, morph target) pairs by their names in VRM 1; ``bones`` are nodes.
+    """
+    if version == 1:
+        node_of = {node["mesh"]: n for n, node in enumerate(document["nodes"]) if "mesh" in node}
+        binds = {
+            name: [{"node": node_of[mesh], "index": row, "weight": 1.0} for mesh, row in targets]
+            for name, targets in expressions.items()
+        }
+        about: dict[str, Any] = {
+            "specVersion": "1.0",
+            "meta": {"name": "x", "authors": ["x"], "licenseUrl": "https://vrm.dev/licenses/1.0/"},
+            "humanoid": {"humanBones": {bone: {"node": node} for bone, node in bones.items()}},
+            "expressions": {"preset": {n: {"morphTargetBinds": b} for n, b in binds.items()}},
+            "lookAt": {"type": "bone"} | dict.fromkeys(LOOK_RANGES, LOOK_RANGE),
+        }
+    else:
+        binds = {
+            VRM_0_NAMES.get(name, name): [
+                {"mesh": mesh, "index": row, "weight": 100.0} for mesh, row in targets
+            ]
+            for name, targets in expressions.items()
+        }
+        groups = [{"name": "any", "presetName": n, "binds": b} for n, b in binds.items()]
+        human_bones = [{"bone": bone, "node": node} for bone, node in bones.items()]
+        about = {
+            "meta": {"title": "x"},
+            "humanoid": {"humanBones": human_bones},
+            "blendShapeMaster": {"blendShapeGroups": groups},
+            "firstPerson": {"lookAtTypeName": "Bone"},
+        }
+    extension = ("VRM", "VRMC_vrm")[version]
+    document |= {"extensionsUsed": [extension], "extensions": {extension: about}}
+
+
 def add_accessor(
     document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int
 ) -> int:
@@ -124,18 +198,18 @@ def add_skeleton(
     joint_of: Callable[[str], int],
     bind: NDArray[Any] | None = None,
 ) -> None:
-    """Add a chain of bones to a GLB, and skin each mesh to one of them.
+    """Add bones to a GLB, and skin each mesh to one of them.
 
-    ``joint_of`` returns the number of a mesh's bone; ``bind`` are the inverse bind matrices.
+    The first bone is the root; ``children`` of a bone are indices of ``bones``. ``joint_of``
+    returns the index of a mesh's bone; ``bind`` are the inverse bind matrices.
     """
     if bind is None:
         bind = np.tile(np.eye(4, dtype="<f4"), (len(bones), 1, 1))
     document, binary = read_chunks(path)
     count = len(document["nodes"])
-    document["nodes"] += [
-        bone | ({"children": [count + number]} if number < len(bones) else {})
-        for number, bone in enumerate(bones, 1)
-    ]
+    for bone in bones:
+        children = [count + index for index in bone.get("children", ())]
+        document["nodes"].append(bone | ({"children": children} if children else {}))
     document["scenes"][0]["nodes"].append(count)
     accessor = add_accessor(document, binary, bind.reshape(-1, 16), "MAT4", 5126)
     used = [count + number for number in range(len(bones))]

@@ -23,7 +23,7 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.documents import code_blocks
-from tests.glb_writer import Mesh, write_glb
+from tests.glb_writer import BONES, Mesh, add_vrm, edit, write_glb
 from tests.system import DEMO, NODE, ROOT, Gateway, System, samples_of_file
 
 SPEECH = DEMO / "hello-female.wav"
@@ -148,46 +148,15 @@ DOWN = np.array([[0.0, -0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, 0.0]])
 FORWARD = np.array([[0.0, 0.0, 1.0]] * 3)
 TURN_AROUND = np.array([-1.0, 1.0, -1.0])  # VRM 0 looks along -z
 TRIANGLE = np.array([[0, 1, 2]])
-BONES = (
-    *("hips", "spine", "head", "leftEye", "rightEye"),
-    *(side + limb for side in ("left", "right") for limb in ("UpperArm", "LowerArm", "Hand")),
-    *(side + limb for side in ("left", "right") for limb in ("UpperLeg", "LowerLeg", "Foot")),
-)
-VRM_1 = {
-    "specVersion": "1.0",
-    "meta": {"name": "x", "authors": ["x"], "licenseUrl": "https://vrm.dev/licenses/1.0/"},
-    "humanoid": {"humanBones": {name: {"node": node} for node, name in enumerate(BONES)}},
-    "expressions": {
-        "preset": {"aa": {"morphTargetBinds": [{"node": len(BONES), "index": 0, "weight": 1.0}]}}
-    },
-    "lookAt": {
-        "type": "bone",
-        **{
-            f"rangeMap{name}": {"inputMaxValue": 90.0, "outputScale": 90.0}
-            for name in ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
-        },
-    },
-}
-VRM_0 = {
-    "meta": {"title": "x"},
-    "humanoid": {"humanBones": [{"bone": name, "node": node} for node, name in enumerate(BONES)]},
-    "blendShapeMaster": {
-        "blendShapeGroups": [
-            {"name": "A", "presetName": "a", "binds": [{"mesh": 0, "index": 0, "weight": 100.0}]}
-        ]
-    },
-}
 
 
-def write_face(
-    path: Path, shapes: list[str], *nodes: dict[str, Any], turned: bool = False, **rest: Any
-) -> None:
+def write_face(path: Path, shapes: list[str], *nodes: dict[str, Any], turned: bool = False) -> None:
     """Write a mouth of one triangle that each shape opens; it comes behind other nodes."""
     turn = TURN_AROUND if turned else 1.0
     targets = dict.fromkeys(shapes, DOWN * turn)
     mouth = Mesh("mouth", LIP_VERTICES * turn, TRIANGLE, targets, normals=FORWARD * turn)
     scenes = [{"nodes": list(range(len(nodes) + 1))}]
-    write_glb(path, [mouth], nodes=list(nodes), scenes=scenes, **rest)
+    write_glb(path, [mouth], nodes=list(nodes), scenes=scenes)
 
 
 def write_faces(folder: Path) -> None:
@@ -198,15 +167,11 @@ def write_faces(folder: Path) -> None:
     write_face(folder / "own.glb", ["open_jaw"], about)
     write_face(folder / "arkit.glb", ["Face.jawOpen"])
     write_face(folder / "none.glb", [])
-    for name, extension, about_vrm in (("vrm", "VRMC_vrm", VRM_1), ("vrm-0", "VRM", VRM_0)):
-        write_face(
-            folder / f"{name}.vrm",
-            ["a"],
-            *({"name": bone} for bone in BONES),
-            turned=extension == "VRM",
-            extensionsUsed=[extension],
-            extensions={extension: about_vrm},
-        )
+    bones = {bone: node for node, bone in enumerate(BONES)}
+    for version in (0, 1):
+        path = folder / f"vrm-{version}.vrm"
+        write_face(path, ["a"], *({"name": bone} for bone in BONES), turned=version == 0)
+        edit(path, lambda document, _, v=version: add_vrm(document, v, {"aa": [(0, 0)]}, bones))
 
 
 def write_recording(path: Path, shapes: str, name: str) -> None:
@@ -229,7 +194,7 @@ def faces(
     live = f'gateway="{gateway.page}" session="seen"'
     attributes = {
         "arkit": 'src="arkit.glb" recording',
-        "vrm": 'src="vrm.vrm" recording',
+        "vrm": 'src="vrm-1.vrm" recording',
         "old": 'src="vrm-0.vrm" recording',
         "own": f'src="own.glb" onclick="this.turnSoundOn()" {live}',
         "none": 'src="none.glb"',
@@ -278,7 +243,7 @@ def test_the_web_component_plays_recordings_on_models_of_all_kinds(
 def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser) -> None:
     script = """
         import('/node_modules/kouxing-client/puppet.js').then(async ({ loadPuppet }) => {
-          const puppet = await loadPuppet('vrm.vrm');
+          const puppet = await loadPuppet('vrm-1.vrm');
           const eye = puppet.scene.getObjectByName('rightEye');
           const turn = (names, weights) => {
             puppet.pose(weights, names);

@@ -9,20 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.glb_writer import Mesh, add_skeleton, read_chunks, write_chunks, write_glb
+from tests.glb_writer import (
+    BONES,
+    TRANSFORMS,
+    Mesh,
+    add_skeleton,
+    add_vrm,
+    read_chunks,
+    wrap_scene,
+    write_chunks,
+    write_glb,
+)
 from tests.system import NODE, ROOT
 
 CLIENT = ROOT / "clients" / "javascript"
 ARKIT = ["jawOpen", "mouthPucker", "eyeBlinkLeft", "eyeBlinkRight"]
 VRCHAT = [f"vrc.v_{viseme}" for viseme in ("sil", "pp", "aa", "ih", "oh", "ou")]
 VOWELS = ["A", "I", "U", "E", "O"]
-ROTATIONS: dict[str, dict[str, list[float]]] = {
-    "z up": {"rotation": [2**-0.5, 0, 0, 2**-0.5]},
-    "upside down": {"rotation": [0, 0, 1, 0]},
-    "oblique": {"rotation": [0, np.sin(0.3), 0, np.cos(0.3)]},
-    "mirrored": {"scale": [1, 1, -1]},
-    "turned": {"rotation": [0, 1, 0, 0]},
-}
 DAMAGED = "it is not a GLB or VRM file, or it is damaged; export it again"
 CANNOT_SPEAK = (
     "the avatar cannot speak: it has no shape jawOpen, mouthPucker of ARKit; use an avatar"
@@ -108,19 +111,18 @@ def chibi() -> Mesh:
 
 def change(path: Path, kind: str) -> None:
     if kind.startswith("jaw bone"):
-        bones = [{"name": "CC_Base_Head"}, {"name": "CC_Base_JawRoot"}]
+        bones: list[dict[str, Any]] = [
+            {"name": "CC_Base_Head", "children": [1]},
+            {"name": "CC_Base_JawRoot"},
+        ]
         add_skeleton(path, bones, lambda name: int(name in ("Teeth", "Chin")))
         if kind == "jaw bone":
             return
         kind = "turned"
     document, binary = read_chunks(path)
     nodes = document["scenes"][0]["nodes"]
-    if kind in ROTATIONS:
-        turn = ROTATIONS[kind] | {
-            "scale": [100 * x for x in ROTATIONS[kind].get("scale", (1, 1, 1))]
-        }
-        document["nodes"].append(turn | {"children": nodes})
-        document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+    if kind in TRANSFORMS:
+        wrap_scene(document, **TRANSFORMS[kind])
     elif kind == "no effect":
         binary[:] = bytes(len(binary))
     elif kind in ("empty expressions", "expressions"):
@@ -149,30 +151,14 @@ def change(path: Path, kind: str) -> None:
 
 def add_humanoid(document: dict[str, Any], num_expressions: int) -> None:
     """Make a VRM in centimeters. Without expressions, "aa" moves nothing, as in some files."""
-    presets = {
-        name: {"morphTargetBinds": [{"node": 0, "index": index, "weight": 1}]}
-        for index, name in enumerate(("aa", "ih", "ou", "ee", "oh")[:num_expressions])
-    }
-    bones = {"head": len(document["nodes"])}
-    limbs = {"Arm": ("UpperArm", "LowerArm", "Hand"), "Leg": ("UpperLeg", "LowerLeg", "Foot")}
-    names = [
-        side + part for side in ("left", "right") for parts in limbs.values() for part in parts
-    ]
-    for name in ("hips", "spine", *names):
-        bones[name] = len(document["nodes"]) + len(bones)
-    document["nodes"] += [{"translation": [0, 1.6, 0]}, *({} for _ in list(bones)[1:])]
-    root = {"children": list(range(len(document["nodes"]))), "scale": [100, 100, 100]}
-    document["nodes"].append(root)
-    document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
-    document["extensionsUsed"] = ["VRMC_vrm"]
-    document["extensions"] = {
-        "VRMC_vrm": {
-            "specVersion": "1.0",
-            "meta": {"name": "x", "authors": ["x"], "licenseUrl": "https://vrm.dev/licenses/1.0/"},
-            "humanoid": {"humanBones": {bone: {"node": node} for bone, node in bones.items()}},
-            "expressions": {"preset": {"aa": {"morphTargetBinds": []}} | presets},
-        }
-    }
+    first = len(document["nodes"])
+    bones = {bone: first + index for index, bone in enumerate(BONES)}
+    document["nodes"] += [{"translation": [0, 1.6, 0]} if bone == "head" else {} for bone in BONES]
+    document["scenes"][0]["nodes"] += bones.values()
+    wrap_scene(document, scale=[100, 100, 100])
+    names = ("aa", "ih", "ou", "ee", "oh")[:num_expressions]
+    expressions = {name: [(0, index)] for index, name in enumerate(names)}
+    add_vrm(document, 1, {"aa": []} | expressions, bones)
 
 
 FILES: dict[str, tuple[list[Mesh], str]] = {
@@ -181,7 +167,7 @@ FILES: dict[str, tuple[list[Mesh], str]] = {
     "primitives": (face(ARKIT), "primitives"),
     "vrchat": (face(VRCHAT), ""),
     "vowels": (face(VOWELS), ""),
-    **{kind: (face(ARKIT), kind) for kind in ROTATIONS},
+    **{kind: (face(ARKIT), kind) for kind in TRANSFORMS},
     "vrm": (face(VOWELS), "empty expressions"),
     "large head": ([box("Head", (0, 0.7, 0), 0.6, VOWELS)], "expressions"),
     "chibi": ([chibi()], ""),
@@ -265,7 +251,7 @@ def test_the_camera_frames_the_head_if_only_the_mouth_of_a_body_moves(
     assert results["body"]["height"] == pytest.approx(0.35, abs=0.01)  # above 1.55 m
 
 
-@pytest.mark.parametrize("kind", ROTATIONS)
+@pytest.mark.parametrize("kind", TRANSFORMS)
 def test_a_face_is_turned_upright(results: dict[str, dict[str, Any]], kind: str) -> None:
     assert results[kind]["eyes"] == pytest.approx([0, 5, 9], abs=1)
 

@@ -16,7 +16,7 @@ from kouxing.services.driver.render.scene import load_head, place_camera
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
-from tests.glb_writer import Mesh, add_skeleton, read_chunks, write_chunks, write_glb
+from tests.glb_writer import Mesh, add_skeleton, edit, wrap_scene, write_glb
 from tests.heads import neutral_faps
 from tests.meshes import ORIGINAL, meshes, shape_error
 
@@ -89,8 +89,8 @@ def same_place(head: Head) -> None:
 def test_skeleton_rotates_the_head_but_not_the_shoulders(tmp_path: Path) -> None:
     path = write_glb(tmp_path / "my.glb", meshes(SHAPES))
     bones = [
-        {"name": "Hips", "translation": [0, -1, 0]},
-        {"name": "Neck", "translation": [0, 0.9, 0]},
+        {"name": "Hips", "translation": [0, -1, 0], "children": [1]},
+        {"name": "Neck", "translation": [0, 0.9, 0], "children": [2]},
         {"name": "Head", "translation": [0, 0.1, 0]},
     ]
     bind = np.tile(np.eye(4, dtype="<f4"), (3, 1, 1))
@@ -110,14 +110,13 @@ def test_a_jaw_bone_moves_teeth_without_shapes(tmp_path: Path, rotation: tuple[i
         if mesh.name.startswith("teeth"):
             mesh.targets = {}
     path = write_glb(tmp_path / "cc4.glb", whole)
-    bones = [{"name": f"CC_Base_{name}"} for name in ("Head", "JawRoot", "Teeth02")]
+    bones: list[dict[str, Any]] = [
+        {"name": "CC_Base_Head", "children": [1]},
+        {"name": "CC_Base_JawRoot", "children": [2]},
+        {"name": "CC_Base_Teeth02"},
+    ]
     add_skeleton(path, bones, lambda name: 2 if name == "teeth_lower" else 0)
-    document, binary = read_chunks(path)
-    roots = document["scenes"][0]["nodes"]
-    document["nodes"].append({"children": roots, "rotation": rotation})
-    document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
-    write_chunks(path, document, binary)
-    head = read_glb(path)
+    head = read_glb(edit(path, lambda document, _: wrap_scene(document, rotation=rotation)))
     moved = head.deform(neutral_faps(open_jaw=400)) - head.vertices
     assert moved[head.part("teeth_lower").vertices, 1].mean() < -0.003
     assert np.abs(moved[head.part("teeth_upper").vertices]).max() == 0
@@ -178,9 +177,7 @@ TOO_MANY = [{"attributes": {"POSITION": 0}}] * 2001
 def test_rejects_bad_descriptions(
     small: Path, damage: Callable[[dict[str, Any]], None], message: str
 ) -> None:
-    document, binary = read_chunks(small)
-    damage(document)
-    write_chunks(small, document, binary)
+    edit(small, lambda document, _: damage(document))
     with pytest.raises(UserError, match=message):
         read_glb(small)
 
