@@ -18,7 +18,7 @@ OMITTED_PARTS = ("brows", "lashes")  # transparent parts that move, which these 
 def meshes(shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
     """Return the parts with morph targets, given as FAPs (68,) by name."""
     shown = [part for part in ORIGINAL.parts if not part.name.startswith(OMITTED_PARTS)]
-    shape_faps = {
+    mesh_of = {
         part.name: Mesh(
             part.name,
             ORIGINAL.vertices[part.vertices],
@@ -33,8 +33,8 @@ def meshes(shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
         shift = (ORIGINAL.basis @ np.asarray(faps, np.float32)).reshape(-1, 3)
         for part in shown:
             if np.abs(shift[part.vertices]).max() > 1e-6:
-                shape_faps[part.name].targets[name] = shift[part.vertices]
-    return list(shape_faps.values())
+                mesh_of[part.name].targets[name] = shift[part.vertices]
+    return list(mesh_of.values())
 
 
 def write_obj(path: Path, parts: list[Mesh]) -> None:

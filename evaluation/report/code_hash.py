@@ -27,7 +27,7 @@ def code_hash(patterns: Iterable[str], root: Path = ROOT) -> str:
 def _read_code(patterns: Iterable[str], root: Path) -> dict[str, bytes]:
     contents: dict[str, bytes] = {}
     waiting = [
-        file for pattern in patterns for path in root.glob(pattern) for file in _python_files(path)
+        file for pattern in patterns for path in root.glob(pattern) for file in _source_files(path)
     ]
     while waiting:
         file = waiting.pop()
@@ -42,7 +42,7 @@ def _read_code(patterns: Iterable[str], root: Path) -> dict[str, bytes]:
     return contents
 
 
-def _python_files(path: Path) -> Iterator[Path]:
+def _source_files(path: Path) -> Iterator[Path]:
     for file in path.rglob("*") if path.is_dir() else (path,):
         if file.suffix in _SOURCES and file.is_file():
             yield file

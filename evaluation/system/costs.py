@@ -101,7 +101,7 @@ def measure_images() -> RenderingCosts:
         rates[name] = NUM_IMAGES / (time.perf_counter() - start_s)
         times_s = [renderer.measure_stages_s(faps) for faps in frames]
         stages[name] = {
-            stage: 1e3 * float(np.median([measure_stages_s[stage] for measure_stages_s in times_s]))
+            stage: 1e3 * float(np.median([stages_s[stage] for stages_s in times_s]))
             for stage in times_s[0]
         }
         if encoded:

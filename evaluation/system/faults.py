@@ -114,7 +114,7 @@ def _stop_and_continue(process_id: int, at_s: float, for_s: float) -> list[Actio
     ]
 
 
-def _load_processor(_start_system: System, _session: str, timing: Timing) -> list[Action]:
+def _load_processor(_system: System, _session: str, timing: Timing) -> list[Action]:
     """Run four busy processes per core."""
     busy: list[subprocess.Popen[bytes]] = []
 
@@ -132,7 +132,7 @@ def _load_processor(_start_system: System, _session: str, timing: Timing) -> lis
     return [(timing.fault_at_s, start), (stop_at_s, stop)]
 
 
-def _no_actions(_start_system: System, _session: str, _timing: Timing) -> list[Action]:
+def _no_actions(_system: System, _session: str, _timing: Timing) -> list[Action]:
     return []
 
 

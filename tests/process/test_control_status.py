@@ -69,14 +69,10 @@ def test_reports_one_session_and_its_services(harness: ControlHarness, client: S
 @pytest.mark.usefixtures("new_keys")
 def test_only_clients_and_services_see_the_token_of_the_web_page() -> None:
     page = "https://face.example:8080/"
-    make_heartbeat = Heartbeat(
-        service="gateway",
-        instance="gateway",
-        role="observer",
-        state="ready",
-        sent_ns=0,
+    heartbeat = Heartbeat(
+        service="gateway", instance="gateway", role="observer", state="ready", sent_ns=0,
         endpoints={"page": f"{page}#token=secret"},
-    )
+    )  # fmt: skip
     told: dict[str, str] = {}
     with (
         contextlib.closing(ControlHarness(insecure=False)) as harness,
@@ -86,7 +82,7 @@ def test_only_clients_and_services_see_the_token_of_the_web_page() -> None:
             bus = buses.enter_context(Bus(load_key(f"key-{len(told)}", (role,))))
             asker = bus.connect_dealer(harness.control.endpoints["commands"])
             if role.startswith("service"):
-                asker.send(make_heartbeat)
+                asker.send(heartbeat)
             report = ask(harness, asker)
             assert isinstance(report, StatusReport)
             endpoints = {state.service: state.endpoints for state in report.services}

@@ -1,4 +1,4 @@
-"""Decisions about connection_limits, without sockets: who is disconnected, and who never."""
+"""Decisions about connections, without sockets: who is disconnected, and who never."""
 
 from types import SimpleNamespace
 from typing import cast

@@ -113,14 +113,13 @@ RATE_HZ = 16_000
 def speech(parts: Sequence[tuple[str, float]]) -> NDArray[np.float32]:
     """Return a sound of vowels (v), hissing consonants (s), weak nasals (n) and silence (-)."""
     rng = np.random.default_rng(0)
-    live_openings = []
+    sounds = []
     for kind, length_s in parts:
         time_s = np.arange(round(length_s * RATE_HZ)) / RATE_HZ
         sine, noise = np.sin(2 * np.pi * 200.0 * time_s), rng.standard_normal(len(time_s))
-        live_openings.append(
-            {"v": 0.2 * sine, "s": 0.05 * noise, "n": 0.03 * sine, "-": 1e-4 * noise}[kind]
-        )
-    return np.concatenate(live_openings).astype(np.float32)
+        sound = {"v": 0.2 * sine, "s": 0.05 * noise, "n": 0.03 * sine, "-": 1e-4 * noise}
+        sounds.append(sound[kind])
+    return np.concatenate(sounds).astype(np.float32)
 
 
 def test_segments_end_at_pauses_dips_and_hisses() -> None:

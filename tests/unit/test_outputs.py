@@ -241,15 +241,10 @@ def test_a_picture_has_one_number(tmp_path: Path) -> None:
         check_name(tmp_path / "face%d%d.png")
 
 
-def test_an_error_names_the_folder_to_create(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="mkdir -p"), open_output(tmp_path / "new/head.glb"):
-        pass
-
-
-def test_an_error_names_the_folder_that_a_link_needs(tmp_path: Path) -> None:
-    link = tmp_path / "head.glb"
-    link.symlink_to(tmp_path / "new" / "head.glb")
-    with pytest.raises(UserError, match=f"mkdir -p {tmp_path}/new"), open_output(link):
+@pytest.mark.parametrize("name", ["new/head.glb", "link.glb"])
+def test_an_error_names_the_folder_to_create(tmp_path: Path, name: str) -> None:
+    (tmp_path / "link.glb").symlink_to(tmp_path / "new" / "head.glb")
+    with pytest.raises(UserError, match=f"mkdir -p {tmp_path}/new"), open_output(tmp_path / name):
         pass
 
 

@@ -7,7 +7,7 @@ from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.session import OpenSession
-from tests.unit.test_sessions import System, worker
+from tests.unit.test_sessions import Cluster, worker
 
 MAX_LOAD = 0.8
 WORKERS = ("recognizer-1", "recognizer-2", "synthesizer-1", "synthesizer-2")
@@ -66,68 +66,68 @@ def test_silent_sessions_do_not_hide_what_they_cost_when_they_speak() -> None:
 
 
 @pytest.fixture
-def system() -> System:
-    system = System(max_sessions=100, max_load=MAX_LOAD)
-    system.add(worker("recognizer", "recognizer-2"))
-    system.add(worker("synthesizer", "synthesizer-2"))
-    return system
+def cluster() -> Cluster:
+    cluster = Cluster(max_sessions=100, max_load=MAX_LOAD)
+    cluster.add(worker("recognizer", "recognizer-2"))
+    cluster.add(worker("synthesizer", "synthesizer-2"))
+    return cluster
 
 
-def measure(system: System, instance: str, load: float, now_s: float) -> None:
+def measure(cluster: Cluster, instance: str, load: float, now_s: float) -> None:
     service = instance.partition("-")[0]
-    system.add(replace(worker(service, instance), load=load), now_s)
+    cluster.add(replace(worker(service, instance), load=load), now_s)
 
 
-def open_at(system: System, now_s: float, *, paced: bool = True) -> str:
+def open_at(cluster: Cluster, now_s: float, *, paced: bool = True) -> str:
     """Open a session; return its recognizer."""
-    record = system.sessions.open(OpenSession(request="r", paced=paced), Peer(b"client"), now_s)
+    record = cluster.sessions.open(OpenSession(request="r", paced=paced), Peer(b"client"), now_s)
     return record.workers["audio"]
 
 
-def test_prefers_the_worker_with_the_least_load(system: System) -> None:
-    placed = [open_at(system, 0.0) for _ in range(6)]
+def test_prefers_the_worker_with_the_least_load(cluster: Cluster) -> None:
+    placed = [open_at(cluster, 0.0) for _ in range(6)]
     assert placed.count("recognizer-1") == placed.count("recognizer-2") == 3, "not measured yet"
     for instance in WORKERS:
-        measure(system, instance, 0.3 if instance == "recognizer-2" else 0.2, 5.0)
-    assert open_at(system, 5.0) == "recognizer-1"
-    system.add(worker("recognizer", "recognizer-1", state="draining"))
-    assert open_at(system, 5.0) == "recognizer-2"
+        measure(cluster, instance, 0.3 if instance == "recognizer-2" else 0.2, 5.0)
+    assert open_at(cluster, 5.0) == "recognizer-1"
+    cluster.add(worker("recognizer", "recognizer-1", state="draining"))
+    assert open_at(cluster, 5.0) == "recognizer-2"
 
 
-def test_refuses_a_session_without_room_and_says_when_to_try_again(system: System) -> None:
+def test_refuses_a_session_without_room_and_says_when_to_try_again(cluster: Cluster) -> None:
     for _ in range(4):
-        open_at(system, 0.0)
+        open_at(cluster, 0.0)
     for instance in WORKERS:
-        measure(system, instance, 0.75 if "recognizer" in instance else 0.1, 5.0)
+        measure(cluster, instance, 0.75 if "recognizer" in instance else 0.1, 5.0)
     text = "every recognizer is busy: 38 % of its time must be free, but only 5 % is"
     with pytest.raises(Rejected, match=text) as caught:
-        open_at(system, 5.0)
+        open_at(cluster, 5.0)
     assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
-    measure(system, "recognizer-2", 0.2, 6.0)
+    measure(cluster, "recognizer-2", 0.2, 6.0)
     with pytest.raises(Rejected):
-        open_at(system, 6.0)  # its two sessions may speak again
-    measure(system, "recognizer-2", 0.2, 300.0)
-    assert open_at(system, 300.0) == "recognizer-2"
+        open_at(cluster, 6.0)  # its two sessions may speak again
+    measure(cluster, "recognizer-2", 0.2, 300.0)
+    assert open_at(cluster, 300.0) == "recognizer-2"
 
 
-def test_unpaced_sessions_of_one_key_leave_room_for_another_client(system: System) -> None:
+def test_unpaced_sessions_of_one_key_leave_room_for_another_client(cluster: Cluster) -> None:
     opening, greedy = OpenSession(request="r", paced=False), Peer(b"a", "greedy")
     for _ in range(14):  # seven of the eight for which each recognizer has room
-        system.sessions.open(opening, greedy, 0.0)
+        cluster.sessions.open(opening, greedy, 0.0)
     with pytest.raises(Rejected, match=r"20 % of its time must be free, but only 10 % is"):
-        system.sessions.open(opening, greedy, 0.0)
-    assert system.sessions.open(opening, Peer(b"b", "other"), 0.0)
+        cluster.sessions.open(opening, greedy, 0.0)
+    assert cluster.sessions.open(opening, Peer(b"b", "other"), 0.0)
 
 
-def test_never_refuses_the_first_sessions_nor_one_that_moves(system: System) -> None:
+def test_never_refuses_the_first_sessions_nor_one_that_moves(cluster: Cluster) -> None:
     for _ in range(2 * MIN_SESSIONS):
         for instance in WORKERS:
-            measure(system, instance, 1.0, 5.0)
-        assert open_at(system, 5.0)
+            measure(cluster, instance, 1.0, 5.0)
+        assert open_at(cluster, 5.0)
     for paced in (True, False):
         with pytest.raises(Rejected):
-            open_at(system, 5.0, paced=paced)
-    record = next(iter(system.sessions))
-    system.lose(record.workers["audio"])
-    system.lose(record.workers["faps"])
-    assert system.sessions.move(record, 5.0)
+            open_at(cluster, 5.0, paced=paced)
+    record = next(iter(cluster.sessions))
+    cluster.lose(record.workers["audio"])
+    cluster.lose(record.workers["faps"])
+    assert cluster.sessions.move(record, 5.0)
