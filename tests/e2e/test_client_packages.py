@@ -23,7 +23,7 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.documents import code_blocks
-from tests.glb_writer import BONES, Mesh, add_vrm, edit, write_glb
+from tests.glb_writer import BONES, Mesh, add_vrm, read_chunks, write_chunks, write_glb
 from tests.system import DEMO, NODE, ROOT, Gateway, System, samples_of_file
 
 SPEECH = DEMO / "hello-female.wav"
@@ -171,7 +171,9 @@ def write_faces(folder: Path) -> None:
     for version in (0, 1):
         path = folder / f"vrm-{version}.vrm"
         write_face(path, ["a"], *({"name": bone} for bone in BONES), turned=version == 0)
-        edit(path, lambda document, _, v=version: add_vrm(document, v, {"aa": [(0, 0)]}, bones))
+        document, binary = read_chunks(path)
+        add_vrm(document, version, {"aa": [(0, 0)]}, bones)
+        write_chunks(path, document, binary)
 
 
 def write_recording(path: Path, shapes: str, name: str) -> None:

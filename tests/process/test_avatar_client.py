@@ -157,8 +157,9 @@ def add_humanoid(document: dict[str, Any], num_expressions: int) -> None:
     document["scenes"][0]["nodes"] += bones.values()
     wrap_scene(document, scale=[100, 100, 100])
     names = ("aa", "ih", "ou", "ee", "oh")[:num_expressions]
-    expressions = {name: [(0, index)] for index, name in enumerate(names)}
-    add_vrm(document, 1, {"aa": []} | expressions, bones)
+    expressions: dict[str, list[tuple[int, int]]] = {"aa": []}
+    expressions |= {name: [(0, index)] for index, name in enumerate(names)}
+    add_vrm(document, 1, expressions, bones)
 
 
 FILES: dict[str, tuple[list[Mesh], str]] = {

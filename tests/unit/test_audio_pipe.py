@@ -25,7 +25,7 @@ RATE_HZ = 16_000
 class Pipe(io.RawIOBase):
     """A stream that cannot seek and that returns few bytes at a time."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes | bytearray) -> None:
         self._data = io.BytesIO(data)
 
     def readable(self) -> bool:
@@ -36,14 +36,14 @@ class Pipe(io.RawIOBase):
 
 
 class Open(Protocol):
-    def __call__(self, data: bytes, raw: RawFormat | None = None) -> AudioSource: ...
+    def __call__(self, data: bytes | bytearray, raw: RawFormat | None = None) -> AudioSource: ...
 
 
 @pytest.fixture
 def open_pipe(monkeypatch: pytest.MonkeyPatch) -> Open:
     """Open data that arrives from standard input."""
 
-    def open_stdin(data: bytes, raw: RawFormat | None = None) -> AudioSource:
+    def open_stdin(data: bytes | bytearray, raw: RawFormat | None = None) -> AudioSource:
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BufferedReader(Pipe(data))))
         return open_audio(Path("-"), raw=raw)
 
@@ -54,7 +54,7 @@ def open_pipe(monkeypatch: pytest.MonkeyPatch) -> Open:
 def open_either(request: pytest.FixtureRequest, tmp_path: Path, open_pipe: Open) -> Open:
     """Open data in a file or from standard input."""
 
-    def open_file(data: bytes, raw: RawFormat | None = None) -> AudioSource:
+    def open_file(data: bytes | bytearray, raw: RawFormat | None = None) -> AudioSource:
         (tmp_path / "a.wav").write_bytes(data)
         return open_audio(tmp_path / "a.wav", raw=raw)
 
