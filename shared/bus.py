@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Self
 
 import zmq
+from kouxing_client.field_types import MAX_AUDIO_BYTES
 from kouxing_client.keys import Key
 from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
 from zmq.utils.monitor import recv_monitor_message
@@ -21,7 +22,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.socket_limits import KIB, SocketLimits
 from kouxing.shared.sockets import Socket
 from kouxing.shared.waker import Waker
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
+from kouxing.shared.wire.message import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
 from kouxing.shared.zap import Zap, answer_handshakes
 
 # Few answers to audio are queued, because not every client reads them.

@@ -2,7 +2,9 @@
 
 import re
 
-from kouxing.shared.name_rules import NAME, NAME_OR_EMPTY, NAME_RULE
+from kouxing_client.field_types import SESSION_NAME
+
+from kouxing.shared.name_rules import NAME, NAME_RULE
 
 _TYPES = {
     "array": "a list",
@@ -37,7 +39,7 @@ def describe_field_error(error: Exception) -> str:
     if rest.startswith(", got `"):
         return f"{name} must be {types}, not {_list_types(rest[7:].rstrip('`'))}"
     if pattern := re.fullmatch(r" matching regex ['\"]\^(.*)\$['\"]", rest):
-        if pattern[1] in (NAME, NAME_OR_EMPTY):
+        if pattern[1] in (NAME, SESSION_NAME):
             return f"{name} is not a valid name; {NAME_RULE}"
         return f"{name} must be {pattern[1].strip('()').replace('|', ' or ')}"
     if rest.startswith(" of length"):

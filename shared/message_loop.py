@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from kouxing_client.messages import VERSION, Message
+
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Poller, ReceivedMessage, Socket
 from kouxing.shared.wire.codec import BadMessage
-from kouxing.shared.wire.message import VERSION, Message
 from kouxing.shared.wire.session import Error, ErrorCode
 
 MAX_TURN_S = 0.05  # time for the messages of one socket before the next socket

@@ -3,7 +3,6 @@
 import re
 
 NAME = "[A-Za-z0-9_-]{1,64}"
-NAME_OR_EMPTY = "[A-Za-z0-9_-]{0,64}"
 NAME_RULE = "use up to 64 letters, digits, '-' and '_'"
 
 

@@ -9,11 +9,12 @@ from collections import deque
 from collections.abc import Callable
 from itertools import islice
 
+from kouxing_client.messages import Message
+
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import batch_messages
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 
 RESEND_AFTER_S = 0.5

@@ -6,8 +6,9 @@ are published in the meantime are repeated for each of them. Subscribers ignore 
 
 from collections import deque
 
+from kouxing_client.messages import Message
+
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.message import Message
 
 REPLAY_S = 10.0  # time after the start of a session; connecting is slow on a busy machine
 MAX_REPLAYED = 2000  # messages

@@ -20,6 +20,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar
 
 from kouxing_client.keys import Key
+from kouxing_client.messages import Event, Message, SessionFacts
 from kouxing_client.reach import reach_error
 
 from kouxing.shared import parent_process
@@ -36,14 +37,12 @@ from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import (
     AllowedKey,
-    Event,
     EventName,
     Heartbeat,
     HeartbeatReply,
     SessionProgress,
 )
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Error, SessionFacts
+from kouxing.shared.wire.session import Error
 
 if TYPE_CHECKING:
     from kouxing.shared.prometheus import MetricsServer

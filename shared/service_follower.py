@@ -5,12 +5,11 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from kouxing_client.follower import Follower
+from kouxing_client.messages import Joined, Message
 
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Joined
 
 
 class ServiceFollower(Follower):

@@ -3,13 +3,14 @@
 import time
 from collections.abc import Iterable
 
+from kouxing_client.messages import Message
+
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import HEARTBEAT_S, Service
 from kouxing.shared.wire.control import EventName, SessionStarted, StartSession
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession
 
 

@@ -11,6 +11,7 @@ from typing import TypeVar
 import zmq
 from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
+from kouxing_client.messages import Joined, Message, topic
 from kouxing_client.sockets import connect
 
 from kouxing.shared.connection_limits import (
@@ -26,9 +27,8 @@ from kouxing.shared.keys import NO_PEER, Grant, Peer, may_subscribe
 from kouxing.shared.name_rules import is_name
 from kouxing.shared.socket_limits import KIB
 from kouxing.shared.waker import Waker
-from kouxing.shared.wire.codec import BadMessage, decode, encode, make_topic
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Error, Joined
+from kouxing.shared.wire.codec import BadMessage, decode, encode
+from kouxing.shared.wire.session import Error
 from kouxing.shared.zap import Zap
 
 ERROR_COST = 4.0  # cost for the sender's budget of a message that is answered with an error
@@ -92,7 +92,7 @@ class Socket:
 
         An answer to the message that is being handled reduces its sender's budget.
         """
-        if self._publishes and not self._has_subscriber(make_topic(type(message), message.session)):
+        if self._publishes and not self._has_subscriber(topic(message.kind, message.session)):
             return True
         parts = encode(message)
         if self._connection is not None and to == self._sender:
@@ -125,7 +125,7 @@ class Socket:
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:
         """Subscribe to a kind of message, of one session or of all (None)."""
-        prefix = f"{kind.kind}/".encode() if session is None else make_topic(kind, session)
+        prefix = f"{kind.kind}/".encode() if session is None else topic(kind.kind, session)
         self.raw.setsockopt(zmq.SUBSCRIBE, prefix)
 
     def subscribe_session(self, kinds: Iterable[type[Message]], session: str) -> None:
@@ -184,7 +184,7 @@ class Socket:
         frames of a live session are useless. libzmq reconnects the subscriber when it continues.
         """
         if self._limited is not None:
-            topics = [make_topic(kind, session) for session in sessions for kind in kinds]
+            topics = [topic(kind.kind, session) for session in sessions for kind in kinds]
             self._limited.disconnect_stalled(topics)
 
     def record_empty(self) -> None:

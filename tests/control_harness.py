@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import zmq
 from kouxing_client.keys import Key
+from kouxing_client.messages import Message
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.services.control.config import ControlConfig
@@ -15,7 +16,6 @@ from kouxing.shared.keys import load_key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, OpenSession
 from tests.system import wait_until
 

@@ -6,6 +6,8 @@ import threading
 from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
+from kouxing_client.messages import Message, ServiceState, SessionFacts
+
 from kouxing.shared.bus import Bus
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
@@ -13,15 +15,12 @@ from kouxing.shared.sockets import Poller, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,
     Error,
     FlushSession,
     OpenSession,
-    ServiceState,
-    SessionFacts,
     SessionOpened,
     StatusReport,
     StatusRequest,

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from kouxing_client.messages import SessionFacts
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -10,7 +11,6 @@ from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.fast_record import replace
-from kouxing.shared.wire.session import SessionFacts
 from tests.samples import START as START_AT_16_KHZ
 from tests.samples import with_opening
 

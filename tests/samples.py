@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from kouxing_client.field_types import MASK_BYTES
+from kouxing_client.messages import VERSION, FapFrame, Message, SessionFacts
 
-from kouxing.shared.face.faps import MASK_BYTES
 from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.kinds import MESSAGES
-from kouxing.shared.wire.message import VERSION, Message
-from kouxing.shared.wire.session import OpenSession, SessionFacts
+from kouxing.shared.wire.session import OpenSession
 
 FILE = Path(__file__).parents[1] / "proto" / "golden" / f"version{VERSION}.json"
 STORED = json.loads(FILE.read_text(encoding="utf-8"))
@@ -34,6 +33,6 @@ def with_opening(start: StartSession, **fields: Any) -> StartSession:
 def fap_frame(session: str, number: int, values: bytes, epoch: int = 1) -> FapFrame:
     """Return the ``number``-th frame of a session at 50 Hz, from 0."""
     return FapFrame(
-        session=session, epoch=epoch, sequence=number + 1, media_time=number * 320, values=values,
-        mask=bytes(MASK_BYTES),
+        session=session, epoch=epoch, sequence=number + 1, media_time=number * 320,
+        packed_values=values, mask=bytes(MASK_BYTES),
     )  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -271,6 +270,8 @@ def _parse_strength(text: str) -> tuple[str, float]:
 
 def status(control: Control = "", json_file: JsonFile = None, force: Force = False) -> None:
     """Show services, sessions, rates and latencies."""
+    import msgspec
+
     from kouxing.shared.client_connection import connect_client
 
     check_output(json_file, force=force)
@@ -306,7 +307,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
         lateness = "late: p50, p95, worst"
         columns = ("session", "state", "open for", lateness, "skipped", "workers")
         print_table(out, "", columns, sessions)
-    write_json(json_file, asdict(report))
+    write_json(json_file, msgspec.to_builtins(report))
 
 
 def doctor(control: Control = "") -> None:

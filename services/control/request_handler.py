@@ -4,6 +4,8 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+from kouxing_client.messages import Message
+
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import Rejected
 from kouxing.shared.keys import Peer
@@ -12,7 +14,6 @@ from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import AllowedKey, Heartbeat
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
     Error,

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from kouxing_client.messages import Event, Message, Speech
+
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.face_check import check_face
 from kouxing.services.control.fault_log import FaultLog
@@ -31,9 +33,8 @@ from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
-from kouxing.shared.wire.control import Event, EventName, Heartbeat, HeartbeatReply, SessionStarted
+from kouxing.shared.wire.control import EventName, Heartbeat, HeartbeatReply, SessionStarted
 from kouxing.shared.wire.face import CurrentFace, FaceSettings, SetFace
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,
@@ -42,7 +43,6 @@ from kouxing.shared.wire.session import (
     OpenSession,
     StatusRequest,
 )
-from kouxing.shared.wire.speech import Speech
 
 STOPPED = "stopped"  # reason for a service that shut down
 CHECK_S = 0.5  # interval of checking waiting sessions and the list of keys

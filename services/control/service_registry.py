@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import itemgetter
 
+from kouxing_client.messages import SessionFacts
+
 from kouxing.services.control.worker_load import WorkerLoad
 from kouxing.services.service_kinds import PROVIDERS
 from kouxing.shared.endpoints import split_endpoint, with_key
@@ -17,7 +19,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
 from kouxing.shared.wire.control import Heartbeat
-from kouxing.shared.wire.session import ErrorCode, SessionFacts
+from kouxing.shared.wire.session import ErrorCode
 
 MAX_SERVICES = 2000
 MAX_SERVICES_PER_KEY = 1500

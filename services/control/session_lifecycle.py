@@ -6,6 +6,8 @@ Each step is sent to the services and the client of the session, and is publishe
 import math
 import time
 
+from kouxing_client.messages import Event, Message
+
 from kouxing.services.control.request_handler import RequestHandler
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
@@ -14,8 +16,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.control import Event, EventName
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.control import EventName
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionMoved
 
 START_TIMEOUT_S = 5.0

@@ -2,19 +2,14 @@
 
 from dataclasses import dataclass, field
 
+from kouxing_client.messages import Lateness, SessionFacts, SessionState
+
 from kouxing.services.control.placement import UNPACED_AUDIO
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import CurrentFace
-from kouxing.shared.wire.session import (
-    Lateness,
-    OpenSession,
-    SessionFacts,
-    SessionMoved,
-    SessionOpened,
-    SessionState,
-)
+from kouxing.shared.wire.session import OpenSession, SessionMoved, SessionOpened
 
 
 @dataclass(slots=True)

@@ -2,12 +2,14 @@
 
 from collections.abc import Iterator
 
+from kouxing_client.messages import ServiceState, SessionState
+
 from kouxing.services.control.service_registry import ServiceRecord, ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
 from kouxing.shared.wire.codec import encoded_size
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.session import ServiceState, SessionState, StatusReport, StatusRequest
+from kouxing.shared.wire.session import StatusReport, StatusRequest
 
 PAGE_BYTES = 512 * 1024  # so that the largest state still fits into the message
 FIRST_SESSION = 2**32  # number of the first session; services have smaller numbers

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from kouxing_client.messages import EndOfFaps, FapFrame, Message, Sound
 
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.pose_store import PoseStore
@@ -27,10 +28,8 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.session_service import SessionService
-from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import ErrorCode
 
 LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
@@ -161,9 +160,9 @@ class DriverService(SessionService):
     # --- sessions ------------------------------------------------------------------------------
 
     def _on_frame(self, frame: FapFrame) -> None:
-        faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
+        faps = np.frombuffer(frame.packed_values, "<f4").astype(np.float32)
         self.poses.update(frame.session, faps, time.monotonic())
-        self.recorder.add_frame(frame.session, to_seconds(frame.media_time), frame.values)
+        self.recorder.add_frame(frame.session, to_seconds(frame.media_time), frame.packed_values)
 
     def _on_sound(self, sound: Sound) -> None:
         self.recorder.add_sound(sound.session, sound.media_time, sound.pcm)

@@ -15,6 +15,7 @@ from collections.abc import Coroutine
 from dataclasses import dataclass
 
 from aiohttp import web
+from kouxing_client.messages import EndOfFaps, FapFrame, Message, Phone, Sound, Speech
 
 from kouxing.services.gateway import browser_messages, web_application
 from kouxing.services.gateway.audio_sessions import AudioClient
@@ -40,13 +41,11 @@ from kouxing.shared.phones.syllable_captions import SyllableCaptions
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionProgress, StartSession
 from kouxing.shared.wire.events import message_to_phone
-from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
-from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import StatusReport, StatusRequest
-from kouxing.shared.wire.speech import Acoustic, Phone, Speech
+from kouxing.shared.wire.speech import Acoustic
 
 STATUS_INTERVAL_S = 1.0  # interval between status requests
 STATUS_TIMEOUT_S = 3.0  # the same without an answer, or without viewers
@@ -318,10 +317,10 @@ class GatewayService(SessionService):
         )
 
     def _on_frame(self, frame: FapFrame) -> None:
-        now_s = time.monotonic()
-        self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values, now_s)
+        now_s, values = time.monotonic(), frame.packed_values
+        self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, values, now_s)
         if self._senders.pool.is_sending and frame.session == self._viewers.newest_session:
-            self._senders.send_frame(frame.media_time, frame.values)
+            self._senders.send_frame(frame.media_time, values)
 
     def _on_sound(self, sound: Sound) -> None:
         message = browser_messages.binary(

@@ -13,6 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from operator import attrgetter
 
+from kouxing_client.messages import Message, SessionFacts, Speech
+
 from kouxing.services.recognizer.acoustic.languages import MODEL_LANGUAGES
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.audio_intake import AudioIntake
@@ -41,9 +43,8 @@ from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
-from kouxing.shared.wire.speech import Acknowledge, Speech
+from kouxing.shared.wire.session import Error, ErrorCode
+from kouxing.shared.wire.speech import Acknowledge
 
 MAX_QUEUED_S = 60.0  # limit for live audio; later audio waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for more late audio: once, and in total

@@ -5,6 +5,8 @@ import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
+from kouxing_client.messages import Message
+
 from kouxing.services.recognizer.audio_queue import AudioQueue
 from kouxing.services.recognizer.front_end.pcm import decode_pcm
 from kouxing.services.recognizer.lip_frames import LipFrameModel
@@ -26,7 +28,6 @@ from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_to_message, message_to_event
 from kouxing.shared.wire.face import CurrentFace
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import (
     Acknowledge,

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
+from kouxing_client.messages import Sound
 
 from kouxing.services.recognizer.front_end.pcm import encode_pcm16
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.phones.events import EndOfSound, SoundEvent, Waveform
-from kouxing.shared.wire.audio import Sound
 
 PACKET_S = 0.04  # duration of a message; less if the face has a shorter delay
 

@@ -7,13 +7,14 @@ frame, and the messages of the last seconds again.
 from collections import deque
 from collections.abc import Set as AbstractSet
 
+from kouxing_client.messages import Message, Speech
+
 from kouxing.shared.clock import to_samples
 from kouxing.shared.message_loop import Handler, MessageLoop
 from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import is_state_report
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Speech
+from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress
 
 MAX_BACKLOG = 2000  # unacknowledged messages above which audio waits
 MAX_OVERDUE_S = 5.0  # then new messages are dropped, so that other sessions continue

@@ -8,8 +8,9 @@ frames in time, and greater for late frames. Frames are compared with the earlie
 from collections import deque
 from collections.abc import Iterable
 
+from kouxing_client.messages import Lateness
+
 from kouxing.shared.metrics import percentile
-from kouxing.shared.wire.session import Lateness
 
 NO_LATENESS = Lateness(p50_ms=0.0, p95_ms=0.0, worst_ms=0.0)
 WINDOW_S = 10.0  # as in services/gateway/page/lateness.js

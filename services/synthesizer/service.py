@@ -17,6 +17,8 @@ from collections.abc import Sequence
 from operator import attrgetter
 
 import numpy as np
+from kouxing_client.field_types import MASK_BYTES
+from kouxing_client.messages import EndOfFaps, FapFrame, Message, SessionFacts
 
 from kouxing.services.lip_models import lip_model_names
 from kouxing.services.service_kinds import KINDS
@@ -30,7 +32,7 @@ from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
 from kouxing.shared.face.expressions import ExpressionName
-from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
+from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
@@ -48,9 +50,8 @@ from kouxing.shared.wire.events import (
     message_to_event,
     split_batch,
 )
-from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import ErrorCode, SessionFacts
+from kouxing.shared.wire.face import FaceSettings, SetFace
+from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import (
     AudioState,
     NewestFrame,
@@ -383,9 +384,9 @@ class SynthesizerService(SessionService):
                 epoch=session.start.epoch,
                 sequence=session.output_sequence,
                 media_time=to_samples(time_s),
-                values=faps.astype("<f4").tobytes(),
+                packed_values=faps.astype("<f4").tobytes(),
                 mask=FAP_MASK,
-                shapes={
+                packed_shapes={
                     name: SHAPE_SETS[name].weights(faps).astype("<f4").tobytes()
                     for name in session.shapes
                 },

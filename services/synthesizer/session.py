@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
+from kouxing_client.messages import FapFrame
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
@@ -19,7 +20,6 @@ from kouxing.shared.reliable import ReliableReceiver
 from kouxing.shared.replaying_publisher import ReplayingPublisher
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame
 
 RECOGNIZER_TIMEOUT_S = 20.0  # longer than the reports for silent clients take
@@ -79,6 +79,6 @@ class SynthesizerSession:
         if (frame := self.newest_frame) is None:
             return Acknowledge()
         newest_frame = NewestFrame(
-            sequence=frame.sequence, media_time=frame.media_time, values=frame.values
+            sequence=frame.sequence, media_time=frame.media_time, values=frame.packed_values
         )
         return Acknowledge(newest_frame=newest_frame)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from kouxing.shared.tsv_tables import read_table
 
 NUM_FAPS = 68
-MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the first byte
 FAP_UNITS_PER_FAPU = 1024.0
 RADIANS_PER_ANGLE_UNIT = 1e-5
 

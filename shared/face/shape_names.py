@@ -19,8 +19,6 @@ from pathlib import Path
 
 from kouxing.shared.errors import UserError
 
-MAX_SHAPES = 256  # per set
-
 
 class ShapeSetName(StrEnum):
     """A set of blendshapes."""

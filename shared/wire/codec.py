@@ -8,10 +8,12 @@ less than separate parts.
 from collections.abc import Sequence
 
 import msgspec
+from kouxing_client.field_types import Version
+from kouxing_client.messages import VERSION, Message, topic
 
 from kouxing.shared.field_errors import describe_field_error
 from kouxing.shared.wire.kinds import MESSAGES
-from kouxing.shared.wire.message import DOCUMENT, VERSION, Message, Version
+from kouxing.shared.wire.message import DOCUMENT
 
 MAX_TOPIC_BYTES = 96
 
@@ -37,14 +39,9 @@ _DECODERS = {kind: msgspec.msgpack.Decoder(cls) for kind, cls in MESSAGES.items(
 _VERSION_DECODER = msgspec.msgpack.Decoder(_VersionOnly)
 
 
-def make_topic(kind: type[Message], session: str) -> bytes:
-    """Return the topic of a message; it ends in a slash, so no topic is a prefix of another."""
-    return f"{kind.kind}/{session}/".encode()
-
-
 def encode(message: Message) -> list[bytes]:
     """Return the two parts of a message."""
-    return [make_topic(type(message), message.session), _ENCODER.encode(message)]
+    return [topic(message.kind, message.session), _ENCODER.encode(message)]
 
 
 def encoded_size(structure: object) -> int:

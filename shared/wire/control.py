@@ -1,38 +1,35 @@
-"""Messages between control and the services, and the events that control publishes."""
+"""Messages between control and the services, and the names of events."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from typing import Annotated
 
+from kouxing_client.field_types import (
+    Count,
+    EndpointMap,
+    MetricMap,
+    Name,
+    Probability,
+    Role,
+    Samples,
+    Seconds,
+    ServiceStatus,
+    SessionName,
+    Text,
+)
+from kouxing_client.messages import Lateness, SessionFacts
 from msgspec import Meta, Struct, field
 
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import MAX_KEYS, MAX_ROLES
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import (
-    Count,
-    EndpointMap,
-    Message,
-    Name,
-    Probability,
-    Samples,
-    Seconds,
-    SessionName,
-    Text,
-)
-from kouxing.shared.wire.session import (
-    Lateness,
-    MetricMap,
-    OpenSession,
-    Role,
-    ServiceStatus,
-    SessionFacts,
-)
+from kouxing.shared.wire.message import ServiceMessage
+from kouxing.shared.wire.session import OpenSession
 
 
 class EventName(StrEnum):
-    """The names of events."""
+    """The names of ``event`` messages."""
 
     AUDIO_SKIPPED = "audio-skipped"
     ERROR = "error"
@@ -59,7 +56,7 @@ class SessionProgress(Struct, frozen=True, kw_only=True):
     skipped_s: Seconds = 0.0  # total duration of the audio skipped by a slow service
 
 
-class Heartbeat(Message, frozen=True, kw_only=True):
+class Heartbeat(ServiceMessage, frozen=True, kw_only=True):
     """A service's loop is running; the first heartbeat registers the service with control."""
 
     service: Name
@@ -89,7 +86,7 @@ class AllowedKey(Struct, frozen=True, kw_only=True):
     roles: Annotated[list[Name], Meta(max_length=MAX_ROLES)]
 
 
-class HeartbeatReply(Message, frozen=True, kw_only=True):
+class HeartbeatReply(ServiceMessage, frozen=True, kw_only=True):
     """Control's answer to a heartbeat; the four timestamps give the offset of the clocks."""
 
     sent_ns: int  # as in the heartbeat
@@ -101,7 +98,7 @@ class HeartbeatReply(Message, frozen=True, kw_only=True):
     )
 
 
-class StartSession(Message, frozen=True, kw_only=True):
+class StartSession(ServiceMessage, frozen=True, kw_only=True):
     """Control asks a service to serve a session; again with a greater epoch after a move."""
 
     request: Name
@@ -119,16 +116,9 @@ class StartSession(Message, frozen=True, kw_only=True):
         return replace(self, opening=replace(self.opening, face=face))
 
 
-class SessionStarted(Message, frozen=True, kw_only=True):
+class SessionStarted(ServiceMessage, frozen=True, kw_only=True):
     """A service serves a session."""
 
     request: Name  # request of the start-session
     final_until: Samples = 0  # synthesizer: media time up to which the session's phones are final
     start: StartSession | None = None  # for a restarted control, which does not have the session
-
-
-class Event(Message, frozen=True, kw_only=True):
-    """Something happened. A service sends it to control, which numbers and publishes it."""
-
-    name: Name  # an EventName, or one of a later build
-    detail: Text = ""

@@ -5,11 +5,11 @@ from operator import attrgetter
 from typing import TypeAlias
 
 import numpy as np
+from kouxing_client.messages import Message, Phone, Speech
 
 from kouxing.shared.clock import duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones import events
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import AudioState, LipPositions, Phone, Progress, Results, Speech
+from kouxing.shared.wire.speech import AudioState, LipPositions, Progress, Results
 
 SpeechMessage: TypeAlias = Phone | LipPositions | Speech | Progress  # the parts of `results`
 

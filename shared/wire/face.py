@@ -1,11 +1,12 @@
-"""The moving face, and the settings that change it."""
+"""The settings that change a face."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
-from msgspec import Meta, Struct, field
+from kouxing_client.field_types import Name, SessionName
+from msgspec import Meta, Struct
 
 from kouxing.shared.face.expressions import (
     DEFAULT_HOLD_S,
@@ -13,20 +14,12 @@ from kouxing.shared.face.expressions import (
     MAX_HOLD_S,
     MIN_EXPRESSIVENESS,
 )
-from kouxing.shared.face.shape_names import MAX_SHAPES
 from kouxing.shared.fast_record import replace
-from kouxing.shared.wire.message import (
-    FapMask,
-    FapValues,
-    Message,
-    Name,
-    SessionName,
-)
+from kouxing.shared.wire.message import ServiceMessage
 
 Strength = Annotated[float, Meta(ge=0, le=1)]
 ExpressionMap = Annotated[dict[Name, Strength], Meta(max_length=32)]
 ShapeSets = Annotated[list[Name], Meta(max_length=16)]
-ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
 
 
 class FaceSettings(Struct, frozen=True, kw_only=True):
@@ -91,25 +84,8 @@ class CurrentFace:
         return self.settings.after(now_s - self.set_at_s)
 
 
-class SetFace(Message, frozen=True, kw_only=True):
+class SetFace(ServiceMessage, frozen=True, kw_only=True):
     """Changes a session's face. Sent by a client to control, and by control to the services."""
 
     face: FaceSettings
     request: Name | None = None  # None: no answer is needed
-
-
-class FapFrame(Message, frozen=True, kw_only=True):
-    """The face that belongs to the audio at media_time."""
-
-    published_at: ClassVar[str | None] = "faps"
-
-    values: FapValues  # 68 float32, little-endian, in FAP units
-    mask: FapMask  # bit i of the little-endian integer: FAP i + 1 is set
-    # The same face as weights of shapes, by set: float32, little-endian, 0 to 1, in the set's order
-    shapes: Annotated[dict[Name, ShapeWeights], Meta(max_length=16)] = field(default_factory=dict)
-
-
-class EndOfFaps(Message, frozen=True, kw_only=True):
-    """The session has no more FAP frames."""
-
-    published_at: ClassVar[str | None] = "faps"

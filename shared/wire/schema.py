@@ -6,9 +6,9 @@
 import json
 
 import msgspec
+from kouxing_client.messages import VERSION
 
 from kouxing.shared.wire.kinds import MESSAGES
-from kouxing.shared.wire.message import VERSION
 
 _FIELD_DEPTH = 4  # $defs, message, properties, field
 

@@ -1,32 +1,22 @@
-"""Messages between a client and control, and the confirmation of subscriptions."""
+"""Messages between a client and control."""
 
 from enum import StrEnum
 from typing import Annotated
 
-from msgspec import Meta, Struct, field
+from kouxing_client.audio import SAMPLE_BYTES
+from kouxing_client.field_types import Count, Endpoint, Name, Seconds, Text
+from kouxing_client.messages import ServiceState, SessionFacts, SessionState
+from kouxing_client.options import MAX_CHANNELS, MAX_RATE_HZ, MIN_RATE_HZ
+from msgspec import Meta, field
 
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import (
-    Count,
-    Endpoint,
-    EndpointMap,
-    Message,
-    Milliseconds,
-    Name,
-    Seconds,
-    SessionName,
-    Text,
-)
+from kouxing.shared.wire.message import ServiceMessage
 
-Encoding = Annotated[str, Meta(pattern="^(s16le|f32le)$")]
-SampleRate = Annotated[int, Meta(ge=8000, le=48000)]  # Hz
-NumChannels = Annotated[int, Meta(ge=1, le=2)]
+Encoding = Annotated[str, Meta(pattern=f"^({'|'.join(SAMPLE_BYTES)})$")]
+SampleRate = Annotated[int, Meta(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]
+NumChannels = Annotated[int, Meta(ge=1, le=MAX_CHANNELS)]
 MouthProfile = Annotated[bytes, Meta(max_length=MAX_MOUTH_PROFILE_BYTES)]
-Role = Annotated[str, Meta(pattern="^(control|worker|observer)$")]
-ServiceStatus = Annotated[str, Meta(pattern="^(ready|draining)$")]
-SessionStatus = Annotated[str, Meta(pattern="^(starting|open)$")]
-MetricMap = Annotated[dict[Name, float], Meta(max_length=64)]
 
 
 class ErrorCode(StrEnum):
@@ -51,24 +41,7 @@ class ErrorCode(StrEnum):
     UNKNOWN_SESSION = "unknown-session"
 
 
-class SessionFacts(Struct, frozen=True, kw_only=True):
-    """Facts about a session's results; each of its workers states some facts."""
-
-    language: Name | None = None  # language of the phones
-    frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # FAP frames per second
-    delay_ms: Annotated[float, Meta(ge=0, le=1000)] | None = None  # from audio to its FAP frame
-    lip_model: Name | None = None  # used unless the face settings name one
-
-
-class Lateness(Struct, frozen=True, kw_only=True):
-    """Lateness of the frames that left a live session's synthesizer in the last 10 s."""
-
-    p50_ms: Milliseconds
-    p95_ms: Milliseconds
-    worst_ms: Milliseconds
-
-
-class OpenSession(Message, frozen=True, kw_only=True):
+class OpenSession(ServiceMessage, frozen=True, kw_only=True):
     """A client asks for a session; if the session name is empty, control chooses one."""
 
     request: Name  # repeated in the answer
@@ -82,7 +55,7 @@ class OpenSession(Message, frozen=True, kw_only=True):
     face: FaceSettings = field(default_factory=FaceSettings)
 
 
-class SessionOpened(Message, frozen=True, kw_only=True):
+class SessionOpened(ServiceMessage, frozen=True, kw_only=True):
     """The session exists; connect to these endpoints."""
 
     request: Name
@@ -94,7 +67,7 @@ class SessionOpened(Message, frozen=True, kw_only=True):
     facts: SessionFacts
 
 
-class SessionMoved(Message, frozen=True, kw_only=True):
+class SessionMoved(ServiceMessage, frozen=True, kw_only=True):
     """Other workers serve the session from now on; ``epoch`` is the new one.
 
     Sent to the client, and published for all followers of the session.
@@ -106,7 +79,7 @@ class SessionMoved(Message, frozen=True, kw_only=True):
     next_sequence: Count | None = None  # first audio message to resend; None: the recognizer stays
 
 
-class CloseSession(Message, frozen=True, kw_only=True):
+class CloseSession(ServiceMessage, frozen=True, kw_only=True):
     """The session is over; the services delete its state.
 
     Sent by a client to control, and by control to the services.
@@ -116,7 +89,7 @@ class CloseSession(Message, frozen=True, kw_only=True):
     token: Name | None = None  # a client must give it
 
 
-class FlushSession(Message, frozen=True, kw_only=True):
+class FlushSession(ServiceMessage, frozen=True, kw_only=True):
     """Interrupts: audio not yet shown is dropped and the face returns to rest.
 
     Sent by a client to control, and by control to the services.
@@ -126,42 +99,14 @@ class FlushSession(Message, frozen=True, kw_only=True):
     token: Name
 
 
-class StatusRequest(Message, frozen=True, kw_only=True):
+class StatusRequest(ServiceMessage, frozen=True, kw_only=True):
     """Asks for the state of the whole system, or of one session and its services."""
 
     request: Name
     after: Count = 0  # ``next`` of the page before
 
 
-class ServiceState(Struct, frozen=True, kw_only=True):
-    """One service, from its newest heartbeat."""
-
-    service: Name  # recognizer, driver, ...
-    instance: Name
-    role: Role
-    state: ServiceStatus
-    age_s: float  # since its newest heartbeat
-    clock_offset_ms: float  # its clock minus control's
-    endpoints: EndpointMap
-    metrics: MetricMap
-    build: Text = ""  # version of kouxing
-
-
-class SessionState(Struct, frozen=True, kw_only=True):
-    """One session."""
-
-    session: SessionName
-    state: SessionStatus
-    age_s: float
-    speaking: bool
-    endpoints: EndpointMap  # the session's workers: audio, phones, faps, ...
-    workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
-    facts: SessionFacts
-    lateness: Lateness | None = None  # None: not live, or no frames in the last 10 s
-    skipped_s: Seconds = 0.0  # total duration of the audio skipped on a busy machine
-
-
-class StatusReport(Message, frozen=True, kw_only=True):
+class StatusReport(ServiceMessage, frozen=True, kw_only=True):
     """The answer to a status request."""
 
     request: Name
@@ -171,13 +116,13 @@ class StatusReport(Message, frozen=True, kw_only=True):
     resting_face: FaceSettings | None = None  # settings of the face at rest that are in effect
 
 
-class Done(Message, frozen=True, kw_only=True):
+class Done(ServiceMessage, frozen=True, kw_only=True):
     """Control has carried out a request."""
 
     request: Name
 
 
-class Error(Message, frozen=True, kw_only=True):
+class Error(ServiceMessage, frozen=True, kw_only=True):
     """A request or message was refused.
 
     The kind and these fields exist in every version of the protocol. A message of another version
@@ -188,12 +133,3 @@ class Error(Message, frozen=True, kw_only=True):
     text: Text
     request: Name | None = None
     retry_after_s: Annotated[Seconds, Meta(le=3600)] | None = None
-
-
-class Joined(Message, frozen=True, kw_only=True):
-    """A publisher's answer to a subscription to ``joined/<session>/``.
-
-    The subscriber's earlier subscriptions are in effect.
-    """
-
-    publisher: Name  # differs between publishers; wait for as many as you connected to

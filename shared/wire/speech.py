@@ -3,21 +3,16 @@
 from enum import StrEnum
 from typing import Annotated, ClassVar
 
+from kouxing_client.field_types import Count, FapValues, Name, Probability, Samples
+from kouxing_client.messages import Phone, Speech
 from msgspec import Meta, Struct, field
 
-from kouxing.shared.wire.message import (
-    Count,
-    FapValues,
-    LipValues,
-    Message,
-    Name,
-    Probability,
-    Samples,
-)
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.wire.message import ServiceMessage
 
-PhoneSymbol = Annotated[str, Meta(pattern=r"^[a-z]{1,4}$")]
 MAX_TOGETHER = 8  # messages in one, so that it fits into the limit of the synthesizer's socket
 _TOGETHER = Meta(max_length=MAX_TOGETHER)
+LipValues = Annotated[bytes, Meta(min_length=4 * len(MOUTH_FAPS), max_length=4 * len(MOUTH_FAPS))]
 Feeling = Annotated[float, Meta(ge=-1, le=1)]
 LipDelay = Annotated[int, Meta(ge=-16_000, le=16_000)]  # samples at 16 kHz
 
@@ -39,38 +34,18 @@ class AcousticModelName(StrEnum):
     LIGHT = "light"  # fewer right phones, in less time
 
 
-class Speech(Message, frozen=True, kw_only=True):
-    """Voice activity started (active) or ended at media_time."""
-
-    published_at: ClassVar[str | None] = "phones"
-
-    active: bool
-
-
-class Acoustic(Message, frozen=True, kw_only=True):
+class Acoustic(ServiceMessage, frozen=True, kw_only=True):
     """The acoustic model that finds the phones from now on. Repeated when speech starts."""
 
-    published_at: ClassVar[str | None] = "phones"
+    published_at: ClassVar[str] = "phones"
 
     model: Name = AcousticModelName.FULL
 
 
-class Phone(Message, frozen=True, kw_only=True):
-    """A recognized phone; media_time is its onset. A message with the same index revises it."""
-
-    published_at: ClassVar[str | None] = "phones"
-
-    index: Count
-    symbol: PhoneSymbol  # one of the session's language
-    duration: Samples
-    confidence: Probability
-    final: bool  # false: the duration is an estimate
-
-
-class LipPositions(Message, frozen=True, kw_only=True):
+class LipPositions(ServiceMessage, frozen=True, kw_only=True):
     """The mouth at media_time, from a lip model that works on the audio itself."""
 
-    published_at: ClassVar[str | None] = "phones"
+    published_at: ClassVar[str] = "phones"
 
     values: LipValues  # float32, little-endian, FAP units, in the order of MOUTH_FAPS
     delay_samples: LipDelay  # audio after media_time that the model used; below 0: it predicts
@@ -86,7 +61,7 @@ class NewestFrame(Struct, frozen=True, kw_only=True):
     values: FapValues  # 68 float32, little-endian, in FAP units
 
 
-class Progress(Message, frozen=True, kw_only=True):
+class Progress(ServiceMessage, frozen=True, kw_only=True):
     """The audio is processed up to media_time."""
 
     state: Name = AudioState.RUNNING
@@ -102,7 +77,7 @@ class Progress(Message, frozen=True, kw_only=True):
     newest_frame: NewestFrame | None = None
 
 
-class Results(Message, frozen=True, kw_only=True):
+class Results(ServiceMessage, frozen=True, kw_only=True):
     """Messages that the recognizer sends together; ``sequence`` is their order."""
 
     phones: Annotated[list[Phone], _TOGETHER] = field(default_factory=list)
@@ -111,7 +86,7 @@ class Results(Message, frozen=True, kw_only=True):
     progress: Annotated[list[Progress], _TOGETHER] = field(default_factory=list)
 
 
-class Acknowledge(Message, frozen=True, kw_only=True):
+class Acknowledge(ServiceMessage, frozen=True, kw_only=True):
     """Every message of the session up to ``sequence`` has arrived.
 
     Sent by the recognizer to the client, and by the synthesizer to the recognizer.

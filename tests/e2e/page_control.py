@@ -4,13 +4,12 @@ import time
 from typing import Any
 
 import numpy as np
+from kouxing_client.field_types import MASK_BYTES
+from kouxing_client.messages import EndOfFaps, FapFrame, Phone, Sound
 from numpy.typing import NDArray
 
-from kouxing.shared.face.faps import MASK_BYTES
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.audio import AudioChunk, Sound
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
-from kouxing.shared.wire.speech import Phone
+from kouxing.shared.wire.audio import AudioChunk
 from tests.fake_control import EPOCH, FakeControl
 
 FRAME = 320  # samples; 20 ms
@@ -68,7 +67,9 @@ class PageControl(FakeControl):
         if frame_time >= 0:
             values = shown.astype("<f4").tobytes()
             self.faps.send(
-                FapFrame(**stamp, media_time=frame_time, values=values, mask=bytes(MASK_BYTES))
+                FapFrame(
+                    **stamp, media_time=frame_time, packed_values=values, mask=bytes(MASK_BYTES)
+                )
             )
         if self._sequence % 10 == 0:
             self.phones.send(

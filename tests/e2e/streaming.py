@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 from kouxing_client import Client, FapFrame, Phone, Result, Session, Sound, Speech
-from kouxing_client.messages import Floats
 from numpy.typing import NDArray
 
 from tests.system import wait_until
@@ -19,7 +18,7 @@ class LipPositions(Result, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = "lip-positions"
 
-    values: Floats
+    values: bytes
     delay_samples: int
     closure: float
     lip_to_teeth: float

@@ -9,6 +9,7 @@ from typing import cast
 
 import pytest
 from kouxing_client import Client, KouxingError
+from kouxing_client.messages import FapFrame, Joined, Message
 
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.bus import Bus, ProbeResult
@@ -20,9 +21,7 @@ from kouxing.shared.service import Service
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import AllowedKey
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Joined, StatusRequest
+from kouxing.shared.wire.session import StatusRequest
 from tests.system import LIMIT_S, start_python, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -167,7 +166,7 @@ def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> 
 
         wait_until(lambda: received, step=exchange)  # then the subscriptions are in effect
         for session in ("theirs", "mine"):
-            publisher.send(FapFrame(session=session, values=bytes(272), mask=bytes(9)))
+            publisher.send(FapFrame(session=session, packed_values=bytes(272), mask=bytes(9)))
         wait_until(lambda: len(received) > 1, step=exchange)
         assert received == [(Joined, "mine"), (FapFrame, "mine")]
 

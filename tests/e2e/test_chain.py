@@ -130,7 +130,7 @@ def lip_frames_of(streamed: StreamedSession) -> list[speech.LipPositions]:
     return [
         speech.LipPositions(
             media_time=lips.media_time,
-            values=lips.values.tobytes(),
+            values=lips.values,
             delay_samples=lips.delay_samples,
             closure=lips.closure,
             lip_to_teeth=lips.lip_to_teeth,

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from kouxing_client.field_types import MAX_AUDIO_BYTES
+from kouxing_client.messages import FapFrame, Message
 
 from kouxing.shared import connection_limits, peer_quota, tarpit
 from kouxing.shared.bus import Bus
@@ -13,8 +15,6 @@ from kouxing.shared.connection_limits import MAX_TOPIC, MAX_TOPICS, ConnectionLi
 from kouxing.shared.sockets import MAX_DROPPED, Poller, ReceivedMessage, Socket
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import encode
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.speech import Progress
 from tests.raw_bytes import connect_raw, frame
 from tests.system import LIMIT_S, wait_until
@@ -140,7 +140,7 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
     with connect_raw(port_of(faps), "SUB") as hostile:
         hostile.sendall(frame(b"\x01" + bytes(MAX_TOPIC + 1)))
         assert is_soon_disconnected(hostile, faps)
-    frame_ = FapFrame(session="s", values=b"\0" * 272, mask=b"\0" * 9)
+    frame_ = FapFrame(session="s", packed_values=b"\0" * 272, mask=b"\0" * 9)
     faps.send(frame_)
     assert honest.wait(LIMIT_S)
 

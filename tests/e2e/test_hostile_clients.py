@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, Sound, find_key
+from kouxing_client.messages import Event, Message, Phone, Speech
 
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
 from kouxing.evaluation.system.attacks import MemoryUsage
@@ -18,11 +19,10 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import add_key, key_folder, load_key, load_user_key, revoke_key
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.control import Event, Heartbeat, HeartbeatReply, SessionProgress
+from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionProgress
 from kouxing.shared.wire.events import batch_messages
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
-from kouxing.shared.wire.speech import Acknowledge, AudioState, Phone, Progress, Speech
+from kouxing.shared.wire.speech import Acknowledge, AudioState, Progress
 from tests.e2e.streaming import StreamedSession
 from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until
 

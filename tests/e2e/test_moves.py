@@ -10,10 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from kouxing_client import Client
+from kouxing_client.messages import FapFrame, Phone
 
 from kouxing.shared.bus import Bus
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.speech import Phone
 from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.system import CHAIN, DEMO, LIMIT_S, System, samples_of_file
 

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
+from kouxing_client.field_types import MAX_AUDIO_BYTES
+from kouxing_client.messages import SessionFacts
 
 from kouxing.services.recognizer import pending_sessions
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -20,8 +22,6 @@ from kouxing.shared.keys import Peer
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES
-from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
 from tests.samples import with_opening

@@ -2,10 +2,10 @@
 
 import msgpack
 import pytest
+from kouxing_client.messages import VERSION
 
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.kinds import MESSAGES
-from kouxing.shared.wire.message import VERSION
 from tests.samples import SAMPLES, STORED
 
 

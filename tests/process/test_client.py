@@ -25,10 +25,9 @@ from kouxing_client import (
     Shapes,
     find_key,
 )
+from kouxing_client.messages import EndOfFaps, Event
 
 from kouxing.shared.keys import add_key, load_user_key
-from kouxing.shared.wire import face, speech
-from kouxing.shared.wire.control import Event
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import CloseSession, Error
 from tests.fake_control import FakeControl
@@ -43,22 +42,20 @@ def client(control: FakeControl) -> Iterator[Client]:
         yield new_client
 
 
-def frame(sequence: int) -> face.FapFrame:
-    return face.FapFrame(
+def frame(sequence: int) -> FapFrame:
+    return FapFrame(
         session="s",
         epoch=1,
         sequence=sequence,
         media_time=320 * sequence,
-        values=np.full(68, sequence, "<f4").tobytes(),
+        packed_values=np.full(68, sequence, "<f4").tobytes(),
         mask=bytes(9),
-        shapes={"vrm": np.array([0.5, *[0] * 11], "<f4").tobytes()},
+        packed_shapes={"vrm": np.array([0.5, *[0] * 11], "<f4").tobytes()},
     )
 
 
-PHONE = speech.Phone(
-    session="s", epoch=1, index=0, symbol="a", duration=1600, confidence=1.0, final=True
-)
-END = face.EndOfFaps(session="s", epoch=1, sequence=9)
+PHONE = Phone(session="s", epoch=1, index=0, symbol="a", duration=1600, confidence=1.0, final=True)
+END = EndOfFaps(session="s", epoch=1, sequence=9)
 
 
 def test_the_client_finds_the_key_that_commands_use(

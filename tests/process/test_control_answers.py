@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import zmq
+from kouxing_client.messages import Speech
 
 from kouxing.shared.bus import Bus
 from kouxing.shared.fast_record import replace
@@ -16,7 +17,6 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionProgress
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
-from kouxing.shared.wire.speech import Speech
 from tests.control_harness import ControlHarness
 
 

@@ -1,6 +1,7 @@
 """A restarted control learns the sessions from the services."""
 
 import pytest
+from kouxing_client.messages import Speech
 
 from kouxing.services.control import restart_recovery, session_lifecycle
 from kouxing.shared.fast_record import replace
@@ -14,7 +15,6 @@ from kouxing.shared.wire.session import (
     OpenSession,
     SessionMoved,
 )
-from kouxing.shared.wire.speech import Speech
 from tests.control_harness import ControlHarness, make_heartbeat
 from tests.samples import START
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kouxing_client import follower
+from kouxing_client.messages import EndOfFaps, Event
 
 from kouxing.services.driver import pose_store, recorder_client
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.service import DriverService
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.wire.control import Event, SessionProgress, SessionStarted
-from kouxing.shared.wire.face import EndOfFaps
+from kouxing.shared.wire.control import SessionProgress, SessionStarted
 from kouxing.shared.wire.session import Error
 from tests.fake_control import FakeControl
 from tests.samples import fap_frame

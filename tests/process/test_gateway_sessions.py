@@ -6,10 +6,10 @@ from collections.abc import Iterator
 import aiohttp
 import pytest
 from kouxing_client.base import MAX_UNACKNOWLEDGED
+from kouxing_client.messages import EndOfFaps
 
 from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import SessionStarted
-from kouxing.shared.wire.face import EndOfFaps
 from kouxing.shared.wire.session import CloseSession, FlushSession
 from tests.fake_control import EPOCH, FakeControl
 from tests.process.web_clients import (

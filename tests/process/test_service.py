@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from kouxing_client.messages import Speech
 
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
@@ -26,7 +27,7 @@ from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat, SessionProgress, SessionStarted
-from kouxing.shared.wire.speech import Progress, Speech
+from kouxing.shared.wire.speech import Progress
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
 from tests.samples import START

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import pytest
+from kouxing_client.messages import EndOfFaps, FapFrame
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED_EVENTS, SynthesizerService
@@ -12,7 +13,7 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.speech import AudioState, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port

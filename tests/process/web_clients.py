@@ -10,12 +10,11 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import aiohttp
+from kouxing_client.field_types import MASK_BYTES
+from kouxing_client.messages import FapFrame, Phone, Sound, Speech
 
 from kouxing.services.gateway.browser_messages import REST_TYPE
-from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
-from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.speech import Phone, Speech
+from kouxing.shared.face.faps import NUM_FAPS
 from tests.fake_control import EPOCH, FakeControl
 from tests.system import LIMIT_S, wait_until
 
@@ -37,7 +36,7 @@ def publish_all(control: FakeControl, session: str) -> None:
     sound, speech = Sound(**stamp, pcm=b"\x01\x00\xff\x7f"), Speech(**stamp, active=True)
     control.publish(control.phones, sound, speech)
     publish_phone(control, session, "iao")
-    control.publish(control.faps, FapFrame(**stamp, values=FACE, mask=bytes(MASK_BYTES)))
+    control.publish(control.faps, FapFrame(**stamp, packed_values=FACE, mask=bytes(MASK_BYTES)))
 
 
 async def wait_until_async(condition: Callable[[], object]) -> None:

@@ -11,6 +11,8 @@ import pytest
 import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kouxing_client.field_types import MAX_AUDIO_BYTES
+from kouxing_client.messages import Message
 
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
@@ -27,7 +29,6 @@ from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionProgress, SessionStarted, StartSession
-from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
 from tests.control_harness import ENDPOINTS_BY_SERVICE, LOCAL, make_heartbeat
 from tests.samples import SAMPLES, with_opening

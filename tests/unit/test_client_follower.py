@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from array import array
-
 from kouxing_client import FapFrame, Sound
 from kouxing_client.follower import CATCH_UP_S, MAX_HELD_FRAMES, OVERLAP_S, RETRY_S, Follower
 from kouxing_client.messages import EndOfFaps, Joined, Message
@@ -51,7 +49,9 @@ class FollowerHarness:
 
 def frame(sequence: int, epoch: int = 1, media_time: int | None = None) -> FapFrame:
     time = 320 * sequence if media_time is None else media_time
-    return FapFrame(epoch=epoch, sequence=sequence, media_time=time, values=array("f", bytes(272)))
+    return FapFrame(
+        epoch=epoch, sequence=sequence, media_time=time, packed_values=bytes(272), mask=bytes(9)
+    )
 
 
 def sound(sequence: int, epoch: int = 1) -> Sound:

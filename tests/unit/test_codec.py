@@ -7,11 +7,11 @@ import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kouxing_client.messages import Message
 
 from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import OpenSession
 from tests.samples import SAMPLES
 

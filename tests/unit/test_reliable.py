@@ -4,6 +4,8 @@ import math
 from collections import deque
 from typing import Any, cast
 
+from kouxing_client.messages import Message
+
 from kouxing.shared.keys import Peer
 from kouxing.shared.reliable import (
     ACKNOWLEDGE_INTERVAL_S,
@@ -13,7 +15,6 @@ from kouxing.shared.reliable import (
     ReliableSender,
 )
 from kouxing.shared.wire.events import split_batch
-from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
 
 PEER = Peer(b"peer")

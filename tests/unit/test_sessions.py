@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from kouxing_client.messages import SessionFacts
 
 from kouxing.services.control.placement import Placement
 from kouxing.services.control.service_registry import ServiceRegistry
@@ -16,7 +17,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import Heartbeat, SessionProgress
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.session import OpenSession, SessionFacts
+from kouxing.shared.wire.session import OpenSession
 
 CLIENT = Peer(b"client", "its key")
 PROVIDES = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}

@@ -1,11 +1,11 @@
 """Sound of a session, joined to messages."""
 
 import numpy as np
+from kouxing_client.messages import Sound
 
 from kouxing.services.recognizer.sound_packets import SoundPackets
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, Waveform
-from kouxing.shared.wire.audio import Sound
 
 
 def messages(*starts: int, num_samples: int = 320, face_delay_s: float = 0.06) -> list[Sound]:

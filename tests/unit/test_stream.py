@@ -5,6 +5,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from kouxing_client.messages import Message
 
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -24,7 +25,6 @@ from kouxing.shared.phones.events import (
     Waveform,
 )
 from kouxing.shared.wire.events import event_to_message
-from kouxing.shared.wire.message import Message
 from tests.live_streams import LiveStream, recognize_live, recognize_together
 from tests.system import HELLO, VOWELS_FILE, samples_of_file
 

@@ -2,6 +2,8 @@
 
 from typing import cast
 
+from kouxing_client.messages import Message, Speech
+
 from kouxing.services.recognizer.synthesizer_link import (
     KEPT_SAMPLES,
     MAX_BACKLOG,
@@ -12,8 +14,7 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import split_batch
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results, Speech
+from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
 
 FAPS = bytes(range(4)) * NUM_FAPS
 

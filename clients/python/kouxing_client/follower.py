@@ -6,13 +6,12 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 from kouxing_client.errors import KouxingError
+from kouxing_client.messages import EndOfFaps, FapFrame, Joined, Message
 
 RETRY_S = 3.0  # an unconfirmed subscription is made again after this time
 OVERLAP_S = 3.0  # time for which a possibly dead connection stays open for late data
 CATCH_UP_S = 0.1  # queued messages arrive within this time after a suspension
 MAX_HELD_FRAMES = 8  # number of these live frames that are kept
-END = "end-of-faps"
-_PUBLISHER_OF = {"fap-frame": "faps", END: "faps"}  # endpoint; other kinds are at "phones"
 _Number = tuple[int, int]  # epoch and sequence, or media time and sequence
 _NO_NUMBER = (-1, -1)
 
@@ -31,7 +30,7 @@ class Transport(Protocol):
     def subscribe(
         self,
         session: str,
-        classes: Collection[type[Any]],
+        classes: Collection[type[Message]],
         addresses: Collection[str],
         live_addresses: Collection[str],
         on_message: Callable[[Any], None],
@@ -59,8 +58,7 @@ class Follower:
     Parameters
     ----------
     classes
-        Classes of messages to subscribe to. They have the attribute ``kind``, and their instances
-        ``epoch``, ``sequence`` and ``media_time``.
+        Classes of messages to subscribe to.
     live
         Whether late frames are worthless. If so, only the newest ``MAX_HELD_FRAMES`` of the frames
         that queued while this process was suspended are passed on.
@@ -75,7 +73,7 @@ class Follower:
         self,
         transport: Transport,
         session: str,
-        classes: Collection[type[Any]],
+        classes: Collection[type[Message]],
         on_message: Callable[[Any], None],
         *,
         live: bool = True,
@@ -104,13 +102,13 @@ class Follower:
         self._keeps_publisher = False  # an address was also used before the move
         self._confirmed: set[str] = set()  # publishers
         self._first_epoch = 0
-        self._epochs: dict[str, int] = {}  # publisher: epoch of its newest message
+        self._epochs: dict[str, int] = {}  # endpoint: epoch of its newest message
         self._newest: dict[str, _Number] = {}  # numbers of the newest message, by kind
         self._newest_before: dict[str, _Number] = {}  # newest at the new subscription
         self._seen: set[tuple[str, _Number]] = set()  # messages since the new subscription
         self._last_frame = _NO_NUMBER  # media time and sequence
         self._last_sequence: int | None = None
-        self._held_frames: deque[Any] = deque(maxlen=MAX_HELD_FRAMES)
+        self._held_frames: deque[FapFrame] = deque(maxlen=MAX_HELD_FRAMES)
 
     def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
         """Subscribe to ``endpoints``; when called again, where the session is published now.
@@ -122,7 +120,7 @@ class Follower:
         KouxingError
             If an endpoint is missing or malformed.
         """
-        names = {_PUBLISHER_OF.get(cls.kind, "phones") for cls in self._classes}
+        names = {cls.published_at for cls in self._classes}
         if missing := sorted(names - endpoints.keys()):
             raise KouxingError(f"session {self.session} has no endpoint {missing[0]!r}")
         addresses = {endpoints[name] for name in names}
@@ -204,11 +202,11 @@ class Follower:
             self._transport.close_connection(connection)
             self._old_connection = None
 
-    def _on_arrival(self, message: Any, confirmed: set[str]) -> None:
+    def _on_arrival(self, message: Message, confirmed: set[str]) -> None:
         self.received_at_s = self._transport.now_s
-        if message.kind == "joined":
+        if isinstance(message, Joined):
             self._on_joined(message.publisher, confirmed)
-        elif self._live and message.kind == "fap-frame" and self._is_catching_up():
+        elif self._live and isinstance(message, FapFrame) and self._is_catching_up():
             self._held_frames.append(message)
         else:
             self._deliver_held()
@@ -235,25 +233,25 @@ class Follower:
             self.tick()
             self._on_complete()
 
-    def _accept(self, message: Any) -> None:
-        publisher = _PUBLISHER_OF.get(message.kind, "phones")
-        known_epoch = self._epochs.get(publisher, self._first_epoch)
-        if message.epoch < known_epoch or (message.kind == END and message.epoch < self.epoch):
+    def _accept(self, message: Message) -> None:
+        known_epoch = self._epochs.get(message.published_at, self._first_epoch)
+        is_end = isinstance(message, EndOfFaps)
+        if message.epoch < known_epoch or (is_end and message.epoch < self.epoch):
             self.num_outdated += 1
             return
         if message.epoch > self.epoch:
             self._enter_epoch(message.epoch)
-        if self._is_repeated(message, publisher):
+        if self._is_repeated(message):
             return
-        if message.kind == "fap-frame":
+        if isinstance(message, FapFrame):
             if self._last_sequence is not None:
                 self.num_missed += max(0, message.sequence - self._last_sequence - 1)
             self._last_sequence = message.sequence
-        elif message.kind == END:
+        elif is_end:
             self.has_ended = True
         self._on_message(message)
 
-    def _is_repeated(self, message: Any, publisher: str) -> bool:
+    def _is_repeated(self, message: Message) -> bool:
         """Return whether the message arrived before, on the other connection or in an epoch."""
         kind, number = message.kind, (message.epoch, message.sequence)
         has_two = self._old_connection is not None
@@ -263,9 +261,9 @@ class Follower:
             return True
         if has_two:
             self._seen.add((kind, number))
-        self._epochs[publisher] = message.epoch
+        self._epochs[message.published_at] = message.epoch
         self._newest[kind] = max(number, self._newest.get(kind, number))
-        if kind == "fap-frame":
+        if isinstance(message, FapFrame):
             number = (message.media_time, message.sequence)
             if number <= self._last_frame:
                 return True

@@ -4,19 +4,34 @@ from __future__ import annotations
 
 import sys
 from array import array
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 
-if TYPE_CHECKING:
-    Floats = array[float]
-else:
-    Floats = array  # a type that msgspec can evaluate
+from kouxing_client.field_types import (
+    MAX_AUDIO_BYTES,
+    Count,
+    EndpointMap,
+    FapMask,
+    FapValues,
+    MetricMap,
+    Milliseconds,
+    Name,
+    PhoneSymbol,
+    Probability,
+    Role,
+    Samples,
+    Seconds,
+    ServiceStatus,
+    SessionName,
+    SessionStatus,
+    ShapeMap,
+    Text,
+    Version,
+)
 
 VERSION = 3
 MEDIA_RATE_HZ = 16000
-NUM_FAPS = 68
 SILENCE = "sil"  # the phone of a pause, in every language
 Fields = dict[str, Any]
 SHAPE_NAMES: dict[str, tuple[str, ...]] = {
@@ -45,14 +60,16 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
     """Fields that every message has."""
 
     kind: ClassVar[str]  # first part of the topic
+    published_at: ClassVar[str] = ""  # name of the worker's endpoint; empty: not published there
 
-    version: int = VERSION
-    session: str = ""
-    epoch: int = 0
+    version: Version = VERSION
+    session: SessionName = ""
+    """name of the session; empty: the message concerns no session"""
+    epoch: Count = 0
     """placement of the session; it grows each time the session moves to another process"""
-    sequence: int = 0
-    """sequence number of the message, counted by its publisher"""
-    media_time: int = 0
+    sequence: Count = 0
+    """sequence number of the message, counted by its sender for each socket and session"""
+    media_time: Samples = 0
     """samples at 16 kHz since the session's first sample"""
 
 
@@ -62,6 +79,8 @@ class Result(Message, frozen=True, kw_only=True):
     Subclasses name other kinds of message of PROTOCOL.md and can be passed to ``results``.
     """
 
+    published_at: ClassVar[str] = "phones"
+
     @property
     def time_s(self) -> float:
         """Seconds since the session's first sample."""
@@ -69,18 +88,27 @@ class Result(Message, frozen=True, kw_only=True):
 
 
 class FapFrame(Result, frozen=True, kw_only=True):
-    """The face at ``media_time``."""
+    """The face that belongs to the audio at media_time."""
 
     kind: ClassVar[str] = "fap-frame"
+    published_at: ClassVar[str] = "faps"
 
-    values: Floats
-    """68 values in FAP units, FAP 1 first"""
-    shapes: dict[str, Floats] = {}
-    """the same face as weights of each requested set of blendshapes, by name of the set"""
+    packed_values: FapValues = msgspec.field(name="values")
+    """``values`` as little-endian float32"""
+    mask: FapMask
+    """bit i of the little-endian integer: FAP i + 1 is set"""
+    packed_shapes: ShapeMap = msgspec.field(name="shapes", default_factory=dict)
+    """``shapes`` as little-endian float32"""
 
-    def __post_init__(self) -> None:
-        if len(self.values) != NUM_FAPS:
-            raise ValueError(f"expected {NUM_FAPS} values, got {len(self.values)}")
+    @property
+    def values(self) -> array[float]:
+        """68 values in FAP units, FAP 1 first."""
+        return _unpack(self.packed_values)
+
+    @property
+    def shapes(self) -> dict[str, array[float]]:
+        """The same face as weights of each requested set of blendshapes, by name of the set."""
+        return {name: _unpack(weights) for name, weights in self.packed_shapes.items()}
 
 
 class Shapes(Result, frozen=True, kw_only=True):
@@ -88,8 +116,13 @@ class Shapes(Result, frozen=True, kw_only=True):
 
     set: str
     """``arkit``, ``oculus`` or ``vrm``"""
-    weights: Floats
-    """0 to 1, in the order of ``SHAPE_NAMES``"""
+    packed_weights: bytes
+    """``weights`` as little-endian float32"""
+
+    @property
+    def weights(self) -> array[float]:
+        """0 to 1, in the order of ``SHAPE_NAMES``."""
+        return _unpack(self.packed_weights)
 
     @property
     def by_name(self) -> dict[str, float]:
@@ -97,19 +130,25 @@ class Shapes(Result, frozen=True, kw_only=True):
         return dict(zip(SHAPE_NAMES[self.set], self.weights, strict=True))
 
 
+class EndOfFaps(Message, frozen=True, kw_only=True):
+    """The session has no more FAP frames."""
+
+    kind: ClassVar[str] = "end-of-faps"
+    published_at: ClassVar[str] = "faps"
+
+
 class Phone(Result, frozen=True, kw_only=True):
-    """A recognized phone with its onset at ``media_time``; the same ``index`` revises it."""
+    """A recognized phone; media_time is its onset. A message with the same index revises it."""
 
     kind: ClassVar[str] = "phone"
 
-    index: int
+    index: Count
     """number of the phone within the session"""
-    symbol: str
+    symbol: PhoneSymbol
     """a phone of the session's language"""
-    duration: int
+    duration: Samples
     """samples at 16 kHz"""
-    confidence: float
-    """0 to 1"""
+    confidence: Probability
     final: bool
     """whether onset and duration are measured; otherwise the duration is an estimate"""
 
@@ -120,7 +159,7 @@ class Phone(Result, frozen=True, kw_only=True):
 
 
 class Speech(Result, frozen=True, kw_only=True):
-    """Speech starts or stops."""
+    """Voice activity started (active) or ended at media_time."""
 
     kind: ClassVar[str] = "speech"
 
@@ -128,120 +167,111 @@ class Speech(Result, frozen=True, kw_only=True):
 
 
 class Sound(Result, frozen=True, kw_only=True):
-    """The session's audio from ``media_time`` on."""
+    """The session's audio as the recognizer reads it: 16 kHz mono."""
 
     kind: ClassVar[str] = "sound"
 
-    pcm: bytes
-    """16-bit integers, little-endian, 16 kHz, mono"""
-
-
-class EndOfFaps(Message, frozen=True, kw_only=True):
-    """The session's last FAP frame has been published."""
-
-    kind: ClassVar[str] = "end-of-faps"
+    pcm: Annotated[bytes, msgspec.Meta(max_length=4 * MAX_AUDIO_BYTES)]
+    """16-bit integers, little-endian"""
 
 
 class Joined(Message, frozen=True, kw_only=True):
-    """A publisher confirms that the subscriptions before this one are in effect."""
+    """A publisher's answer to a subscription to ``joined/<session>/``.
+
+    The subscriber's earlier subscriptions are in effect.
+    """
 
     kind: ClassVar[str] = "joined"
 
-    publisher: str
+    publisher: Name
+    """differs between publishers; wait for as many as you connected to"""
 
 
 class Event(Message, frozen=True, kw_only=True):
-    """Control reports a change, such as ``session-closed`` or ``recorded``."""
+    """Something happened. A service sends it to control, which numbers and publishes it."""
 
     kind: ClassVar[str] = "event"
 
-    name: str
-    detail: str = ""
+    name: Name
+    """such as ``session-closed`` or ``recorded``"""
+    detail: Text = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServiceState:
-    """One service, as its last heartbeat described it."""
+class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
+    """One service, from its newest heartbeat."""
 
-    service: str
+    service: Name
     """``recognizer``, ``synthesizer``, ..."""
-    instance: str
-    role: str
+    instance: Name
+    role: Role
     """``control``, ``worker`` (placed in sessions) or ``observer`` (takes part in all)"""
-    state: str
+    state: ServiceStatus
     """``ready`` or ``draining``"""
     age_s: float
-    """seconds since its last heartbeat"""
+    """seconds since its newest heartbeat"""
     clock_offset_ms: float
     """its clock minus control's"""
-    endpoints: dict[str, str]
-    metrics: dict[str, float]
-    build: str = ""
+    endpoints: EndpointMap
+    metrics: MetricMap
+    build: Text = ""
     """version of kouxing; empty if unknown"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SessionFacts:
-    """Facts that a session's workers state about their results."""
+class SessionFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """Facts about a session's results; each of its workers states some facts."""
 
-    language: str | None = None
+    language: Name | None = None
     """language of the phones"""
-    frame_rate_hz: float | None = None
+    frame_rate_hz: Annotated[float, msgspec.Meta(gt=0, le=1000)] | None = None
     """FAP frames per second of media time"""
-    delay_ms: float | None = None
+    delay_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] | None = None
     """from audio to its FAP frame"""
-    lip_model: str | None = None
+    lip_model: Name | None = None
     """lip model of a face whose settings name none"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lateness:
-    """Lateness of a live session's frames in the last 10 s."""
+class Lateness(msgspec.Struct, frozen=True, kw_only=True):
+    """Lateness of the frames that left a live session's synthesizer in the last 10 s."""
 
-    p50_ms: float
-    p95_ms: float
-    worst_ms: float
+    p50_ms: Milliseconds
+    p95_ms: Milliseconds
+    worst_ms: Milliseconds
 
 
-@dataclass(frozen=True, kw_only=True)
-class SessionState:
-    """One session, as control knows it."""
+class SessionState(msgspec.Struct, frozen=True, kw_only=True):
+    """One session."""
 
-    session: str
-    state: str
+    session: SessionName
+    state: SessionStatus
     """``starting`` or ``open``"""
     age_s: float
     speaking: bool
-    endpoints: dict[str, str]
+    endpoints: EndpointMap
     """addresses of its recognizer and synthesizer: ``audio``, ``phones``, ``faps``, ..."""
-    workers: dict[str, str]
+    workers: Annotated[dict[Name, Name], msgspec.Meta(max_length=16)]
     """instance at each endpoint"""
     facts: SessionFacts
     lateness: Lateness | None = None
     """None if the session is not live, or had no frames in the last 10 s"""
-    skipped_s: float = 0.0
+    skipped_s: Seconds = 0.0
     """duration of the audio that was skipped on a busy machine"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Status:
+class Status(msgspec.Struct, frozen=True, kw_only=True):
     """The state of a system."""
 
     services: list[ServiceState]
     sessions: list[SessionState]
-    resting_face: dict[str, Any] = field(default_factory=dict)
+    resting_face: dict[str, Any] = {}
     """settings of the face at rest that are in effect, as in ``Client.set_face``"""
 
 
-M = TypeVar("M", bound=Message)
 _ENCODER = msgspec.msgpack.Encoder()
 _FIELDS_DECODER = msgspec.msgpack.Decoder(dict[str, Any])
 
 
-def _to_floats(_type: object, data: object) -> array[float]:
+def _unpack(data: bytes) -> array[float]:
     """Convert little-endian float32 to numbers."""
-    if not isinstance(data, bytes):
-        raise TypeError("expected bytes")
     values = array("f", data)
     if sys.byteorder == "big":
         values.byteswap()
@@ -249,7 +279,10 @@ def _to_floats(_type: object, data: object) -> array[float]:
 
 
 def topic(kind: str, session: str) -> bytes:
-    """Return the first part of a message, to which clients subscribe."""
+    """Return the first part of a message, to which clients subscribe.
+
+    It ends in a slash, so no topic is a prefix of another.
+    """
     return f"{kind}/{session}/".encode()
 
 
@@ -278,9 +311,7 @@ class Decoders:
     """Decodes messages of some classes."""
 
     def __init__(self, *classes: type[Message]) -> None:
-        self._decoders = {
-            cls.kind: msgspec.msgpack.Decoder(cls, dec_hook=_to_floats) for cls in classes
-        }
+        self._decoders = {cls.kind: msgspec.msgpack.Decoder(cls) for cls in classes}
 
     def decode(self, parts: list[bytes]) -> Message | None:
         """Return a message; None for other kinds, other versions and malformed messages."""

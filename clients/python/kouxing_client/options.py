@@ -7,11 +7,11 @@ from typing import TypedDict
 
 from kouxing_client.audio import SAMPLE_BYTES
 from kouxing_client.errors import KouxingError
+from kouxing_client.field_types import SESSION_NAME
 from kouxing_client.messages import MEDIA_RATE_HZ, Fields
 
 MIN_RATE_HZ, MAX_RATE_HZ = 8000, 48000
 MAX_CHANNELS = 2
-_NAME = re.compile("[A-Za-z0-9_-]{0,64}")
 
 
 class FaceSettings(TypedDict, total=False):
@@ -105,7 +105,7 @@ def face_fields(settings: FaceSettings) -> Fields:
 
 def check_name(name: str) -> None:
     """Raise ``KouxingError`` if a text is not a valid session name; it may be empty."""
-    if not (isinstance(name, str) and _NAME.fullmatch(name)):
+    if not (isinstance(name, str) and re.fullmatch(SESSION_NAME, name)):
         raise KouxingError(
             f"{name!r} is not a valid session name; use up to 64 letters, digits, '-' and '_'"
         )

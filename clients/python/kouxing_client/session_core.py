@@ -116,10 +116,10 @@ class Subscription:
         if type(message) in self._classes and not isinstance(message, Phone):
             self._on_result(message)
         if Shapes in self._classes and isinstance(message, FapFrame):
-            weights = message.shapes.get(self._shape_set)
+            weights = message.packed_shapes.get(self._shape_set)
             if weights is not None:
                 header = {name: getattr(message, name) for name in Message.__struct_fields__}
-                self._on_result(Shapes(**header, set=self._shape_set, weights=weights))
+                self._on_result(Shapes(**header, set=self._shape_set, packed_weights=weights))
 
     def _on_end(self) -> None:
         """End; before that, wait for the last phones, because they have another publisher.

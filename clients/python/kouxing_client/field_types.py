@@ -1,0 +1,32 @@
+"""The types of the fields of messages, with their ranges; PROTOCOL.md describes them."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+NUM_FAPS = 68
+MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the first byte
+MAX_SHAPES = 256  # per set
+MAX_AUDIO_BYTES = 64 * 1024  # in one message
+SESSION_NAME = "[A-Za-z0-9_-]{0,64}"  # empty: no session
+
+Version = Annotated[int, Meta(ge=1, le=65535)]
+SessionName = Annotated[str, Meta(pattern=f"^{SESSION_NAME}$")]
+Name = Annotated[str, Meta(min_length=1, max_length=128)]
+Text = Annotated[str, Meta(max_length=2000)]
+Count = Annotated[int, Meta(ge=0, le=2**53)]
+Samples = Annotated[int, Meta(ge=0, le=2**53)]  # at 16 kHz
+Seconds = Annotated[float, Meta(ge=0)]
+Milliseconds = Annotated[float, Meta(ge=0)]
+Probability = Annotated[float, Meta(ge=0, le=1)]
+PhoneSymbol = Annotated[str, Meta(pattern=r"^[a-z]{1,4}$")]
+FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]
+FapMask = Annotated[bytes, Meta(min_length=MASK_BYTES, max_length=MASK_BYTES)]
+ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
+ShapeMap = Annotated[dict[Name, ShapeWeights], Meta(max_length=16)]
+Endpoint = Annotated[str, Meta(max_length=256)]
+EndpointMap = Annotated[dict[Name, Endpoint], Meta(max_length=16)]
+MetricMap = Annotated[dict[Name, float], Meta(max_length=64)]
+Role = Annotated[str, Meta(pattern="^(control|worker|observer)$")]
+ServiceStatus = Annotated[str, Meta(pattern="^(ready|draining)$")]
+SessionStatus = Annotated[str, Meta(pattern="^(starting|open)$")]
