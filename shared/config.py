@@ -161,7 +161,8 @@ class ServiceConfig(BaseModel):
     """Alternative to an unencrypted address that other machines can reach, for errors."""
 
     control: Endpoint = "tcp://127.0.0.1:5550"
-    """Address at which control accepts commands."""
+    """Address at which control accepts commands. Control binds it; if it contains a host name,
+    control binds all addresses of its host."""
     advertise: Host = ""
     """Host name or address at which others reach this service, for example behind NAT. If empty,
     the bound address is used; for 0.0.0.0, the address from which this host reaches control."""
