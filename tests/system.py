@@ -211,10 +211,7 @@ class System(LocalSystem):
 
     def start(self, name: str, **settings: str) -> None:
         """Start a service, or start it again."""
-        supervisor = self.supervisor
-        supervisor._more = {**supervisor._more, name: settings}
-        supervisor._backoff_s[name] = 0.0
-        supervisor._start(name)
+        self.supervisor.start_service(name, settings)
         self.running.add(name)
 
     def lose(self, name: str, number: signal.Signals = signal.SIGKILL) -> ServiceProcess:

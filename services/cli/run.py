@@ -48,6 +48,7 @@ from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
 if TYPE_CHECKING:
     from kouxing.shared.audio_file import AudioSource
 
+CONTROL_VARIABLE = variable_name(COMMON, "control")
 BOUND_CONTROL_VARIABLE = variable_name("control", "control")
 _SAMPLE_SESSION = "demo"
 
@@ -89,65 +90,61 @@ def run(
         settings.load(kind.config_type)  # if a key is wrong, nothing starts
     out = Path(settings.load(DriverConfig).out)
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
-    reservation = _enter(lock_output_folder(out))
-    arguments = ["--config", str(config)] if config else []
-    startup = _enter(
-        lock_startup(lambda: print_message("waiting for another kouxing to finish starting"))
-    )
-    addresses = _service_addresses(settings, has_port_option=port is not None)
-    control_config = settings.load(ControlConfig)
-    bound_control = addresses.get(BOUND_CONTROL_VARIABLE, control_config.bound_control)
-    control = _control_address(bound_control)
-    environment = {
-        **assigned_environment(given),
-        **head_environment(settings, head, out),
-        **addresses,
-        variable_name(COMMON, "control"): control,
-        BOUND_CONTROL_VARIABLE: bound_control,
-    }
-    if not control_config.insecure:
-        check_keys({kind.name: kind.key_roles for kind in KINDS.values()})
-    client_control = control_endpoint(control, insecure=control_config.insecure)
-    supervisor = Supervisor(
-        arguments,
-        out / "logs",
-        CONSOLE,
-        environment,
-        more=extra_worker_environments(settings, workers),
-    )
-    _install_signal_handlers()
-    if warning := _port_warning(settings, addresses, control):
-        print_message(warning)
-    try:
-        with CONSOLE.status(f"starting {', '.join(KINDS)}"):
-            ensure_page_heads()
-            supervisor.start()
-            supervisor.wait_ready(client_control)
-        startup.close()
-        supervisor.watch()
-        page = supervisor.page_address(client_control)
-        with announce_system(client_control):
-            print_message(f"the face is at {page}")
-            if browser and not stop_after:
-                _open_browser(page)
-            if sample is not None:
-                _play_sample(sample, client_control)
-            if stop_after:
-                return
-            print_message(
-                "ready: use the microphone on the page, or run in another terminal:"
-                f" {command_name()} speak my.wav; press Ctrl-C to stop"
-            )
-            supervisor.wait()
-    except KeyboardInterrupt:
-        _stop_at_interrupt()
-    finally:
-        supervisor.stop()
-        reservation.close()
+    with lock_output_folder(out), contextlib.ExitStack() as startup:
+        startup.enter_context(
+            lock_startup(lambda: print_message("waiting for another kouxing to finish starting"))
+        )
+        moved = _moved_addresses(settings, has_port_option=port is not None)
+        control_environment = _control_environment(settings, moved)
+        control_address = control_environment[CONTROL_VARIABLE]
+        control = _check_keys(settings, control_address)
+        supervisor = Supervisor(
+            ["--config", str(config)] if config else [],
+            out / "logs",
+            CONSOLE,
+            {
+                **assigned_environment(given),
+                **head_environment(settings, head, out),
+                **moved,
+                **control_environment,
+            },
+            more=extra_worker_environments(settings, workers),
+        )
+        _install_signal_handlers()
+        if warning := _port_warning(settings, moved, control_address):
+            print_message(warning)
+        try:
+            with CONSOLE.status(f"starting {', '.join(KINDS)}"):
+                ensure_page_heads()
+                supervisor.start()
+                supervisor.wait_ready(control)
+            startup.close()
+            supervisor.watch()
+            page = supervisor.page_address(control)
+            with announce_system(control):
+                print_message(f"the face is at {page}")
+                if browser and not stop_after:
+                    _open_browser(page)
+                if sample is not None:
+                    _play_sample(sample, control)
+                if not stop_after:
+                    print_message(
+                        "ready: use the microphone on the page, or run in another terminal:"
+                        f" {command_name()} speak my.wav; press Ctrl-C to stop"
+                    )
+                    supervisor.wait()
+        except KeyboardInterrupt:
+            clear_interrupt()
+            print_message("stopping")
+        finally:
+            supervisor.stop()
 
 
-def _service_addresses(settings: Settings, *, has_port_option: bool) -> dict[str, str]:
-    """Return the environment with free ports; an error names the option that set the port."""
+def _moved_addresses(settings: Settings, *, has_port_option: bool) -> dict[str, str]:
+    """Return the environment in which free ports replace the default ports that are in use.
+
+    An error names the option that set the port.
+    """
     try:
         return available_port_environment(settings)
     except UserError as error:
@@ -155,9 +152,20 @@ def _service_addresses(settings: Settings, *, has_port_option: bool) -> dict[str
         raise UserError(str(error).replace("gateway.port:", key)) from None
 
 
-def _stop_at_interrupt() -> None:
-    clear_interrupt()
-    print_message("stopping")
+def _control_environment(settings: Settings, moved: Mapping[str, str]) -> dict[str, str]:
+    """Return the address that control binds, and the one that others on this machine use."""
+    bound = moved.get(BOUND_CONTROL_VARIABLE, settings.load(ControlConfig).bound_control)
+    host, _ = split_endpoint(bound, "control.control")
+    control = with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
+    return {BOUND_CONTROL_VARIABLE: bound, CONTROL_VARIABLE: control}
+
+
+def _check_keys(settings: Settings, control: str) -> str:
+    """Check all keys; return the endpoint of control for clients, with its public key."""
+    insecure = settings.load(ControlConfig).insecure
+    if not insecure:
+        check_keys({kind.name: kind.key_roles for kind in KINDS.values()})
+    return control_endpoint(control, insecure=insecure)
 
 
 def head_environment(settings: Settings, option: str, out: Path) -> dict[str, str]:
@@ -194,19 +202,6 @@ def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
             if service == table or (table == COMMON and key in config_type.model_fields):
                 environment[variable_name(service, key)] = value
     return environment
-
-
-def _enter(context: contextlib.AbstractContextManager[None]) -> contextlib.ExitStack:
-    """Enter a context; return a stack whose ``close`` leaves it."""
-    stack = contextlib.ExitStack()
-    stack.enter_context(context)
-    return stack
-
-
-def _control_address(bound: str) -> str:
-    """Return the address by which services and clients on this machine reach control."""
-    host, _ = split_endpoint(bound, "control.control")
-    return with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
 
 
 def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -26,6 +28,28 @@ MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # delays before restarting a service th
 START_LIMIT_S = 120.0
 STEADY_S = 10.0  # a service that has run for longer restarts without delay
 WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded
+
+
+@dataclass(slots=True, eq=False)
+class _Service:
+    """One service, and its process while it runs."""
+
+    name: str
+    log_path: Path
+    environment: Mapping[str, str]  # additions to the supervisor's
+    process: ServiceProcess | None = None
+    log_thread: threading.Thread | None = None  # copies the log of the process
+    started_s: float = -math.inf
+    restart_at_s: float = math.inf
+    backoff_s: float = 0.0  # delay before the restart after a soon crash
+    is_restarting: bool = False  # started again, and not ready yet
+    error: str = ""  # newest error in the configuration
+
+    @property
+    def hang_limit_s(self) -> float:
+        """The hang limit: short for a worker, unless it has already been restarted twice."""
+        is_fresh = self.backoff_s <= MIN_BACKOFF_S
+        return WORKER_HANG_S if kind_of(self.name) in WORKERS and is_fresh else HANG_S
 
 
 class Supervisor:
@@ -47,19 +71,14 @@ class Supervisor:
         services: Collection[str] = tuple(KINDS),
         more: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
-        self._more = more or {}
-        self._names = (*services, *self._more)
         self._arguments = arguments
         self._log_folder = log_folder
         self._console = console
         self._environment = {**os.environ, **(environment or {})}
-        self._processes: dict[str, ServiceProcess] = {}
-        self._started_s: dict[str, float] = {}
-        self._backoff_s = dict.fromkeys(self._names, 0.0)
-        self._restart_at_s: dict[str, float] = {}
-        self._restarted: set[str] = set()  # services that are not ready again
-        self._followers: dict[str, threading.Thread] = {}  # threads that copy the logs
-        self._errors: dict[str, str] = {}  # newest error in the configuration
+        more = more or {}
+        self._services = {
+            name: self._make_service(name, more.get(name, {})) for name in (*services, *more)
+        }
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
         self._process_ended = threading.Event()
@@ -67,7 +86,8 @@ class Supervisor:
         path = log_folder
         try:
             log_folder.mkdir(parents=True, exist_ok=True)
-            for path in map(self._log_path, self._names):
+            for service in self._services.values():
+                path = service.log_path
                 LogFile(path, self._warn).check()
         except OSError as error:
             raise UserError(
@@ -77,8 +97,13 @@ class Supervisor:
 
     def start(self) -> None:
         """Start every service."""
-        for name in self._names:
-            self._start(name)
+        for service in self._services.values():
+            self._start(service)
+
+    def start_service(self, name: str, environment: Mapping[str, str]) -> None:
+        """Start a service, or start it again, with additions to the environment."""
+        service = self._services[name] = self._make_service(name, environment)
+        self._start(service)
 
     def wait_ready(self, control: str) -> None:
         """Wait until all services have registered with control.
@@ -91,7 +116,7 @@ class Supervisor:
                 self.check()
                 with contextlib.suppress(KouxingError):  # control does not run yet
                     ready = Counter(service.service for service in client.status().services)
-                    if ready >= Counter(map(kind_of, self._names)):
+                    if ready >= Counter(map(kind_of, self._services)):
                         return
                 time.sleep(0.1)
         raise UserError(f"the services did not start; see their logs in {self._log_folder}")
@@ -124,52 +149,48 @@ class Supervisor:
         Raises ``UserError`` if a service reports a wrong configuration.
         """
         now_s = time.monotonic()
-        processes = self._processes.values()
+        processes = self._processes()
         for process in processes:
             process.read_heartbeats()
         if len(processes) > 1 and all(process.is_silent for process in processes):
             for process in processes:  # all processes were stopped, so none of them hangs
                 process.reset_silence()
-        for name, process in list(self._processes.items()):
-            status = process.poll()
-            if status is None:
-                if process.hangs:
-                    self._warn(f"{name} hangs; killing it")
-                    process.kill()
-                elif process.is_ready and name in self._restarted:
-                    self._restarted.remove(name)
-                    self._print(f"{name} is running again", "green")
-            elif status == USER_ERROR:
-                self._followers[name].join()
-                missing = f"{name} cannot start; see {self._log_path(name)}"
-                raise UserError(self._errors.get(name, missing))
-            else:
-                self._schedule_restart(name, status, now_s)
-        for name, restart_at_s in list(self._restart_at_s.items()):
-            if now_s >= restart_at_s:
-                del self._restart_at_s[name]
-                self._restarted.add(name)
-                self._start(name)
+        for service in self._services.values():
+            if service.process is not None:
+                self._check_process(service, service.process, now_s)
+            if service.process is None and now_s >= service.restart_at_s:
+                service.is_restarting = True
+                self._start(service)
 
     def process(self, name: str) -> ServiceProcess:
-        """Return the process of a running service."""
-        return self._processes[name]
+        """Return the process of a service; raises ``KeyError`` if it does not run."""
+        process = self._services[name].process
+        if process is None:
+            raise KeyError(name)
+        return process
 
     def stop(self) -> None:
         """Ask every service to stop, and kill those that do not stop in time."""
         self._stopping.set()
         if self._watcher is not None:
             self._watcher.join()
-        for process in self._processes.values():
+        for process in self._processes():
             process.send_signal(signal.SIGTERM)
         end_s = time.monotonic() + DRAIN_TIMEOUT_S + 1.0
-        for process in self._processes.values():
+        for process in self._processes():
             try:
                 process.wait(max(0.1, end_s - time.monotonic()))
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        self._processes.clear()
+        for service in self._services.values():
+            service.process = None
+
+    def _make_service(self, name: str, environment: Mapping[str, str]) -> _Service:
+        return _Service(name, self._log_folder / f"{name}.log", environment)
+
+    def _processes(self) -> list[ServiceProcess]:
+        return [s.process for s in self._services.values() if s.process is not None]
 
     def _watch(self) -> None:
         while not self._stopping.is_set():
@@ -181,58 +202,62 @@ class Supervisor:
                 self._failure = error
                 self._stopping.set()
 
-    def _schedule_restart(self, name: str, status: int, now_s: float) -> None:
-        del self._processes[name]
-        is_steady = now_s - self._started_s[name] > STEADY_S
-        wait_s = 0.0 if is_steady else self._backoff_s[name]
-        self._backoff_s[name] = min(max(2 * wait_s, MIN_BACKOFF_S), MAX_BACKOFF_S)
-        self._restart_at_s[name] = now_s + wait_s
+    def _check_process(self, service: _Service, process: ServiceProcess, now_s: float) -> None:
+        status = process.poll()
+        if status is None:
+            if process.hangs:
+                self._warn(f"{service.name} hangs; killing it")
+                process.kill()
+            elif process.is_ready and service.is_restarting:
+                service.is_restarting = False
+                self._print(f"{service.name} is running again", "green")
+            return
+        if status == USER_ERROR:
+            if service.log_thread is not None:
+                service.log_thread.join()
+            raise UserError(service.error or f"{service.name} cannot start; see {service.log_path}")
+        service.process = None
+        is_steady = now_s - service.started_s > STEADY_S
+        wait_s = 0.0 if is_steady else service.backoff_s
+        service.backoff_s = min(max(2 * wait_s, MIN_BACKOFF_S), MAX_BACKOFF_S)
+        service.restart_at_s = now_s + wait_s
         when = f"in {wait_s:g} s" if wait_s else "now"
-        self._warn(f"{name} ended with status {status}; restarting it {when}")
+        self._warn(f"{service.name} ended with status {status}; restarting it {when}")
 
-    def _start(self, name: str) -> None:
-        process = ServiceProcess(
-            kind_of(name),
+    def _start(self, service: _Service) -> None:
+        process = service.process = ServiceProcess(
+            kind_of(service.name),
             self._arguments,
-            environment={**self._environment, **self._more.get(name, {})},
-            hang_limit_s=self._hang_limit_s(name),
+            environment={**self._environment, **service.environment},
+            hang_limit_s=service.hang_limit_s,
             stdin=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C must reach only the supervisor
         )
-        self._processes[name] = process
-        self._started_s[name] = time.monotonic()
-        follower = threading.Thread(
-            target=self._copy_log_until_end, args=(name, process), daemon=True
+        service.started_s = time.monotonic()
+        service.log_thread = threading.Thread(
+            target=self._copy_log_until_end, args=(service, process), daemon=True
         )
-        self._followers[name] = follower
-        follower.start()
+        service.log_thread.start()
 
-    def _hang_limit_s(self, name: str) -> float:
-        """Return the hang limit: short for a worker, unless it has already been restarted twice."""
-        is_fresh = self._backoff_s[name] <= MIN_BACKOFF_S
-        return WORKER_HANG_S if kind_of(name) in WORKERS and is_fresh else HANG_S
-
-    def _copy_log_until_end(self, name: str, process: subprocess.Popen[bytes]) -> None:
+    def _copy_log_until_end(self, service: _Service, process: ServiceProcess) -> None:
         """Copy a service's log until it ends, then wake the watcher."""
         if process.stderr is not None:
-            self._copy_log(name, process.stderr)
+            self._copy_log(service, process.stderr)
         process.wait()
         self._process_ended.set()
 
-    def _log_path(self, name: str) -> Path:
-        return self._log_folder / f"{name}.log"
-
-    def _copy_log(self, name: str, stream: IO[bytes]) -> None:
-        log = LogFile(self._log_path(name), self._warn)
+    def _copy_log(self, service: _Service, stream: IO[bytes]) -> None:
+        log = LogFile(service.log_path, self._warn)
+        kind = kind_of(service.name)
         with stream, contextlib.closing(log):
             for line in stream:
                 log.write(line)
                 text = _console_text(line)
-                if text.startswith((f"{kind_of(name)}:", f"{kind_of(name)}.")):
-                    self._errors[name] = text  # `check` raises it
+                if text.startswith((f"{kind}:", f"{kind}.")):
+                    service.error = text  # `check` raises it
                 elif text:
-                    self._print(prefix_name(name, text))
+                    self._print(prefix_name(service.name, text))
 
     def _warn(self, text: str) -> None:
         self._print(text, "yellow")
