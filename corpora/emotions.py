@@ -42,27 +42,28 @@ class EmotionRecording:
     stressed_s: tuple[float, ...] = ()  # starts of stressed vowels, if phone times are given
 
 
-def read_emotions(folder: Path, *, only_distributable: bool = False) -> list[EmotionRecording]:
+def read_emotions(folder: Path, *, any_license: bool = True) -> list[EmotionRecording]:
     """Read the list of a folder; ``UserError`` if it is missing or names no known emotion.
 
-    ``only_distributable`` excludes recordings whose license does not allow distributing a model.
+    Without ``any_license``, recordings whose license does not allow distributing a model are
+    skipped.
     """
     manifest = folder / "manifest.tsv"
     recordings = []
     try:
         for row in read_rows(manifest, _COLUMNS):
+            if not (any_license or may_distribute(row["license"])):
+                continue
             match = _EMOTION.search(row["note"])
-            emotion = match[1] if match and match[1] in FEELINGS else None
             recording = EmotionRecording(
                 folder / row["path"],
                 row["speaker"],
                 row["license"],
                 float(row["seconds"]) / 60,
-                emotion,
+                match[1] if match and match[1] in FEELINGS else None,
                 _stressed(folder / row["phones_path"]) if row.get("phones_path") else (),
             )
-            if may_distribute(recording.license) or not only_distributable:
-                recordings.append(recording)
+            recordings.append(recording)
     except ValueError as error:
         raise UserError(f"{manifest}: {error}; write the seconds as a number") from error
     if not any(recording.emotion for recording in recordings):

@@ -48,11 +48,8 @@ def load_or_compute(
 
 
 def read_audio(path: Path) -> NDArray[np.float32]:
-    """Read a recording as 16 kHz mono; ValueError if it cannot be read."""
-    try:
-        return to_16_khz(*audio_file.read_audio(path))
-    except UserError as error:
-        raise ValueError(str(error)) from error
+    """Read a recording as 16 kHz mono; UserError if it cannot be read."""
+    return to_16_khz(*audio_file.read_audio(path))
 
 
 def log_mel_of(
@@ -118,7 +115,7 @@ def _cached(
         num_rows = []
 
         def compute(utterance: Utterance) -> NDArray[Any]:
-            with suppress(ValueError):
+            with suppress(UserError):
                 return compute_block(read_audio(utterance.path))
             return empty
 
@@ -132,5 +129,4 @@ def _cached(
     if not ends[-1]:
         return [empty] * len(ends)
     content = np.memmap(rows, empty.dtype, "r").reshape(-1, *empty.shape[1:])
-    starts = [0, *ends[:-1]]
-    return [content[start:end] for start, end in zip(starts, ends, strict=True)]
+    return np.split(content, ends[:-1])

@@ -130,8 +130,8 @@ def read_clips(
 ) -> list[LipClip]:
     """Read the clips of a folder in one language, or in all with None.
 
-    ``any_license`` also trains on clips whose license does not allow distribution. Raises UserError
-    if there are no clips, or one of them cannot be read.
+    Without ``any_license``, clips whose license does not allow distributing a model are not in the
+    split ``train``. Raises UserError if there are no clips, or one of them cannot be read.
     """
     held = folder / "held.txt"
     held_out = set(read_text(held, _MAX_BYTES).split()) if held.exists() else set()
@@ -250,6 +250,11 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
     return faps
 
 
+def opening_of(faps: Array) -> Array:
+    """Return the opening between the inner lips relative to the neutral face, (num_frames,)."""
+    return np.asarray(-faps[:, fap_columns((4, 5))].sum(axis=1))
+
+
 def openings_of(
     speakers: Sequence[str], mouths: Sequence[Array]
 ) -> tuple[list[Array], dict[str, float]]:
@@ -257,7 +262,7 @@ def openings_of(
 
     The widest opening is the 98th percentile of all frames of a speaker, at least 1.
     """
-    openings = [-faps[:, fap_columns((4, 5))].sum(axis=1) for faps in mouths]
+    openings = [opening_of(faps) for faps in mouths]
     by_speaker: dict[str, list[Array]] = defaultdict(list)
     for speaker, opening in zip(speakers, openings, strict=True):
         by_speaker[speaker].append(opening)

@@ -32,10 +32,10 @@ class Sound:
     is_held_out: bool
 
 
-def read_sounds(folders: Sequence[Path], *, only_distributable: bool) -> list[Sound]:
+def read_sounds(folders: Sequence[Path], *, any_license: bool) -> list[Sound]:
     """Read folders; UserError if a file is missing or cannot be read.
 
-    ``only_distributable`` excludes sounds whose license does not allow distributing the model.
+    Without ``any_license``, sounds whose license does not allow distributing a model are skipped.
     """
     sounds = []
     for folder in folders:
@@ -43,14 +43,9 @@ def read_sounds(folders: Sequence[Path], *, only_distributable: bool) -> list[So
         rows = read_rows(manifest, ("path", "kind", "license"))
         if not rows:
             raise UserError(f"{manifest} lists no sounds")
-        try:
-            for row in rows:
-                if may_distribute(row["license"]) or not only_distributable:
-                    sounds += _split_sound(row["kind"], folder / row["path"])
-        except OSError as error:
-            raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
-        except ValueError as error:
-            raise UserError(f"cannot read a sound in {folder}: {error}") from error
+        for row in rows:
+            if any_license or may_distribute(row["license"]):
+                sounds += _split_sound(row["kind"], folder / row["path"])
     return sounds
 
 

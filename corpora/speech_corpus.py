@@ -53,6 +53,19 @@ _MIN_PHONE_S = 0.03
 _MAX_LIST_BYTES = 256 << 20
 _AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
 _KALDI_SPLITS = ("train", "dev", "test")
+# Prefixes of the names of held-out files. They cover whole recordings, and all recordings of a
+# speaker.
+_HELD_OUT_PREFIXES = (
+    "MOSS-TTSD_",
+    "MOSS-TTS_reference_zh_3",
+    "MiMo-Audio_aa7ed1",
+    "RapidASR_",
+    "Step-Audio-EditX_",
+    "alibabacloud-bailian-speech-demo_",
+    "paraformer-python_P9",
+    "paraformer-python_vad",
+    "websdk-java-demo_16K",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,11 +138,13 @@ def read_corpus(
     *,
     split: str | None = None,
     audio: Path | None = None,
+    any_license: bool = True,
 ) -> list[Utterance]:
     """Read a corpus folder, or a manifest, in any of the three layouts.
 
     ``errors`` receives a message for every row that cannot be used. Without ``split`` all splits
     are read. ``audio`` is the base folder of a manifest's paths, by default the manifest's folder.
+    Without ``any_license``, rows whose license does not allow distributing a model are skipped.
     Raises UserError if the layout is unknown, or a list is missing or not UTF-8 text.
     """
     if folder.suffix == ".tsv" and not folder.is_dir():
@@ -151,49 +166,54 @@ def read_corpus(
             errors.splits[_split_of(row)] += 1
             if split in (None, _split_of(row)):
                 chosen.append((row_name, row))
-    utterances = [_utterance(row_name, row, errors, inventory) for row_name, row in chosen]
-    return [utterance for utterance in utterances if utterance]
+    utterances = []
+    for row_name, row in chosen:
+        try:
+            utterances.append(_utterance(row, inventory, any_license=any_license))
+        except (UserError, ValueError, OSError) as error:  # OSError: invalid file name
+            errors.add(row_name, str(error))
+    return utterances
 
 
 def audio_files(folder: Path) -> list[Path]:
-    """Find and sort the recordings in a folder, at any depth; UserError if it contains no audio."""
+    """Find and sort the recordings in a folder, at any depth, except those that are held out.
+
+    Raises UserError if the folder contains no audio.
+    """
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
     if not files:
         raise UserError(f"{folder} contains no wav, flac, ogg or opus files")
-    return files
+    return [path for path in files if not path.name.startswith(_HELD_OUT_PREFIXES)]
 
 
 def _split_of(row: dict[str, str]) -> str:
     return row.get("split") or "train"
 
 
-def _utterance(
-    row_name: str, row: dict[str, str], errors: RowErrors, inventory: PhoneInventory
-) -> Utterance | None:
-    path = Path(row["path"])
-    try:
-        if not path.is_file():
-            raise ValueError(f"no audio file {path}")
-        if inventory.language == UNIVERSAL:
-            syllables = universal_words(row)
-        else:
-            syllables = inventory.pronounce(row.get("pinyin") or row["text"])
-        seconds = float(row.get("seconds") or duration_s(path))
-    except (UserError, ValueError, OSError) as error:  # OSError: invalid file name
-        errors.add(row_name, str(error))
-        return None
+def _utterance(row: dict[str, str], inventory: PhoneInventory, *, any_license: bool) -> Utterance:
+    """Read a row; UserError, ValueError or OSError if it cannot be used."""
+    path, license_name = Path(row["path"]), row.get("license", "")
+    if not (any_license or may_distribute(license_name)):
+        raise UserError(
+            f"its license ({license_name or 'none'}) does not allow distributing a model"
+        )
+    if not path.is_file():
+        raise UserError(f"no audio file {path}")
+    if inventory.language == UNIVERSAL:
+        syllables = universal_words(row)
+    else:
+        syllables = inventory.pronounce(row.get("pinyin") or row["text"])
+    seconds = float(row.get("seconds") or read_duration_s(path))
     phones = tuple(inventory.index[phone] for syllable in syllables for phone in syllable)
     if not phones:
-        errors.add(row_name, "no text")
-        return None
+        raise UserError("no text")
     if not len(phones) * _MIN_PHONE_S <= seconds < math.inf:
-        errors.add(row_name, f"{len(phones)} phones do not fit into {seconds:.2f} s")
-        return None
+        raise UserError(f"{len(phones)} phones do not fit into {seconds:.2f} s")
     return Utterance(
         utterance_id=row["utt_id"],
         path=path,
         speaker=row.get("speaker") or row["utt_id"],
-        license=row.get("license", ""),
+        license=license_name,
         language=row.get("language", ""),
         split=_split_of(row),
         seconds=seconds,
@@ -201,14 +221,6 @@ def _utterance(
         syllables=tuple(len(syllable) for syllable in syllables),
         labels=Path(row["phones_path"]) if has_labels(row) else None,
     )
-
-
-def duration_s(path: Path) -> float:
-    """Return the length of a recording; ValueError if the file cannot be read."""
-    try:
-        return read_duration_s(path)
-    except UserError as error:
-        raise ValueError(str(error)) from error
 
 
 def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[str, str]]]:
@@ -269,22 +281,3 @@ def _read_pairs(path: Path) -> Iterator[tuple[str, str]]:
         key, _, value = line.strip().partition(" ")
         if key:
             yield key, value.strip()
-
-
-# Prefixes of file names. They cover whole recordings, and all recordings of a speaker.
-_HELD_OUT_PREFIXES = (
-    "MOSS-TTSD_",
-    "MOSS-TTS_reference_zh_3",
-    "MiMo-Audio_aa7ed1",
-    "RapidASR_",
-    "Step-Audio-EditX_",
-    "alibabacloud-bailian-speech-demo_",
-    "paraformer-python_P9",
-    "paraformer-python_vad",
-    "websdk-java-demo_16K",
-)
-
-
-def is_held_out(recording: Path) -> bool:
-    """Return whether a recording is held out, by the name of its file."""
-    return recording.name.startswith(_HELD_OUT_PREFIXES)

@@ -181,7 +181,7 @@ def face(
 def _read_sounds(folders: list[Path] | None) -> list[Sound]:
     from kouxing.corpora.sounds import read_sounds
 
-    return read_sounds(folders or (), only_distributable=False)
+    return read_sounds(folders or (), any_license=True)
 
 
 def _models(

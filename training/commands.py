@@ -121,7 +121,7 @@ def gmm(
         output,
         load_inventory(language or DEFAULT_LANGUAGE),
         phone_lm=phone_lm,
-        only_distributable=not context.obj,
+        any_license=context.obj,
     )
 
 
@@ -141,7 +141,8 @@ def blocks(
 ) -> None:
     """Train the block model (.npz), and write its model card.
 
-    Repeat the command to resume an interrupted run. The number of steps may change.
+    Repeat the command to resume an interrupted run; the number of steps may change. The state of
+    the run is stored next to the output, and deleted at the end.
     """
     with _neural_training(output, force=force):
         from kouxing.training.blocks.recipe import train_blocks
@@ -154,7 +155,7 @@ def blocks(
         untranscribed=untranscribed or [],
         sounds=sounds or [],
         num_steps=steps,
-        only_distributable=not context.obj,
+        any_license=context.obj,
     )
 
 
@@ -180,7 +181,10 @@ def universal(
     """Train the universal phones (.npz), and write their model card.
 
     They are a second readout of the shipped block model. The corpora of --corpus are Mandarin; of
-    the clips, those of GRID are used. Repeat the command to resume an interrupted run.
+    the clips, those of GRID are used.
+
+    Repeat the command to resume an interrupted run; the number of steps may change. The state of
+    the run is stored next to the output, and deleted at the end.
     """
     with _neural_training(output, force=force):
         from kouxing.training.universal.recipe import train_universal
@@ -192,7 +196,7 @@ def universal(
         languages=languages or [],
         clips=clips,
         num_steps=steps,
-        only_distributable=not context.obj,
+        any_license=context.obj,
     )
 
 
@@ -212,7 +216,8 @@ def encoder(
 ) -> None:
     """Train the audio encoder (.npz), and write its model card.
 
-    Repeat the command to resume an interrupted run.
+    Repeat the command to resume an interrupted run; the number of steps may change. The state of
+    the run is stored next to the output, and deleted at the end.
     """
     with _neural_training(output, force=force):
         from kouxing.training.encoder.recipe import train_encoder
@@ -225,7 +230,7 @@ def encoder(
         untranscribed=untranscribed or [],
         sounds=sounds,
         num_steps=steps,
-        only_distributable=not context.obj,
+        any_license=context.obj,
     )
 
 
@@ -284,7 +289,7 @@ def traits(
     from kouxing.training.voice_traits import train_traits
 
     check_output(output, force=force)
-    train_traits(recordings, sounds, output, only_distributable=not context.obj)
+    train_traits(recordings, sounds, output, any_license=context.obj)
 
 
 @app.command()

@@ -19,9 +19,7 @@ from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
     audio_files,
-    is_held_out,
     is_synthetic,
-    may_distribute,
     read_corpus,
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
@@ -70,23 +68,21 @@ def load_examples(
     errors: RowErrors,
     inventory: PhoneInventory,
     *,
+    any_license: bool,
     split: str = "train",
-    only_distributable: bool = True,
     with_samples: bool = False,
 ) -> list[Example]:
     """Read the recordings of one split, with their log-mel features and weights.
 
-    ``errors`` receives a message for every row that cannot be used. ``only_distributable`` excludes
-    rows whose license does not allow distributing the model. ``with_samples`` also loads the
-    samples. Raises UserError if no recording can be used.
+    ``errors`` receives a message for every row that cannot be used. For ``any_license``, see
+    :func:`read_corpus`. ``with_samples`` also loads the samples. Raises UserError if no recording
+    can be used.
     """
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
     sounds: list[NDArray[np.int16]] = []
     for corpus in corpora:
-        rows = read_utterances(
-            corpus, errors, inventory, split=split, only_distributable=only_distributable
-        )
+        rows = read_corpus(corpus, errors, inventory, split=split, any_license=any_license)
         utterances += rows
         log_mels += log_mel_of(rows, errors)
         sounds += samples_of(rows) if with_samples else [_NO_SAMPLES] * len(rows)
@@ -118,24 +114,6 @@ def load_examples(
     return examples
 
 
-def read_utterances(
-    corpus: Path,
-    errors: RowErrors,
-    inventory: PhoneInventory,
-    *,
-    split: str,
-    only_distributable: bool,
-) -> list[Utterance]:
-    """Read the list of a corpus. For the arguments, see :func:`load_examples`."""
-    rows = read_corpus(corpus, errors, inventory, split=split)
-    for row in rows:
-        if only_distributable and not may_distribute(row.license):
-            license_name = row.license or "none"
-            problem = f"its license ({license_name}) does not allow distributing a model"
-            errors.add(row.utterance_id, problem)
-    return [row for row in rows if not only_distributable or may_distribute(row.license)]
-
-
 def weights_of(utterances: Sequence[Utterance]) -> list[float]:
     """Return the weight of each recording, as above."""
     minutes: dict[str, float] = defaultdict(float)
@@ -157,11 +135,7 @@ def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArr
     """
     pieces = []
     for folder in folders:
-        files = [
-            Utterance(utterance_id=str(path), path=path)
-            for path in audio_files(folder)
-            if not is_held_out(path)
-        ]
+        files = [Utterance(utterance_id=str(path), path=path) for path in audio_files(folder)]
         sounds = samples_of(files)
         for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
             if log_mel is None:

@@ -37,6 +37,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import MIN_VOICE, VoiceReadout
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.augmentation import disturb, scale_level
+from kouxing.training.seed import SEED
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -54,12 +55,11 @@ def train_traits(
     sounds: Sequence[Path],
     output: Path,
     *,
-    seed: int = 0,
-    only_distributable: bool,
+    any_license: bool,
 ) -> None:
     """Train the readout, and write it with its card; ``UserError`` if a file cannot be read."""
-    rng = np.random.default_rng(seed)
-    speech = read_emotions(recordings, only_distributable=only_distributable)
+    rng = np.random.default_rng(SEED)
+    speech = read_emotions(recordings, any_license=any_license)
     labeled = [recording for recording in speech if recording.emotion]
     means, targets, speaker_names = [], [], []  # one entry per recording with an emotion
     rows, labels = [], []  # positions
@@ -72,9 +72,7 @@ def train_traits(
                 means.append(_mean_state(positions, states))
                 targets.append(FEELINGS[recording.emotion])
                 speaker_names.append(recording.speaker)
-    for sound in track(
-        read_sounds(sounds, only_distributable=only_distributable), description="sounds"
-    ):
+    for sound in track(read_sounds(sounds, any_license=any_license), description="sounds"):
         if not sound.is_held_out:
             is_trait = [sound.kind == trait for trait in _TRAITS]
             for positions in _encoder_outputs(as_floats(sound.samples), rng):
@@ -96,7 +94,7 @@ def train_traits(
     write_card(
         output,
         title="Voice traits",
-        details=f"a linear readout of the audio encoder's state, seed {seed}",
+        details=f"a linear readout of the audio encoder's state, seed {SEED}",
         recordings=speech,
         notes=(
             f"{len(labeled)} recordings of {len(speakers_of(labeled))} actors name an emotion "

@@ -52,7 +52,7 @@ def test_trains_resumes_and_writes_model_and_card(
         start=model_path(start),
         untranscribed=[corpus],
         sounds=[write_noises(tmp_path / "sounds")],
-        seed=1,
+        any_license=False,
     )
     with monkeypatch.context() as patch:
         patch.setattr(recipe, "export_onnx", interrupt)

@@ -12,7 +12,7 @@ from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind, load_en
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.services.recognizer.onnx_session import create_inference_session
 from kouxing.shared.errors import UserError
-from kouxing.training.encoder import batches, lip_teacher, targets
+from kouxing.training.encoder import batches, lip_teacher, recipe, targets
 from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
 from kouxing.training.encoder.export import export_onnx
 from kouxing.training.encoder.network import NUM_FEATURES, AudioEncoder
@@ -24,6 +24,7 @@ from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import EncoderShape
 from tests.corpora import write_noises, write_speech
 from tests.system import HELLO
+from tests.unit.test_block_training import interrupt
 from tests.unit.test_lips_training import name_for, write_clip
 from tests.whisper_folder import encoder_arrays, write_whisper
 
@@ -57,7 +58,7 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_ONLY_BACKGROUND_PROB", 0.0)
     monkeypatch.setattr(batches, "change_speed", lambda samples, _: (samples, 1.0))
     batch_source = BatchSource([piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS)
-    _, rows = draw_batch(batch_source, 0, 1)
+    _, rows = draw_batch(batch_source, 1)
     lips = rows[0, 100, COLUMNS.lips].reshape(-1, NUM_OUTPUTS)[:, 0] - rows[0, 100, PITCH]
     # A position's audio ends 45 ms after its start, and the target of row 0 is at 20 ms.
     np.testing.assert_allclose(lips, (0.045 - np.array(LIP_DELAYS_S)) / 0.02 - 1, atol=0.51)
@@ -86,7 +87,7 @@ def test_trains_resumes_and_writes_a_model(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
-    monkeypatch.setattr(batches, "NUM_PHRASE_POSITIONS", 30)
+    monkeypatch.setattr(batches, "NUM_POSITIONS", 30)
     monkeypatch.setattr(targets, "CHUNK_SIZE", 2)
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
     monkeypatch.setattr(lip_teacher, "NUM_EPOCHS", 1)
@@ -97,14 +98,26 @@ def test_trains_resumes_and_writes_a_model(
     write_clip(clips, name_for("choice"), "berta", "MIT")
     output = tmp_path / "encoder.npz"
     sounds = [write_noises(tmp_path / "sounds")]
-    train = partial(train_encoder, [corpus], output, whisper=whisper, clips=clips, sounds=sounds)
-    train(untranscribed=[corpus], num_steps=2)
+    train = partial(
+        train_encoder,
+        [corpus],
+        output,
+        whisper=whisper,
+        clips=clips,
+        sounds=sounds,
+        any_license=False,
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe, "save_encoder", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            train(untranscribed=[corpus], num_steps=2)
+    with pytest.raises(UserError, match="targets of other recordings or models; delete it"):
+        train(untranscribed=[], num_steps=3)
     train(untranscribed=[corpus], num_steps=3)
     assert "resuming after step 2" in capsys.readouterr().err
     assert load_encoder(output).num_features == NUM_FEATURES
     assert "3 steps of" in output.with_suffix(".md").read_text()
-    with pytest.raises(UserError, match="targets of other recordings or models; delete it"):
-        train(num_steps=3)
+    assert {*tmp_path.glob("encoder*")} == {output, output.with_suffix(".md")}
 
 
 @pytest.mark.parametrize(("name", "problem"), [("a", "no music or noise"), ("d", "no usable rec")])
@@ -113,4 +126,13 @@ def test_training_needs_speech_and_sounds(
 ) -> None:
     corpus = write_speech(tmp_path / "corpus", {name: HELLO})
     with pytest.raises(UserError, match=problem):
-        train_encoder([corpus], tmp_path / "encoder.npz", whisper=whisper, clips=tmp_path)
+        train_encoder(
+            [corpus],
+            tmp_path / "encoder.npz",
+            whisper=whisper,
+            clips=tmp_path,
+            untranscribed=[],
+            sounds=[],
+            num_steps=1,
+            any_license=False,
+        )

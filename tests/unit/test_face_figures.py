@@ -56,7 +56,7 @@ def test_movements_match_the_stressed_vowels_that_they_follow() -> None:
 
 
 def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
-    calm, loud, other = read_emotions(folder, only_distributable=True)
+    calm, loud, other = read_emotions(folder, any_license=False)
     assert (calm.emotion, loud.emotion, other.emotion) == ("boredom", "anger", None)
     assert calm.stressed_s == (0.5, 1.5)
     for columns, row, problem in (

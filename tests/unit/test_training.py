@@ -1,6 +1,7 @@
 """Corpora, estimation and alignment on small made-up speech."""
 
 import itertools
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -180,19 +181,20 @@ def test_trains_models_and_writes_cards(tmp_path: Path, capsys: pytest.CaptureFi
     closed = "closed\t0.wav\tS\tx\tCC BY-NC\ttrain\t1.25\t你好\tni3 hao3"
     write_corpus(tmp_path / "corpus", [*rows, bad, closed], 6)
     gmm = tmp_path / "gmm.npz"
-    train_gmm([tmp_path / "corpus"], gmm, MANDARIN, num_mixtures=2)
+    train = partial(train_gmm, [tmp_path / "corpus"], inventory=MANDARIN, any_license=False)
+    train(gmm, num_mixtures=2)
     messages = capsys.readouterr().err
     assert messages.endswith("2 rows skipped\n")
-    assert "closed: its license (CC BY-NC)" in messages
+    assert "(closed): its license (CC BY-NC)" in messages
     assert "CC0-1.0" in gmm.with_suffix(".md").read_text()
     again = tmp_path / "again.npz"
-    train_gmm([tmp_path / "corpus"], again, MANDARIN, num_mixtures=2)
+    train(again, num_mixtures=2)
     assert again.read_bytes() == gmm.read_bytes()  # the same seed, the same model
     text = tmp_path / "text.txt"
     text.write_text("欢迎来到口型。\n" * 3, encoding="utf-8")
     train_phone_lm([], [text], tmp_path / "lm.npz", MANDARIN)
     lm = tmp_path / "lm.npz"
-    train_gmm([tmp_path / "corpus"], again, MANDARIN, phone_lm=lm, num_mixtures=1)
+    train(again, phone_lm=lm, num_mixtures=1)
     welcome = load_phone_lm(tmp_path / "lm.npz", MANDARIN)
     known = {path: load_model(path).topology.phone_lm for path in (gmm, again)}
     np.testing.assert_array_equal(known[again].phone, welcome.phone)

@@ -53,7 +53,15 @@ def test_trains_resumes_and_writes_model_and_card(
 ) -> None:
     output = tmp_path / "universal.npz"
     languages = [write_corpus(tmp_path / "corpus")]
-    train = partial(train_universal, [], output, languages=languages)
+    train = partial(
+        train_universal,
+        [],
+        output,
+        learners=[],
+        languages=languages,
+        clips=None,
+        any_license=False,
+    )
     with monkeypatch.context() as patch:
         patch.setattr(recipe, "export_extension", interrupt)
         with pytest.raises(KeyboardInterrupt):

@@ -30,6 +30,7 @@ from kouxing.training.networks.augmentation import (
     source_frames,
 )
 from kouxing.training.networks.batches import FrameTargets, LabeledRecording, sampling_probs
+from kouxing.training.seed import SEED
 
 BATCH_S = 32
 BATCHES_PER_STEP = 8
@@ -80,13 +81,13 @@ class BlockBatch:
     start: int  # row of the first position
 
 
-def draw_block_batch(batch_source: BatchSource, seed: int, number: int) -> BlockBatch:
+def draw_block_batch(batch_source: BatchSource, number: int) -> BlockBatch:
     """Draw the batch with this number; the batches of a step have the same shape."""
-    of_step = np.random.default_rng([seed, number // BATCHES_PER_STEP])
+    of_step = np.random.default_rng([SEED, number // BATCHES_PER_STEP])
     length = int(of_step.choice(_LENGTHS))
     block = _BLOCKS[int(of_step.choice(len(_BLOCKS), p=_BLOCK_PROBS))]
     start = 0 if of_step.random() < _FIRST_ROW_PROB else int(of_step.integers(_MAX_START))
-    rng = np.random.default_rng([seed, 1, number])
+    rng = np.random.default_rng([SEED, 1, number])
     probs = np.cumsum(sampling_probs(batch_source.recordings))
     num_frames = 2 * (length + _BEYOND) + 1
     disturbed, clean, states, target_probs = [], [], [], []
@@ -176,8 +177,8 @@ def _shorten(frames: Floats, tempo: float, shortening: float, num_frames: int) -
         durations *= 1 - shortening / (1 + np.square(change / (np.median(change) + _TINY)))
     ends = np.cumsum(durations)
     ends *= max(1.0, num_frames / ends[-1])
-    source_frames = np.searchsorted(ends, np.arange(num_frames) + 0.5)
-    return np.minimum(source_frames, len(frames) - 1)
+    chosen = np.searchsorted(ends, np.arange(num_frames) + 0.5)
+    return np.minimum(chosen, len(frames) - 1)
 
 
 def _add_background(sound: Samples, batch_source: BatchSource, rng: np.random.Generator) -> Samples:

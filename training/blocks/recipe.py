@@ -12,7 +12,7 @@ and ``.network.pt``. The same command resumes from them, and deletes them at the
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,8 @@ from kouxing.training.model_card import write_card
 from kouxing.training.networks.batches import FrameTargets, LabeledRecording
 from kouxing.training.networks.labels import STATES_PER_PHONE, DataMix, alignment_statistics, label
 from kouxing.training.networks.whisper import init_encoder, load_whisper
-from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_examples
+from kouxing.training.seed import SEED
+from kouxing.training.training_set import FRAMES_PER_MINUTE, load_examples
 
 # Live, in positions. A short block gives early hypotheses. Its positions have less right context
 # than the first positions of a long block, so R is longer than in training.
@@ -58,52 +59,16 @@ _MAX_SUNG_FRAMES = 800  # limit for the sung part of a recording
 _FRAMES_PER_POSITION = 2
 
 
-@dataclass(frozen=True, slots=True)
-class _LabeledSet:
-    """The recordings to train on, and the statistics of their alignment."""
-
-    recordings: list[LabeledRecording]
-    topology: Topology
-    log_prior: NDArray[np.float32]  # (states,)
-
-    def arrays(self) -> dict[str, ArrayLike]:
-        """Return the contents of a file, so that training can resume."""
-        targets = [recording.targets for recording in self.recordings]
-        return {
-            **topology_arrays(self.topology),
-            "log_prior": self.log_prior,
-            "samples": np.concatenate([recording.samples for recording in self.recordings]),
-            "num_samples": [len(recording.samples) for recording in self.recordings],
-            "states": np.concatenate([frame_targets.states for frame_targets in targets]),
-            "probs": np.concatenate([frame_targets.probs for frame_targets in targets]),
-            "num_frames": [len(frame_targets) for frame_targets in targets],
-            "weights": [recording.weight for recording in self.recordings],
-        }
-
-    @classmethod
-    def from_arrays(cls, saved: dict[str, NDArray[Any]]) -> _LabeledSet:
-        """Restore the object from :meth:`arrays`."""
-        samples = np.split(saved["samples"], np.cumsum(saved["num_samples"])[:-1])
-        bounds = np.cumsum(saved["num_frames"])[:-1]
-        states, probs = np.split(saved["states"], bounds), np.split(saved["probs"], bounds)
-        recordings = [
-            LabeledRecording(samples=sound, targets=FrameTargets(*pair), weight=float(weight))
-            for sound, *pair, weight in zip(samples, states, probs, saved["weights"], strict=True)
-        ]
-        return cls(recordings, parse_topology(Archive(saved)), saved["log_prior"])
-
-
 def train_blocks(
     corpora: Sequence[Path],
     output: Path,
     *,
     whisper: Path,
-    start: Path | None = None,
-    untranscribed: Sequence[Path] = (),
-    sounds: Sequence[Path] = (),
-    seed: int = 0,
-    num_steps: int = 1000,
-    only_distributable: bool = True,
+    start: Path | None,
+    untranscribed: Sequence[Path],
+    sounds: Sequence[Path],
+    num_steps: int,
+    any_license: bool,
 ) -> None:
     """Train the block model, and write it with its card.
 
@@ -114,74 +79,108 @@ def train_blocks(
     before = load_model(start)
     torch.set_num_threads(1)  # reproducible sums on every machine
     torch.set_float32_matmul_precision("high")  # faster on a GPU
-    torch.manual_seed(seed)
+    torch.manual_seed(SEED)
     num_states = STATES_PER_PHONE * len(before.inventory)
     whole = init_encoder(whisper)
     errors = RowErrors()
-    backgrounds = training_backgrounds(read_sounds(sounds, only_distributable=only_distributable))
+    backgrounds = training_backgrounds(read_sounds(sounds, any_license=any_license))
     examples = load_examples(
-        corpora, errors, before.inventory, only_distributable=only_distributable, with_samples=True
+        corpora, errors, before.inventory, any_license=any_license, with_samples=True
     )
     labels, checkpoint = (output.with_suffix(end) for end in (".labels.npz", ".network.pt"))
 
     def compute_labels() -> dict[str, ArrayLike]:
-        aligned, recordings = label(
+        alignments, recordings = label(
             examples,
             untranscribed,
             _DATA_MIX,
             aligner=before,
             encoder=whole,
             errors=errors,
-            seed=seed,
         )
-        weights = [recording.weight for recording in recordings[: len(aligned)]]
-        statistics = alignment_statistics(
-            [example.alignment for example in aligned], weights, before.topology.phone_lm
-        )
-        return _LabeledSet([*recordings, *_sung_copies(recordings, seed)], *statistics).arrays()
+        weights = [recording.weight for recording in recordings[: len(alignments)]]
+        statistics = alignment_statistics(alignments, weights, before.topology.phone_lm)
+        return _label_arrays([*recordings, *_sung_copies(recordings)], *statistics)
 
-    labeled = _LabeledSet.from_arrays(load_or_compute(labels, compute_labels))
+    saved = load_or_compute(labels, compute_labels)
+    recordings = _labeled_recordings(saved)
     encoder = BlockEncoder(whole.shape)
     load_whisper(encoder, whisper)
     readout = BlockReadout(whole.shape.width * len(whole.kept_layers), num_states, READOUT)
     network = train_network(
         BlockNetwork(encoder, readout),
         whole,
-        BatchSource(labeled.recordings, backgrounds),
-        seed=seed,
+        BatchSource(recordings, backgrounds),
         num_steps=num_steps,
         checkpoint=checkpoint,
     ).cpu()
+    topology = parse_topology(Archive(saved))
     model = BlockModel(
-        topology=replace(labeled.topology, phone_penalty=_PHONE_PENALTY, rate_weight=_RATE_WEIGHT),
+        topology=replace(topology, phone_penalty=_PHONE_PENALTY, rate_weight=_RATE_WEIGHT),
         network=export_onnx(network.encoder, network.readout, BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST),
-        log_prior=labeled.log_prior,
+        log_prior=saved["log_prior"],
         acoustic_scale=_ACOUSTIC_SCALE,
     )
     model.save(output)
-    _write_card(output, start, seed, num_steps, labeled.recordings, examples, errors)
+    minutes = sum(len(recording.targets) for recording in recordings) / FRAMES_PER_MINUTE
+    write_card(
+        output,
+        title="Block model: Whisper's encoder in blocks with a cached past, gently tuned",
+        details=f"with Whisper's weights (Radford et al. 2023, MIT license), seed {SEED}, "
+        f"{num_steps} steps of {BATCHES_PER_STEP * BATCH_S} s of sound, aligned by `{start.name}`, "
+        f"on {len(recordings)} recordings of {minutes:.0f} minutes: those below, speech "
+        "without text, and sung copies",
+        recordings=examples,
+        errors=errors,
+    )
     errors.report_to(print_message)
     for path in (labels, checkpoint):
         path.unlink()
 
 
-def _sung_copies(recordings: Sequence[LabeledRecording], seed: int) -> Iterator[LabeledRecording]:
+def _label_arrays(
+    recordings: Sequence[LabeledRecording], topology: Topology, log_prior: NDArray[np.float32]
+) -> dict[str, ArrayLike]:
+    """Return labeled recordings and the statistics of their alignment as arrays of a file."""
+    targets = [recording.targets for recording in recordings]
+    return {
+        **topology_arrays(topology),
+        "log_prior": log_prior,
+        "samples": np.concatenate([recording.samples for recording in recordings]),
+        "num_samples": [len(recording.samples) for recording in recordings],
+        "states": np.concatenate([frame_targets.states for frame_targets in targets]),
+        "probs": np.concatenate([frame_targets.probs for frame_targets in targets]),
+        "num_frames": [len(frame_targets) for frame_targets in targets],
+        "weights": [recording.weight for recording in recordings],
+    }
+
+
+def _labeled_recordings(saved: dict[str, NDArray[Any]]) -> list[LabeledRecording]:
+    """Restore the recordings from :func:`_label_arrays`."""
+    samples = np.split(saved["samples"], np.cumsum(saved["num_samples"])[:-1])
+    bounds = np.cumsum(saved["num_frames"])[:-1]
+    states, probs = np.split(saved["states"], bounds), np.split(saved["probs"], bounds)
+    return [
+        LabeledRecording(samples=sound, targets=FrameTargets(*pair), weight=float(weight))
+        for sound, *pair, weight in zip(samples, states, probs, saved["weights"], strict=True)
+    ]
+
+
+def _sung_copies(recordings: Sequence[LabeledRecording]) -> Iterator[LabeledRecording]:
     """Yield copies of some recordings that are sung, or have a held vowel."""
-    numbers = np.random.default_rng(seed).permutation(len(recordings))[::_SUNG_EVERY].tolist()
-    copies = process_in_order(partial(_sung_copy, recordings, seed), numbers)
+    numbers = np.random.default_rng(SEED).permutation(len(recordings))[::_SUNG_EVERY].tolist()
+    copies = process_in_order(partial(_sung_copy, recordings), numbers)
     for copy in track(copies, "sung copies", len(numbers)):
         if copy:
             yield copy
 
 
-def _sung_copy(
-    recordings: Sequence[LabeledRecording], seed: int, number: int
-) -> LabeledRecording | None:
+def _sung_copy(recordings: Sequence[LabeledRecording], number: int) -> LabeledRecording | None:
     """Sing the start of a recording; None if it has too little voice."""
     recording = recordings[number]
     speech = as_floats(recording.samples[: HOP_SAMPLES * _MAX_SUNG_FRAMES])
     num_positions = len(speech) // HOP_SAMPLES // _FRAMES_PER_POSITION
-    sung = sing(speech, num_positions, np.random.default_rng([seed, number]))
+    sung = sing(speech, num_positions, np.random.default_rng([SEED, number]))
     if sung is None:
         return None
     frames = _FRAMES_PER_POSITION * sung.source[:, None] + np.arange(_FRAMES_PER_POSITION)
@@ -191,26 +190,4 @@ def _sung_copy(
         samples=as_integers(sung.samples),
         targets=targets.select(slice(num_frames)),
         weight=_SUNG_WEIGHT * recording.weight,
-    )
-
-
-def _write_card(
-    output: Path,
-    start: Path,
-    seed: int,
-    num_steps: int,
-    recordings: Sequence[LabeledRecording],
-    examples: Sequence[Example],
-    errors: RowErrors,
-) -> None:
-    minutes = sum(len(recording.targets) for recording in recordings) / FRAMES_PER_MINUTE
-    write_card(
-        output,
-        title="Block model: Whisper's encoder in blocks with a cached past, gently tuned",
-        details=f"with Whisper's weights (Radford et al. 2023, MIT license), seed {seed}, "
-        f"{num_steps} steps of {BATCHES_PER_STEP * BATCH_S} s of sound, aligned by `{start.name}`, "
-        f"on {len(recordings)} recordings of {minutes:.0f} minutes: those below, speech without "
-        "text, and sung copies",
-        recordings=examples,
-        errors=errors,
     )

@@ -69,7 +69,6 @@ def train_network(
     teacher: WholeEncoder,
     batch_source: BatchSource,
     *,
-    seed: int,
     num_steps: int,
     checkpoint: Path,
 ) -> BlockNetwork:
@@ -78,7 +77,7 @@ def train_network(
     ``network`` has Whisper's weights and an untrained readout, ``teacher`` is Whisper's encoder.
     Training saves its state in ``checkpoint``, and resumes from it if the file exists.
     """
-    first = [draw_block_batch(batch_source, seed, number) for number in range(_NUM_STANDARDIZED)]
+    first = [draw_block_batch(batch_source, number) for number in range(_NUM_STANDARDIZED)]
     with torch.no_grad():
         features = [
             teacher(_tensor([batch.clean]), batch.start)[:, : batch.states.shape[1]].flatten(0, 1)
@@ -92,7 +91,7 @@ def train_network(
         nonlocal batches
         if batches is None:
             numbers = range(BATCHES_PER_STEP * step, BATCHES_PER_STEP * num_steps)
-            batches = process_in_order(partial(draw_block_batch, batch_source, seed), numbers)
+            batches = process_in_order(partial(draw_block_batch, batch_source), numbers)
         total = torch.zeros((), device=DEVICE)
         for last in range(_JOINED, BATCHES_PER_STEP + 1, _JOINED):
             joined = list(islice(batches, _JOINED))
@@ -111,7 +110,6 @@ def train_network(
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,
-        seed=seed,
         checkpoint=checkpoint,
     )
 

@@ -27,14 +27,15 @@ from kouxing.training.networks.augmentation import (
     disturb,
     scale_level,
 )
+from kouxing.training.seed import SEED
 
 Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
 Batch = tuple[Halves, Halves]  # inputs, (batch, positions, 160); targets
 
-NUM_PHRASE_POSITIONS = 250  # length of an excerpt, 5 s
+NUM_POSITIONS = 250  # length of an excerpt, 5 s
 NUM_EXCERPTS = 28
-BATCH_S = NUM_EXCERPTS * NUM_PHRASE_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
+BATCH_S = NUM_EXCERPTS * NUM_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
 _MAX_SPEED = 1.3
 _MAX_PIECE = 400  # positions of one recording in an excerpt
 _PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
@@ -61,11 +62,11 @@ class BatchSource:
         return self.pieces[int(np.searchsorted(probs, rng.random() * probs[-1]))]
 
 
-def draw_batch(material: BatchSource, seed: int, number: int) -> Batch:
+def draw_batch(batch_source: BatchSource, number: int) -> Batch:
     """Draw a batch by its number."""
-    rng = np.random.default_rng([seed, number])
-    probs = np.cumsum([piece.weight for piece in material.pieces])
-    excerpts = [_excerpt(material, probs, rng) for _ in range(NUM_EXCERPTS)]
+    rng = np.random.default_rng([SEED, number])
+    probs = np.cumsum([piece.weight for piece in batch_source.pieces])
+    excerpts = [_excerpt(batch_source, probs, rng) for _ in range(NUM_EXCERPTS)]
     inputs, targets = (np.stack(arrays, dtype=np.float16) for arrays in zip(*excerpts, strict=True))
     return inputs, targets
 
@@ -77,26 +78,26 @@ def network_inputs(samples: Floats) -> Floats:
 
 
 def _excerpt(
-    material: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
+    batch_source: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    samples, targets = _speech(material, probs, rng)
+    samples, targets = _speech(batch_source, probs, rng)
     sound, speed = change_speed(samples, rng)
     if rng.random() < _ONLY_BACKGROUND_PROB:
         targets[:] = np.nan
         targets[:, VOICE] = VoiceKind.NONE
-        sound = _add_background(sound, material, rng, 0.0, with_voices=False) - sound
+        sound = _add_background(sound, batch_source, rng, 0.0, with_voices=False) - sound
     elif rng.random() >= _CLEAN_PROB:
         if rng.random() < _BACKGROUND_PROB:
             snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
-            sound = _add_background(sound, material, rng, snr_db, with_voices=True)
+            sound = _add_background(sound, batch_source, rng, snr_db, with_voices=True)
         sound = disturb(sound, rng)
-    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_PHRASE_POSITIONS]
-    source = speed * np.arange(NUM_PHRASE_POSITIONS) + (speed - 1) * _MIDDLE
+    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
+    source = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
     chosen = _rows(targets, source)
     chosen[:, PITCH] += np.float32(np.log2(speed))
-    lips = material.columns.lips
+    lips = batch_source.columns.lips
     delayed = [
-        _rows(targets[:, lips], speed * (np.arange(NUM_PHRASE_POSITIONS) + known) - 1)
+        _rows(targets[:, lips], speed * (np.arange(NUM_POSITIONS) + known) - 1)
         for known in (_KNOWN - delay_s / POSITION_S for delay_s in LIP_DELAYS_S)
     ]
     return inputs, np.concatenate([chosen[:, : lips.start], *delayed], axis=1)
@@ -110,14 +111,14 @@ def _rows(targets: Floats, positions: NDArray[np.floating]) -> Floats:
 
 
 def _speech(
-    material: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
+    batch_source: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Join recordings and pauses that are long enough for an excerpt at any speed."""
     sounds: list[Floats] = []
     rows: list[Floats] = []
-    missing = int(NUM_PHRASE_POSITIONS * _MAX_SPEED)
+    missing = int(NUM_POSITIONS * _MAX_SPEED)
     while missing > 0:
-        piece = material.draw(rng, probs)
+        piece = batch_source.draw(rng, probs)
         size = min(len(piece.targets), _MAX_PIECE, missing)
         start = int(rng.integers(len(piece.targets) - size + 1))
         sound = as_floats(piece.samples[POSITION_SAMPLES * start :][: POSITION_SAMPLES * size])
@@ -138,7 +139,7 @@ def _speech(
 
 def _add_background(
     sound: Sound,
-    material: BatchSource,
+    batch_source: BatchSource,
     rng: np.random.Generator,
     snr_db: float,
     *,
@@ -146,10 +147,10 @@ def _add_background(
 ) -> Sound:
     """Add music, noise or other voices, ``snr_db`` below a sound."""
     if with_voices and rng.random() < _VOICES_PROB:
-        numbers = rng.integers(len(material.pieces), size=int(rng.integers(1, _MAX_VOICES + 1)))
-        others = [material.pieces[number].samples for number in numbers]
+        numbers = rng.integers(len(batch_source.pieces), size=int(rng.integers(1, _MAX_VOICES + 1)))
+        others = [batch_source.pieces[number].samples for number in numbers]
     else:
-        background = material.backgrounds[int(rng.integers(len(material.backgrounds)))]
+        background = batch_source.backgrounds[int(rng.integers(len(batch_source.backgrounds)))]
         others = [_change_pitch(background, rng)]
     return add_sounds(sound, others, snr_db, rng)
 

@@ -46,6 +46,7 @@ from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.lips.recipe import measure_scale, repeats_by_source, standardize
 from kouxing.training.lips.recurrent import LipNetwork, SpeechExample, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
+from kouxing.training.seed import SEED
 
 Floats = NDArray[np.float32]
 
@@ -146,7 +147,6 @@ def train_lip_teacher(
     clips: Sequence[LipClip],
     features: Sequence[TeacherFeatures],
     phones: Mapping[str, Sequence[Phone]],
-    seed: int,
 ) -> LipTeacher:
     """Train the teacher on filmed clips; ``phones`` has phones by clip name."""
     projection = Projection.fit(
@@ -169,7 +169,7 @@ def train_lip_teacher(
 
     def train(number: int) -> LipNetwork:
         network, _ = train_network(
-            examples, num_epochs=NUM_EPOCHS, seed=seed + number, both_ways=True
+            examples, num_epochs=NUM_EPOCHS, seed=SEED + number, both_ways=True
         )
         return network
 

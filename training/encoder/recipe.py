@@ -3,10 +3,12 @@
     clips, block network, Whisper's encoder -> lip teacher
     recordings, teachers -> targets -> audio encoder
 
-If training is interrupted, the same command resumes it. Next to the output, the folder ``.targets``
-contains the lip teacher and the targets, and ``.checkpoint.pt`` the training state.
+Training can be interrupted. Next to the output, the folder ``.targets`` contains the lip teacher
+and the targets, and ``.checkpoint.pt`` the training state. The same command resumes from them, and
+deletes them at the end.
 """
 
+import shutil
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -25,7 +27,7 @@ from kouxing.corpora.lip_clips import (
 )
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds, training_backgrounds
-from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, is_held_out
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, read_corpus
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.encoder import VoiceKind
@@ -41,7 +43,8 @@ from kouxing.training.encoder.targets import Samples, SourceRecording, TargetCol
 from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.optimizer import optimize
-from kouxing.training.training_set import read_utterances, weights_of
+from kouxing.training.seed import SEED
+from kouxing.training.training_set import weights_of
 
 _LEARNING_RATE, _WARM_UP_STEPS, _DECAY_FRACTION = 2e-3, 200, 0.5
 _OTHER_VOICES = {"laughter": VoiceKind.LAUGHTER, "breath": VoiceKind.NONE}  # by the kind of a sound
@@ -63,11 +66,10 @@ def train_encoder(
     *,
     whisper: Path,
     clips: Path,
-    untranscribed: Sequence[Path] = (),
-    sounds: Sequence[Path] = (),
-    seed: int = 0,
-    num_steps: int = 7000,
-    only_distributable: bool = True,
+    untranscribed: Sequence[Path],
+    sounds: Sequence[Path],
+    num_steps: int,
+    any_license: bool,
 ) -> None:
     """Train the audio encoder, and write it with its model card.
 
@@ -79,13 +81,13 @@ def train_encoder(
     utterances = [
         utterance
         for corpus in corpora
-        for utterance in read_utterances(
-            corpus, errors, inventory, split="train", only_distributable=only_distributable
+        for utterance in read_corpus(
+            corpus, errors, inventory, split="train", any_license=any_license
         )
     ]
     if not utterances:
         raise errors.no_recording_error("of split 'train' in the corpora")
-    all_sounds = read_sounds(sounds, only_distributable=only_distributable)
+    all_sounds = read_sounds(sounds, any_license=any_license)
     backgrounds = training_backgrounds(all_sounds)
     if not backgrounds:
         raise UserError("no music or noise to mix with the speech; add a folder with --sounds")
@@ -99,32 +101,32 @@ def train_encoder(
         for sound in all_sounds
         if sound.kind in _OTHER_VOICES and not sound.is_held_out
     ]
-    filmed = training_clips(
-        read_clips(clips, any_license=not only_distributable, language=None),
-        any_license=not only_distributable,
-    )
+    all_clips = read_clips(clips, any_license=any_license, language=None)
+    filmed = training_clips(all_clips, any_license=any_license)
     if not any(clip.is_in_sync for clip in filmed):
         raise no_clip_error(clips)
     paths = [clips / f"{clip.name}.flac" for clip in filmed]
     recordings = [*_speech_of(utterances, untranscribed, paths), *others]
-    folder = output.with_suffix(".targets")
+    folder, checkpoint = (output.with_suffix(end) for end in (".targets", ".checkpoint.pt"))
     folder.mkdir(parents=True, exist_ok=True)
-    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", filmed, teachers, seed)
-    store = TargetStore(folder, recordings, teachers, lip_teacher, errors, seed)
+    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", filmed, teachers)
+    store = TargetStore(folder, recordings, teachers, lip_teacher, errors)
     batch_source = BatchSource(store.pieces(), backgrounds, TargetColumns(len(inventory)))
-    trained = _train_network(batch_source, num_steps, seed, output)
+    trained = _train_network(batch_source, num_steps, checkpoint)
     trained.rescale_lips(store.lips_mean, store.lips_deviation)
     save_encoder(output, trained)
     write_card(
         output,
         title="Audio encoder: voice and lip features, a recurrent network",
         details=f"with Whisper's encoder as a teacher (Radford et al. 2023, MIT license), seed "
-        f"{seed}, {num_steps} steps of {BATCH_S:.0f} s of sound",
+        f"{SEED}, {num_steps} steps of {BATCH_S:.0f} s of sound",
         recordings=utterances,
         errors=errors,
         notes=f"It also learned from {len(untranscribed)} folders of speech without text.",
     )
     errors.report_to(print_message)
+    checkpoint.unlink()
+    shutil.rmtree(folder)
 
 
 def _speech_of(
@@ -134,7 +136,7 @@ def _speech_of(
     weights = zip(utterances, weights_of(utterances), strict=True)
     of_sources = [[(utterance.path, weight * utterance.seconds) for utterance, weight in weights]]
     for folder in untranscribed:
-        of_sources.append([(path, 1.0) for path in audio_files(folder) if not is_held_out(path)])
+        of_sources.append([(path, 1.0) for path in audio_files(folder)])
     of_sources.append([(path, 1.0) for path in filmed])
     source_weights = np.sqrt(
         [sum(path.stat().st_size for path, _ in source) for source in of_sources]
@@ -156,9 +158,7 @@ def _read(path: Path) -> Samples:
     return as_integers(read_audio(path))
 
 
-def _load_lip_teacher(
-    path: Path, all_clips: Sequence[LipClip], teachers: Teachers, seed: int
-) -> LipTeacher:
+def _load_lip_teacher(path: Path, all_clips: Sequence[LipClip], teachers: Teachers) -> LipTeacher:
     """Load the lip teacher, or train it on the clips whose audio is in sync."""
     if not path.exists():
         clips = [clip for clip in all_clips if clip.is_in_sync]
@@ -167,15 +167,13 @@ def _load_lip_teacher(
         )
         phones = label_clips(load_model(), clips)
         unfinished = path.with_suffix(".part")
-        train_lip_teacher(clips, features, phones, seed).save(unfinished)
+        train_lip_teacher(clips, features, phones).save(unfinished)
         unfinished.replace(path)
     return LipTeacher.load(path)
 
 
-def _train_network(
-    batch_source: BatchSource, num_steps: int, seed: int, output: Path
-) -> AudioEncoder:
-    torch.manual_seed(seed)
+def _train_network(batch_source: BatchSource, num_steps: int, checkpoint: Path) -> AudioEncoder:
+    torch.manual_seed(SEED)
     encoder = AudioEncoder(batch_source.columns.num_phones).to(DEVICE)
     batches: Iterator[Batch] | None = None
 
@@ -183,7 +181,7 @@ def _train_network(
         nonlocal batches
         if batches is None:
             numbers = range(step, num_steps)
-            batches = process_in_order(partial(draw_batch, batch_source, seed), numbers)
+            batches = process_in_order(partial(draw_batch, batch_source), numbers)
         with mixed_precision():
             return encoder.loss(
                 *(torch.from_numpy(part).to(DEVICE).float() for part in next(batches))
@@ -196,7 +194,6 @@ def _train_network(
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,
-        seed=seed,
         max_norm=1.0,
-        checkpoint=output.with_suffix(".checkpoint.pt"),
+        checkpoint=checkpoint,
     ).cpu()

@@ -38,6 +38,7 @@ from kouxing.shared.terminal import write_text
 from kouxing.training.encoder.lip_teacher import LipTeacher, TeacherFeatures
 from kouxing.training.encoder.singing import sing
 from kouxing.training.encoder.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
+from kouxing.training.seed import SEED
 
 Floats = NDArray[np.float32]
 Samples = NDArray[np.int16]  # 16 kHz
@@ -59,7 +60,7 @@ class SourceRecording:
     """A recording to train on."""
 
     name: str
-    read: Callable[[], Samples]  # ValueError if it cannot be read
+    read: Callable[[], Samples]  # UserError if it cannot be read
     weight: float  # relative sampling frequency
     voice: VoiceKind = VoiceKind.SPEECH  # frames in which the sound is audible
 
@@ -105,15 +106,14 @@ class TargetStore:
         teachers: Teachers,
         lip_teacher: LipTeacher,
         errors: RowErrors,
-        seed: int,
     ) -> None:
         """Open a folder; UserError if it has targets of other recordings, or no usable recording.
 
         ``errors`` receives a message for every recording that cannot be read.
         """
-        self._folder, self._errors, self._seed = folder, errors, seed
+        self._folder, self._errors = folder, errors
         self._teachers, self._lip_teacher = teachers, lip_teacher
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(SEED)
         order = rng.exponential(size=len(recordings)) / [
             recording.weight for recording in recordings
         ]
@@ -144,7 +144,7 @@ class TargetStore:
         return [piece for number in chunks for piece in self._load(number)]
 
     def _check_key(self) -> None:
-        key = hashlib.sha256(f"3 {self._seed} {self._teachers.digest}".encode())
+        key = hashlib.sha256(f"3 {SEED} {self._teachers.digest}".encode())
         for recording in self._recordings:
             key.update(f"{recording.name} {recording.voice}\n".encode())
         path = self._folder / "key"
@@ -189,12 +189,12 @@ class TargetStore:
     def _compute(self, chunk: int) -> list[tuple[str, str]]:
         """Compute and store a chunk; return the recordings that cannot be read, with messages."""
         torch.set_num_threads(1)
-        rng = np.random.default_rng([self._seed, chunk])
+        rng = np.random.default_rng([SEED, chunk])
         pieces, errors = [], []
         for recording in self._recordings[CHUNK_SIZE * chunk :][:CHUNK_SIZE]:
             try:
                 of_recording = self.pieces_of(recording)
-            except ValueError as error:
+            except UserError as error:
                 errors.append((recording.name, str(error)))
                 continue
             for piece in of_recording:
@@ -212,7 +212,7 @@ class TargetStore:
         return errors
 
     def pieces_of(self, recording: SourceRecording) -> list[Piece]:
-        """Compute the targets of a recording; ValueError if it cannot be read."""
+        """Compute the targets of a recording; UserError if it cannot be read."""
         pieces = []
         for samples in _cut(recording):
             outputs = self._teachers.compute_targets(samples)
@@ -235,7 +235,7 @@ class TargetStore:
 
 
 def _cut(recording: SourceRecording) -> list[Samples]:
-    """Read a recording in parts of up to 20 s; ValueError if it cannot be read."""
+    """Read a recording in parts of up to 20 s; UserError if it cannot be read."""
     samples = recording.read()
     starts = range(0, max(1, len(samples) - _MIN_SAMPLES), _MAX_SAMPLES)
     parts = [samples[start : start + _MAX_SAMPLES] for start in starts]

@@ -12,7 +12,7 @@ bounded linear least-squares problem. Rare phones are shrunk toward the values o
 other phones. Silence and bilabials are closed: R is 0.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, islice, pairwise
@@ -27,7 +27,6 @@ from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, openin
 from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
-    may_distribute,
     read_corpus,
     syllables_of,
 )
@@ -233,7 +232,7 @@ _MAX_OF_SPEAKER = 60  # recordings
 
 
 def train_ferguson(
-    clips: Path, corpora: Sequence[Path], output: Path, *, any_license: bool = False
+    clips: Path, corpora: Sequence[Path], output: Path, *, any_license: bool
 ) -> None:
     """Learn the table from the training clips and recordings.
 
@@ -273,13 +272,12 @@ def training_rows(
     Raises UserError if there are no usable sentences.
     """
     chosen: list[Utterance] = []
-    of_speaker: dict[str, int] = {}
+    of_speaker: Counter[str] = Counter()
     for corpus in corpora:
-        for row in read_corpus(corpus, errors, inventory, split="train"):
-            number = of_speaker.get(row.speaker, 0)
-            is_free = any_license or may_distribute(row.license)
-            if is_free and len(row.syllables) >= _MIN_SYLLABLES and number < _MAX_OF_SPEAKER:
-                of_speaker[row.speaker] = number + 1
+        rows = read_corpus(corpus, errors, inventory, split="train", any_license=any_license)
+        for row in rows:
+            if len(row.syllables) >= _MIN_SYLLABLES and of_speaker[row.speaker] < _MAX_OF_SPEAKER:
+                of_speaker[row.speaker] += 1
                 chosen.append(row)
     if not chosen:
         raise errors.no_recording_error(f"in {', '.join(map(str, corpora))}")
@@ -295,7 +293,7 @@ def aligned_speech(
         try:
             samples = read_audio(row.path)
             phones = align_syllables(model, samples, MEDIA_RATE_HZ, syllables).phones
-        except (UserError, OSError, ValueError) as error:
+        except UserError as error:
             errors.add(row.utterance_id, str(error))
             continue
         yield AlignedSpeech(

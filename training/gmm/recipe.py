@@ -30,6 +30,7 @@ from kouxing.training.gmm.search_weights import SearchWeights, choose_search_wei
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.augmentation import augment_samples, scale_level
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
+from kouxing.training.seed import SEED
 from kouxing.training.training_set import Example, load_examples
 
 _STATES_PER_PHONE = 5  # Li et al. 2011, section 3.1
@@ -50,10 +51,9 @@ def train_gmm(
     output: Path,
     inventory: PhoneInventory,
     *,
-    seed: int = 0,
+    any_license: bool,
     phone_lm: Path | None = None,
     num_mixtures: int = 32,
-    only_distributable: bool = True,
 ) -> None:
     """Train the Gaussian mixture recognizer, and write the model with its card.
 
@@ -61,11 +61,9 @@ def train_gmm(
     train on.
     """
     errors = RowErrors()
-    examples = load_examples(
-        corpora, errors, inventory, only_distributable=only_distributable, with_samples=True
-    )
+    examples = load_examples(corpora, errors, inventory, any_license=any_license, with_samples=True)
     lm = load_phone_lm(phone_lm, inventory) if phone_lm else phone_lm_of(examples, inventory)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     copies = [copy for example in examples for copy in _copies(example, rng)]
     print_message(f"{len(examples)} recordings, {len(copies)} copies with augmentation")
     first_state = np.arange(len(inventory) + 1) * _STATES_PER_PHONE
@@ -88,13 +86,13 @@ def train_gmm(
         half_width=_HALF_WIDTH,
     )
 
-    chosen = choose_search_weights(model, corpora, only_distributable=only_distributable)
+    chosen = choose_search_weights(model, corpora, any_license=any_license)
     (chosen or _UNTUNED).apply_to(model).save(output)
     write_card(
         output,
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
         f"{len(inventory)} x {_STATES_PER_PHONE} states",
-        details=f"seed {seed}",
+        details=f"seed {SEED}",
         recordings=examples,
         errors=errors,
         notes=f"Chosen on dev: {chosen}" if chosen else "",

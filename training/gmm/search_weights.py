@@ -11,7 +11,6 @@ from kouxing.corpora.scoring import ErrorCounts, count_errors
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology, score_segment
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
-from kouxing.services.recognizer.front_end.vtln import append_unvoiced_pitch
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import print_message
@@ -42,7 +41,7 @@ class SearchWeights:
 
 
 def choose_search_weights(
-    model: GmmModel, corpora: Sequence[Path], *, only_distributable: bool
+    model: GmmModel, corpora: Sequence[Path], *, any_license: bool
 ) -> SearchWeights | None:
     """Choose the weights with the lowest error rate on the split ``dev``; None if it is empty.
 
@@ -54,12 +53,13 @@ def choose_search_weights(
             RowErrors(),
             model.inventory,
             split="dev",
-            only_distributable=only_distributable,
+            any_license=any_license,
         )
     except UserError:
         print_message("no dev recordings; acoustic scale and phone penalty keep their defaults")
         return None
-    features = (append_unvoiced_pitch(example.log_mel.astype(np.float32)) for example in dev)
+    # the pitch is unknown, so no band is warped
+    features = (np.pad(example.log_mel.astype(np.float32), ((0, 0), (0, 2))) for example in dev)
     scores = [score_segment(model, frames) for frames in features]
     best: SearchWeights | None = None
     for scale in _SCALES:

@@ -144,14 +144,10 @@ def write(
 
     eyes = [p.part for p in pieces if p.name.startswith("eye")]
     points = {
-        name: start["skin"] + int(skin.number[vertex])
+        name: start[piece] + int(surface.number[vertex])
+        for piece, surface in (("skin", skin), ("tongue", tongue))
         for name, vertex in FEATURE_POINTS.items()
-        if skin.number[vertex] >= 0
-    }
-    points |= {
-        name: start["tongue"] + int(tongue.number[vertex])
-        for name, vertex in FEATURE_POINTS.items()
-        if tongue.number[vertex] >= 0
+        if surface.number[vertex] >= 0
     }
     points |= {"3.5": start["eye_left"], "3.6": start["eye_right"]}
     for name, edge, root in (("teeth_upper", "9.10", "9.8"), ("teeth_lower", "9.11", "9.9")):

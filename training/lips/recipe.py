@@ -40,6 +40,7 @@ from kouxing.training.lips.positions import SpeechStretch, components_of, featur
 from kouxing.training.lips.recurrent import LipNetwork, SpeechExample, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
 from kouxing.training.model_card import write_card
+from kouxing.training.seed import SEED
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -83,13 +84,7 @@ class Basis:
     units: FapScale
 
 
-def train_lips(
-    folder: Path,
-    output: Path,
-    *,
-    seed: int = 0,
-    any_license: bool = False,
-) -> None:
+def train_lips(folder: Path, output: Path, *, any_license: bool) -> None:
     """Train the lip model, and write it with its card.
 
     The arguments are the options of ``kouxing train lips``. Raises UserError if no clip may be
@@ -119,13 +114,13 @@ def train_lips(
         for count, example in zip(counts, examples_of(filmed, targets, basis), strict=True)
         for _ in range(count)
     ]
-    network, losses = train_network(examples, num_epochs=NUM_EPOCHS, seed=seed)
+    network, losses = train_network(examples, num_epochs=NUM_EPOCHS, seed=SEED)
     lips = combine_parts(basis, network, *fit_linear(filmed, targets, counts))
     lips.save(output)
     write_card(
         output,
         title="Lip model",
-        details=f"seed {seed}; mean training loss of each epoch: "
+        details=f"seed {SEED}; mean training loss of each epoch: "
         + ", ".join(f"{loss:.3f}" for loss in losses),
         recordings=used,
         notes=Path(__file__).with_name("about.md").read_text(encoding="utf-8").rstrip(),

@@ -19,9 +19,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import LipClip
+from kouxing.corpora.lip_clips import LipClip, opening_of
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, select_lip_faps
-from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
@@ -31,17 +30,11 @@ _RANGE_PERCENTILES = (1.0, 99.0)
 _LIP_TO_TEETH = "f"
 
 
-def opening_of(clip: LipClip) -> Array:
-    """Return the opening between the inner lips relative to the neutral face, (num_frames,)."""
-    upper, lower = (MOUTH_FAPS.index(fap) for fap in (4, 5))
-    return -clip.faps[:, upper] - clip.faps[:, lower]
-
-
 def closed_below(clips: Sequence[LipClip]) -> dict[str, float]:
     """Measure the opening, FAP units, below which the lips of each speaker touch."""
     by_speaker: dict[str, list[Array]] = defaultdict(list)
     for clip in clips:
-        by_speaker[clip.speaker].append(opening_of(clip))
+        by_speaker[clip.speaker].append(opening_of(clip.faps))
     limits = {}
     for speaker, heights in by_speaker.items():
         known = np.concatenate(heights)
@@ -66,7 +59,7 @@ def targets_at(
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
     faps = [interpolate_track(clip.time_s, track, time_s) for track in select_lip_faps(clip.faps).T]
-    height = interpolate_track(clip.time_s, opening_of(clip), time_s)
+    height = interpolate_track(clip.time_s, opening_of(clip.faps), time_s)
     closure = np.where(np.isnan(height), np.nan, height < closed_at)
     lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)
     for phone in phones or ():

@@ -5,6 +5,7 @@ recordings, clean and whole. A target is the average of both, or only the teache
 is no text.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +34,7 @@ from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations
 from kouxing.training.networks.batches import FrameTargets, LabeledRecording
 from kouxing.training.networks.teacher import WholeEncoder, train_teacher
+from kouxing.training.seed import SEED
 from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_untranscribed
 
 STATES_PER_PHONE = 3
@@ -60,14 +62,6 @@ class Alignment:
     weight: float  # of the phones in statistics of durations
 
 
-@dataclass(frozen=True, slots=True)
-class AlignedExample:
-    """A recording with its alignment."""
-
-    example: Example
-    alignment: Alignment
-
-
 def label(
     examples: Sequence[Example],
     untranscribed: Sequence[Path],
@@ -76,35 +70,33 @@ def label(
     aligner: AcousticModel,
     encoder: WholeEncoder,
     errors: RowErrors,
-    seed: int,
-) -> tuple[list[AlignedExample], list[LabeledRecording]]:
+) -> tuple[list[Alignment], list[LabeledRecording]]:
     """Align and label recordings; those with text come first, in random order.
 
     ``examples`` have text and samples, in the language of ``aligner``. ``untranscribed`` are
-    folders of recordings without text. ``encoder`` is Whisper's, for the teacher.
+    folders of recordings without text. ``encoder`` is Whisper's, for the teacher. Returns the
+    alignments of the recordings with text, and all recordings.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     folders = [load_untranscribed([folder], errors) for folder in untranscribed]
     in_random_order = [examples[index] for index in rng.permutation(len(examples))]
-    aligned = _align_examples(aligner, in_random_order)
-    recordings = _recordings(aligned, mix)
-    num_of_kind = dict.fromkeys(mix.kinds, 0)
+    aligned, alignments = _align_examples(aligner, in_random_order)
+    recordings = _recordings(aligned, alignments, mix)
+    num_of_kind: Counter[str] = Counter()
     teacher_set = []
-    num_states = STATES_PER_PHONE * len(aligner.inventory)
-    for aligned_example, recording in zip(aligned, recordings, strict=True):
-        num_of_kind[aligned_example.example.kind] += 1
-        if num_of_kind[aligned_example.example.kind] <= _TEACHER_SET:
+    for example, recording in zip(aligned, recordings, strict=True):
+        num_of_kind[example.kind] += 1
+        if num_of_kind[example.kind] <= _TEACHER_SET:
             teacher_set.append(recording)
-    teacher = train_teacher(encoder, teacher_set, num_states, seed=seed)
-    sounds = [sound for pieces in folders for sound in pieces]
-    all_sounds = [*(recording.samples for recording in recordings), *sounds]
-    labels = teacher.label(all_sounds)
+    teacher = train_teacher(encoder, teacher_set, STATES_PER_PHONE * len(aligner.inventory))
+    sounds = [recording.samples for recording in recordings]
+    sounds += [sound for pieces in folders for sound in pieces]
+    labels = iter(teacher.label(sounds))
     labeled = [
         replace(recording, targets=recording.targets.average_with(targets))
         for recording, targets in zip(recordings, labels, strict=False)
     ]
-    rest = iter(labels[len(recordings) :])
-    of_folders = [list(zip(pieces, rest, strict=False)) for pieces in folders]
+    of_folders = [list(zip(pieces, labels, strict=False)) for pieces in folders]
     sizes = [sum(len(targets) for _, targets in pairs) for pairs in of_folders]
     counted = [min(size, _FULL_FOLDER_MINUTES * FRAMES_PER_MINUTE) for size in sizes]
     for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
@@ -112,33 +104,35 @@ def label(
             weight = mix.untranscribed * count / sum(counted) * len(targets) / size
             labeled.append(LabeledRecording(samples=sound, targets=targets, weight=weight))
     width = max(recording.targets.states.shape[1] for recording in labeled)
-    return aligned, [
+    return alignments, [
         replace(recording, targets=recording.targets.pad_states(width)) for recording in labeled
     ]
 
 
-def _recordings(aligned: Sequence[AlignedExample], mix: DataMix) -> list[LabeledRecording]:
+def _recordings(
+    examples: Sequence[Example], alignments: Sequence[Alignment], mix: DataMix
+) -> list[LabeledRecording]:
     """Weight recordings: a kind of speech has a fixed total weight; rare speakers weigh more."""
+    pairs = list(zip(examples, alignments, strict=True))
     frames = dict.fromkeys(mix.kinds, 0.0)
-    for aligned_example in aligned:
-        frames[aligned_example.example.kind] += aligned_example.example.weight * len(
-            aligned_example.alignment.states
+    for example, alignment in pairs:
+        frames[example.kind] += example.weight * len(alignment.states)
+    return [
+        LabeledRecording(
+            samples=example.samples,
+            targets=FrameTargets.hard(alignment.states),
+            weight=mix.kinds[example.kind]
+            * example.weight
+            * len(alignment.states)
+            / frames[example.kind],
         )
-    recordings = []
-    for aligned_example in aligned:
-        kind = aligned_example.example.kind
-        states = aligned_example.alignment.states
-        weight = mix.kinds[kind] * aligned_example.example.weight * len(states) / frames[kind]
-        targets = FrameTargets.hard(states)
-        recordings.append(
-            LabeledRecording(
-                samples=aligned_example.example.samples, targets=targets, weight=weight
-            )
-        )
-    return recordings
+        for example, alignment in pairs
+    ]
 
 
-def _align_examples(aligner: AcousticModel, examples: Sequence[Example]) -> list[AlignedExample]:
+def _align_examples(
+    aligner: AcousticModel, examples: Sequence[Example]
+) -> tuple[list[Example], list[Alignment]]:
     """Align each recording with its text; drop recordings that do not fit.
 
     Raises UserError if no recording fits its text.
@@ -169,17 +163,19 @@ def _align_examples(aligner: AcousticModel, examples: Sequence[Example]) -> list
         phones = segments_of_path(path, graph)
         return Alignment(states=states, phones=phones, weight=example.weight)
 
-    alignments = process_in_order(align, range(len(examples)))
-    tracked = track(examples, "aligned recordings")
-    pairs = zip(tracked, alignments, strict=True)
-    aligned = [AlignedExample(example, alignment) for example, alignment in pairs if alignment]
+    found = process_in_order(align, range(len(examples)))
+    aligned, alignments = [], []
+    for example, alignment in zip(track(examples, "aligned recordings"), found, strict=True):
+        if alignment:
+            aligned.append(example)
+            alignments.append(alignment)
     if not aligned:
         raise UserError("no recording fits its text; check the texts and the aligner")
-    return aligned
+    return aligned, alignments
 
 
 def alignment_statistics(
-    aligned: Sequence[Alignment], weights: Sequence[float], phone_lm: PhoneLanguageModel
+    alignments: Sequence[Alignment], weights: Sequence[float], phone_lm: PhoneLanguageModel
 ) -> tuple[Topology, NDArray[np.float32]]:
     """Count transitions and durations, and the states' log priors, (states,).
 
@@ -189,9 +185,9 @@ def alignment_statistics(
     counts = np.ones(num_states)
     occupied, left = np.full(num_states, 2.0), np.ones(num_states)
     durations = PhoneDurations(phone_lm.inventory)
-    for alignment, weight in zip(aligned, weights, strict=True):
+    for alignment, weight in zip(alignments, weights, strict=True):
         in_states = np.bincount(alignment.states, minlength=num_states)
-        counts += weight * len(aligned) / len(alignment.states) * in_states
+        counts += weight * len(alignments) / len(alignment.states) * in_states
         occupied += in_states
         ends = np.append(np.flatnonzero(np.diff(alignment.states)), len(alignment.states) - 1)
         np.add.at(left, alignment.states[ends], 1.0)

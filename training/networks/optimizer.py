@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 from kouxing.shared.terminal import print_message
+from kouxing.training.seed import SEED
 
 SAVE_EVERY = 25  # steps
 MIN_SAVE_S = 30.0  # between two saves
@@ -37,7 +38,6 @@ def optimize(
     num_steps: int,
     warm_up_steps: int,
     decay_fraction: float,
-    seed: int,
     weight_decay: float = 0.01,
     max_norm: float = 2.0,
     checkpoint: Path | None = None,
@@ -60,7 +60,7 @@ def optimize(
     losses = []
     next_save_s = time.monotonic() + MIN_SAVE_S
     for step in range(first_step, num_steps):
-        torch.manual_seed(seed + step)
+        torch.manual_seed(SEED + step)
         adam.zero_grad()
         loss = loss_of(step)
         rise = min(1.0, (step + 1) / warm_up_steps)

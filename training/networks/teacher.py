@@ -49,6 +49,7 @@ from kouxing.training.networks.batches import (
 )
 from kouxing.training.networks.network import Encoder, EncoderShape, Readout, ReadoutShape
 from kouxing.training.networks.optimizer import cross_entropy, optimize
+from kouxing.training.seed import SEED
 
 NUM_LAYERS = 6  # layers of Whisper base's encoder
 _NUM_STEPS = 600  # batches of up to 70 s of sound
@@ -154,13 +155,13 @@ class Teacher:
 
 
 def train_teacher(
-    encoder: WholeEncoder, recordings: Sequence[LabeledRecording], num_states: int, *, seed: int
+    encoder: WholeEncoder, recordings: Sequence[LabeledRecording], num_states: int
 ) -> Teacher:
     """Train a readout on recordings whose targets are the states of an alignment.
 
     Their features stay in memory, 150 KB a second with Whisper base.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     sampling = sampling_probs(recordings)
     tracked = track(recordings, "encoded for the teacher")
     features = [encoder.features(recording.samples) for recording in tracked]
@@ -189,7 +190,6 @@ def train_teacher(
         num_steps=_NUM_STEPS,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,
-        seed=seed,
         weight_decay=0.02,
     )
     return Teacher(encoder.eval(), trained)

@@ -22,6 +22,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.user_file import open_file, read_file
 from kouxing.training.phone_lm.recipe import PhoneStream, phones_of_text
+from kouxing.training.seed import SEED
 
 NGRAMS, DICTIONARY = "ngrams.txt", "pydict_sc.bin"  # files of a word model
 _MAX_BYTES = 4 << 30
@@ -62,12 +63,11 @@ def draw_phones(
     inventory: PhoneInventory,
     *,
     num_words: int = 30_000_000,
-    seed: int = 0,
 ) -> PhoneStream:
     """Draw about ``num_words`` words; return their phones, with pauses between sentences.
 
-    ``folder`` has ``ngrams.txt``, the output of ``tslminfo -v``, and ``pydict_sc.bin``. The same
-    seed draws the same words. Raises UserError if a file is missing or invalid.
+    ``folder`` has ``ngrams.txt``, the output of ``tslminfo -v``, and ``pydict_sc.bin``. Raises
+    UserError if a file is missing or invalid.
     """
     ngrams, dictionary = folder / NGRAMS, folder / DICTIONARY
     words = _read_words(dictionary)
@@ -76,7 +76,7 @@ def draw_phones(
         raise UserError(
             f"{ngrams} has words that {dictionary} lacks; use files of the same version"
         )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     num_chains = min(_NUM_CHAINS, num_words)
     num_drawn = max(1, num_words // num_chains)
     drawn = np.zeros((num_chains, _CONTEXT_WORDS + num_drawn), np.int64)

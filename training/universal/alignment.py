@@ -32,6 +32,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.universal.segments import features
 from kouxing.training.networks.labels import STATES_PER_PHONE
+from kouxing.training.seed import SEED
 from kouxing.training.universal.features import Features
 
 _NUM_COMPONENTS, _INNER = 192, 384
@@ -56,13 +57,13 @@ class Aligner:
         """Number of universal phones, silence included."""
         return len(self.inventory)
 
-    def align(self, stored: Sequence[Features], seed: int) -> dict[str, NDArray[np.int64]]:
+    def align(self, stored: Sequence[Features]) -> dict[str, NDArray[np.int64]]:
         """Return the states of the frames of recordings, (2 positions,) each, by name.
 
         A recording with too few positions for its phones is left out.
         """
-        torch.manual_seed(seed)
-        components = _components(stored, seed)
+        torch.manual_seed(SEED)
+        components = _components(stored)
         labels = [self._hand_labels(features) for features in stored]
         by_hand = [len(phones) > 0 for phones in labels]
         if not any(by_hand):
@@ -126,9 +127,9 @@ class Aligner:
         return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
-def _components(stored: Sequence[Features], seed: int) -> list[Tensor]:
+def _components(stored: Sequence[Features]) -> list[Tensor]:
     """Return whitened principal components of the positions, (positions, 256) each."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     size = min(_NUM_FOR_COMPONENTS, len(stored))
     some = np.concatenate(
         [

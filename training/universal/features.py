@@ -27,6 +27,7 @@ from kouxing.corpora.speech_corpus import Utterance
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.terminal import write_text
 from kouxing.training.networks.network import MAX_DEVIATIONS
+from kouxing.training.seed import SEED
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, MAX_FRAMES, FeatureEncoder
 
 LAYERS = (-2, -1)  # the last layers of the block network
@@ -65,7 +66,7 @@ class FeatureStore:
         def compute() -> dict[str, NDArray[np.float32]]:
             size = min(_NUM_STANDARDIZED, len(recordings))
             features = []
-            for number in np.random.default_rng(0).choice(len(recordings), size, replace=False):
+            for number in np.random.default_rng(SEED).choice(len(recordings), size, replace=False):
                 frames = _frames_of(recordings[number])
                 (rows,) = self._encoder.encode([frames])
                 positions = rows[:, :BLOCK_LENGTH].reshape(-1, WIDTH)[: len(frames) // 2]

@@ -24,11 +24,12 @@ from kouxing.shared.terminal import print_message
 from kouxing.training.model_card import write_card
 from kouxing.training.networks.labels import STATES_PER_PHONE, Alignment, alignment_statistics
 from kouxing.training.phone_lm.recipe import estimate_phone_lm, join_sentences
+from kouxing.training.seed import SEED
 from kouxing.training.universal.alignment import Aligner
 from kouxing.training.universal.encoder import FeatureEncoder
 from kouxing.training.universal.export import export_extension
 from kouxing.training.universal.features import LAYERS, Features, FeatureStore
-from kouxing.training.universal.recordings import TrainingSet, read_training_set
+from kouxing.training.universal.recordings import read_training_set
 from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
 
 # chosen on held-out recordings
@@ -40,12 +41,11 @@ def train_universal(
     mandarin: Sequence[Path],
     output: Path,
     *,
-    learners: Sequence[Path] = (),
-    languages: Sequence[Path] = (),
-    clips: Path | None = None,
-    seed: int = 0,
-    num_steps: int = 2000,
-    only_distributable: bool = True,
+    learners: Sequence[Path],
+    languages: Sequence[Path],
+    clips: Path | None,
+    num_steps: int,
+    any_license: bool,
 ) -> None:
     """Train the universal readout of the shipped block model, and write it with its card.
 
@@ -56,12 +56,10 @@ def train_universal(
     if not isinstance(model, BlockModel):
         raise UserError("the shipped model is not a block model; reinstall kouxing")
     torch.set_num_threads(1)  # reproducible sums on every machine
-    torch.manual_seed(seed)
+    torch.manual_seed(SEED)
     errors = RowErrors()
     inventory = load_inventory(UNIVERSAL)
-    data = read_training_set(
-        mandarin, learners, languages, clips, errors, only_distributable=only_distributable
-    )
+    data = read_training_set(mandarin, learners, languages, clips, errors, any_license=any_license)
     folder, states_file, checkpoint = (
         output.with_suffix(end) for end in (".features", ".states.npz", ".readout.pt")
     )
@@ -74,7 +72,7 @@ def train_universal(
         for recording, weight in zip(data.recordings, data.weights, strict=True)
     }
     aligner = Aligner(by_name, inventory)
-    saved = load_or_compute(states_file, partial(_aligned_states, aligner, stored, seed))
+    saved = load_or_compute(states_file, partial(_aligned_states, aligner, stored))
     pieces = np.split(saved["states"].astype(np.int64), np.cumsum(saved["lengths"])[:-1])
     states = dict(zip(saved["names"].tolist(), pieces, strict=True))
     aligned = [features for features in stored if features.name in states]
@@ -83,7 +81,6 @@ def train_universal(
         aligned,
         states,
         [weight_of[features.name] for features in aligned],
-        seed=seed,
         num_steps=num_steps,
         checkpoint=checkpoint,
     )
@@ -104,18 +101,23 @@ def train_universal(
         acoustic_scale=_ACOUSTIC_SCALE,
     )
     save_universal(output, universal, extension)
-    _write_card(output, data, seed, num_steps, errors)
+    write_card(
+        output,
+        title="Universal phones: a second readout of the block network",
+        details=f"on layers of `blocks.npz`, which is not changed, seed {SEED}, "
+        f"{num_steps} steps of {CROPS_S:.0f} s of audio, on the recordings below",
+        recordings=data.recordings,
+        errors=errors,
+    )
     errors.report_to(print_message)
     for path in (states_file, checkpoint):
         path.unlink()
     shutil.rmtree(folder)
 
 
-def _aligned_states(
-    aligner: Aligner, stored: Sequence[Features], seed: int
-) -> dict[str, NDArray[Any]]:
+def _aligned_states(aligner: Aligner, stored: Sequence[Features]) -> dict[str, NDArray[Any]]:
     """Align recordings; return the arrays of the file of states."""
-    states = aligner.align(stored, seed)
+    states = aligner.align(stored)
     return {
         "names": np.array(list(states)),
         "lengths": np.array([len(path) for path in states.values()]),
@@ -150,16 +152,3 @@ def _phones_of(states: NDArray[np.int64]) -> list[PathSegment]:
         PathSegment(int(states[start]) // STATES_PER_PHONE, int(start), int(end))
         for start, end in zip(starts, ends, strict=True)
     ]
-
-
-def _write_card(
-    output: Path, data: TrainingSet, seed: int, num_steps: int, errors: RowErrors
-) -> None:
-    write_card(
-        output,
-        title="Universal phones: a second readout of the block network",
-        details=f"on layers of `blocks.npz`, which is not changed, seed {seed}, "
-        f"{num_steps} steps of {CROPS_S:.0f} s of audio, on the recordings below",
-        recordings=data.recordings,
-        errors=errors,
-    )

@@ -17,6 +17,7 @@ from kouxing.corpora.speech_corpus import (
     is_synthetic,
     may_distribute,
     read_corpus,
+    syllables_of,
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, load_inventory
@@ -53,28 +54,24 @@ def read_training_set(
     clips: Path | None,
     errors: RowErrors,
     *,
-    only_distributable: bool = True,
+    any_license: bool,
 ) -> TrainingSet:
     """Read the recordings that are not held out.
 
     ``mandarin`` are Mandarin corpora, ``learners`` English by native speakers of Mandarin,
-    ``languages`` corpora of several languages, and ``clips`` a folder with clips of GRID. By
-    default, their license must allow distributing the model. Raises UserError if nothing can be
-    used.
+    ``languages`` corpora of several languages, and ``clips`` a folder with clips of GRID. Without
+    ``any_license``, their license must allow distributing the model. Raises UserError if nothing
+    can be used.
     """
     groups: dict[str, list[Utterance]] = defaultdict(list)
     for corpus in mandarin:
-        groups["mandarin"] += _sample_mandarin(
-            corpus, errors, only_distributable=only_distributable
-        )
+        groups["mandarin"] += _sample_mandarin(corpus, errors, any_license=any_license)
     for corpus in learners:
         groups["learners"] += _sample_speakers(corpus, errors)
     universal = load_inventory(UNIVERSAL)
     for corpus in languages:
-        for recording in read_corpus(corpus, errors, universal):
-            groups[
-                "emodb" if recording.speaker.startswith("emodb_") else _group_of(recording)
-            ].append(recording)
+        for recording in read_corpus(corpus, errors, universal, any_license=any_license):
+            groups[_group_of(recording)].append(recording)
     if clips:
         groups["grid"] += _grid_clips(clips, errors)
     recordings, weights = [], []
@@ -82,7 +79,7 @@ def read_training_set(
         usable = [
             recording
             for recording in group
-            if _may_train(recording, only_distributable=only_distributable)
+            if _may_train(recording) and (any_license or may_distribute(recording.license))
         ]
         minutes = sum(recording.seconds for recording in usable)
         recordings += usable
@@ -94,29 +91,24 @@ def read_training_set(
 
 
 def _group_of(recording: Utterance) -> str:
+    if recording.speaker.startswith("emodb_"):
+        return "emodb"
     return "synthetic" if is_synthetic(recording.license) else recording.language
 
 
-def _may_train(recording: Utterance, *, only_distributable: bool) -> bool:
+def _may_train(recording: Utterance) -> bool:
     return (
-        (may_distribute(recording.license) or not only_distributable)
-        and recording.seconds <= _MAX_S
+        recording.seconds <= _MAX_S
         and recording.language not in _HELD_OUT_LANGUAGES
         and recording.speaker not in _HELD_OUT_SPEAKERS
         and recording.split != "test"
     )
 
 
-def _sample_mandarin(
-    corpus: Path, errors: RowErrors, *, only_distributable: bool
-) -> list[Utterance]:
+def _sample_mandarin(corpus: Path, errors: RowErrors, *, any_license: bool) -> list[Utterance]:
     """Draw some recordings of each kind, with universal phones."""
     mandarin, universal = load_inventory(), load_inventory(UNIVERSAL)
-    rows = [
-        row
-        for row in read_corpus(corpus, errors, mandarin, split="train")
-        if may_distribute(row.license) or not only_distributable
-    ]
+    rows = read_corpus(corpus, errors, mandarin, split="train", any_license=any_license)
     random.Random(3).shuffle(rows)  # noqa: S311 - reproducible
     by_kind: dict[str, list[Utterance]] = defaultdict(list)
     for row in rows:
@@ -125,11 +117,7 @@ def _sample_mandarin(
     drawn = [row for kind, some in by_kind.items() for row in some[: _MANDARIN_LIMITS[kind]]]
     converted = []
     for row in drawn:
-        units = iter(mandarin.phones[phone] for phone in row.phones)
-        words = [
-            mandarin.in_universal_phones([next(units) for _ in range(length)])
-            for length in row.syllables
-        ]
+        words = [mandarin.in_universal_phones(word) for word in syllables_of(row, mandarin)]
         phones = tuple(universal.index[phone] for word in words for phone in word)
         converted.append(replace(row, phones=phones, syllables=tuple(map(len, words))))
     return converted

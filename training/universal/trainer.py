@@ -17,6 +17,7 @@ from torch.nn.functional import nll_loss
 from kouxing.training.blocks.network import BlockLayout, BlockReadout, block_layout
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.networks.optimizer import optimize
+from kouxing.training.seed import SEED
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, RIGHT_CONTEXT
 from kouxing.training.universal.features import STEP, WIDTH, Features
 
@@ -43,7 +44,6 @@ def train_readout(
     states: Mapping[str, NDArray[np.int64]],
     weights: Sequence[float],
     *,
-    seed: int,
     num_steps: int,
     checkpoint: Path,
 ) -> BlockReadout:
@@ -57,7 +57,7 @@ def train_readout(
     readout.train()
 
     def loss(step: int) -> Tensor:
-        rng = np.random.default_rng([seed, step])
+        rng = np.random.default_rng([SEED, step])
         drawn = [recordings[int(np.searchsorted(probs, rng.random()))] for _ in range(_NUM_CROPS)]
         crops = [_crop(recording, states[recording.name], layout, rng) for recording in drawn]
         features, targets = (torch.from_numpy(np.stack(part)) for part in zip(*crops, strict=True))
@@ -81,7 +81,6 @@ def train_readout(
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,
-        seed=seed,
         checkpoint=checkpoint,
     )
 

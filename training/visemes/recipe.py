@@ -97,7 +97,7 @@ def closure_reach(
     return min(_CLOSURE_REACHES_S, key=loss)
 
 
-def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> None:
+def train_visemes(folder: Path, output: Path, *, any_license: bool) -> None:
     """Train viseme parameters on the training clips of a folder.
 
     Raises UserError if no clip may be used, or the file cannot be written.

@@ -180,11 +180,6 @@ class PitchedLogMel:
         return np.column_stack([log_mel, *self._pitch.accept_waveform(samples)])
 
 
-def append_unvoiced_pitch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Add an unknown pitch to log-mel frames, (n, 41) to (n, 43), so that no band is warped."""
-    return np.pad(log_mel, ((0, 0), (0, 2)))
-
-
 @numba.njit(cache=True, nogil=True)
 def _low_pass(
     samples: NDArray[np.float32], taps: NDArray[np.float64], out: NDArray[np.float64]
