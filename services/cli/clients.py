@@ -192,8 +192,7 @@ def listen(
     if form is ListenFormat.LIVELINK and output is None:
         raise UserError("--as livelink is a table; add --output face.csv")
     check_output(output, force=force)
-    with find_control_address(control) as endpoint:
-        follow(_session_name(session), output, form, endpoint, alphabet)
+    follow(_session_name(session), output, form, find_control_address(control), alphabet)
 
 
 def send(
@@ -239,7 +238,12 @@ def express(
     from kouxing.shared.client_connection import connect_client
 
     words = list(arguments or ())
-    session = _session_name(words.pop(0)) if words and "=" not in words[0] else ""
+    session = words.pop(0) if words and "=" not in words[0] else ""
+    if session and not is_name(session):
+        raise UserError(
+            f"{session!r} is not a session name ({NAME_RULE}); write an expression as"
+            " NAME=STRENGTH, for example joy=0.4"
+        )
     strengths = dict(map(_parse_strength, words))
     if hold is not None and not strengths:
         raise UserError("--hold needs an expression: kouxing express joy=0.4 --hold 2")
@@ -251,6 +255,7 @@ def express(
             raise UserError(
                 f"session {session!r} does not exist (open sessions:"
                 f" {', '.join(all_sessions) or 'none'}); to change all faces, leave it out"
+                + (f", and write {session}=0.4" if session in set(ExpressionName) else "")
             )
         for name in [session] if session else ["", *all_sessions]:
             client.set_face(name, expressions=strengths, hold_s=hold_s)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,19 +41,20 @@ def follow(
     session: str,
     output: Path | None,
     form: ListenFormat | None,
-    control: str,
+    control: AbstractContextManager[str],
     alphabet: Alphabet | None = None,
 ) -> None:
     """Follow a session until it ends; without a name, the newest one, or else the next one.
 
     The frames go to ``output``. Without it, they are printed, or syllables, or phones in an
-    ``alphabet``. Raises ``UserError`` if control does not answer, the file cannot be written, or
-    its format does not fit ``form``.
+    ``alphabet``. ``control`` finds control's address, once the file's format was checked. Raises
+    ``UserError`` if control does not answer, the file cannot be written, or its format does not fit
+    ``form``.
     """
     is_speech = form in SPEECH_FORMATS
     curve_form = None if form is None or is_speech else CurveFormat(form)
     exporter = None if output is None else _open_exporter(output, curve_form)
-    with connect_client(control) as client:
+    with control as endpoint, connect_client(endpoint) as client:
         followed = _wait_for_session(session, client)
         results = followed.results(Phone if is_speech else FapFrame, keep_all=True)
         arriving = _iter_until_interrupt(results, followed.name)

@@ -5,9 +5,10 @@ from urllib.parse import parse_qsl, urlsplit
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import OscConnection
-from kouxing.services.senders.target import Target, parse_camera, parse_delay_s
+from kouxing.services.senders.target import Target, parse_delay_s
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
+from kouxing.shared.endpoints import is_loopback
 from kouxing.shared.errors import UserError
 
 LOOPBACK = "127.0.0.1"
@@ -39,23 +40,32 @@ def parse_target(url: str) -> Target:
         raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}") from None
     protocol = PROTOCOLS.get(parts.scheme)
     is_bare = parts.path in ("", "/") and not parts.fragment and parts.username is None
-    if protocol is None or not is_bare or not url.isprintable() or " " in url:
+    if protocol is None or not is_bare or port == 0 or not url.isprintable() or " " in url:
         raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}")
     options = _parse_options(url, parts.query, protocol)
     try:
-        delay_s = parse_delay_s(options["delay"])
-        if camera := options.get("camera"):
-            parse_camera(camera)
+        target = Target(
+            url=url,
+            protocol=parts.scheme,
+            host=host or LOOPBACK,
+            port=port or protocol.default_port,
+            options=options,
+            delay_s=parse_delay_s(options["delay"]),
+        )
+        _check_combination(target)
     except UserError as error:
         raise UserError(f"{url}: {error}") from None
-    return Target(
-        url=url,
-        protocol=parts.scheme,
-        host=host or LOOPBACK,
-        port=port or protocol.default_port,
-        options=options,
-        delay_s=delay_s,
-    )
+    return target
+
+
+def _check_combination(target: Target) -> None:
+    if target.is_mouth_only and target.options.get("head") == "on":
+        raise UserError("only=mouth leaves the head to another program; leave out head=on")
+    if target.camera is not None and is_loopback(target.host) and target.camera[1] == target.port:
+        raise UserError(
+            f"camera must differ from the program's port {target.port}; set the tracker to send to"
+            " the port of camera"
+        )
 
 
 def _parse_options(url: str, query: str, protocol: type[TargetConnection]) -> dict[str, str]:

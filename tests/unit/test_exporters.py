@@ -2,6 +2,7 @@
 
 import csv
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"unknown format; .*\.mp4, .*\.png, .*\.csv"):
             open_exporter(output, ExportOptions())
         with pytest.raises(UserError, match=r"unknown format; .*\.fap, \.csv, \.jsonl"):
-            follow("", output, ListenFormat.FAPS, control="")
+            follow("", output, ListenFormat.FAPS, control=nullcontext(""))
         assert not output.exists()
 
 

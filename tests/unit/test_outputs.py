@@ -140,6 +140,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
             "--output does not apply to phones",
         ),
         ("express demo --hold 2", "--hold needs an expression"),
+        ("express joy:0.4", "for example joy=0.4"),
         ("run --stop-after", "--stop-after needs --play FILE"),
         ("run --track 2", "--track needs --play FILE"),
         ("head export . --head ada", "leave out --head"),

@@ -164,12 +164,16 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
         ("vmc", "write vmc://HOST"),
         ("vmc://me@host", "write vmc://HOST"),
         ("vmc://host:99999", "write vmc://HOST"),
+        ("vmc://host:0", "write vmc://HOST"),
         ("vmc://?delai=3", "use delay"),
         ("vmc://?shapes=fap", "vrm or arkit"),
         ("vts://?shapes=vrm", "unknown option"),
         ("vmc://?delay=-1", "milliseconds"),
         ("osc://?prefix=kouxing", "start with '/'"),
         (f"osc://?prefix=/{'a' * 64}", "longer than 64"),
+        ("vmc://?head=on&only=mouth", "leave out head=on"),
+        ("vmc://127.0.0.1:39539?camera=39539", "program's port 39539"),
+        ("livelink://localhost?camera=0.0.0.0:11111", "program's port 11111"),
     ],
 )
 def test_error_of_an_invalid_address(url: str, reason: str) -> None:
