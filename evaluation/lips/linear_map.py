@@ -26,7 +26,7 @@ from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.closures import DetectionCounts, closures
 from kouxing.evaluation.lips.curve_tables import CurveTable
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import CURVES, predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import CURVES, clip_mouth, predicted_mouth, real_faps
 from kouxing.shared.face.faps import NUM_FAPS
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ def _best_constant(
     linear: LinearMap, clips: Sequence[LipClip], tables: Mapping[str, CurveTable]
 ) -> float:
     """Return the constant of the opening with the best F1 of closures on some clips."""
-    reals = [real_mouth(clip.time_s, real_faps(clip)) for clip in clips]
+    reals = [clip_mouth(clip) for clip in clips]
     predicted = [
         linear.faps(tables[clip.name], np.arange(0.0, clip.time_s[-1], 1.0 / FRAME_RATE_HZ))
         for clip in clips

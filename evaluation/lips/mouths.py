@@ -60,6 +60,11 @@ def real_mouth(time_s: Array, faps: Array) -> Mouth:
     return Mouth(time_s[is_known], curves, opening < low + _CLOSED_FRACTION * (high - low))
 
 
+def clip_mouth(clip: LipClip) -> Mouth:
+    """Return the tracked mouth of a clip."""
+    return real_mouth(clip.time_s, real_faps(clip))
+
+
 def real_faps(clip: LipClip) -> Array:
     """Return the tracked FAPs of a clip, (num_frames, 68), NaN where not measured."""
     faps = np.full((len(clip.time_s), NUM_FAPS), np.nan)

@@ -17,7 +17,7 @@ from kouxing.evaluation.lips.agreement import moments
 from kouxing.evaluation.lips.curve_tables import CurveTable, fap_conversion, read_tables
 from kouxing.evaluation.lips.linear_map import fit_map
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
 
 Array = NDArray[np.float64]
 MouthFunction = Callable[[LipClip], Mouth]
@@ -60,7 +60,7 @@ def _program_faps(
     def faps(clip: LipClip, time_s: Array, delay_s: float) -> Array:
         return shipped.faps(tables[clip.name].at(time_s + delay_s))
 
-    reals = [real_mouth(clip.time_s, real_faps(clip)) for clip in fitting]
+    reals = [clip_mouth(clip) for clip in fitting]
 
     def agreement(delay_s: float) -> float:
         pairs = [

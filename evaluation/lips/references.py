@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips, training_clips
 from kouxing.corpora.scoring import final_hypothesis
 from kouxing.evaluation.lips.curves import is_near
-from kouxing.evaluation.lips.mouths import CURVES, Mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import CURVES, Mouth, clip_mouth, real_faps
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import training_clip_names
 from kouxing.shared.errors import UserError
@@ -113,7 +113,7 @@ def reference_of(
     """Return the reference of a clip, with a live recognizer's output for its audio."""
     return Reference(
         clip=clip,
-        mouth=real_mouth(clip.time_s, real_faps(clip)),
+        mouth=clip_mouth(clip),
         phones=aligned or final_hypothesis(events),
         voice=[event for event in events if isinstance(event, SpeechChange)],
         visemes=inventory.visemes,

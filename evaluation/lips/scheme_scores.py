@@ -30,7 +30,7 @@ from kouxing.evaluation.lips.four_schemes import (
     make_frames,
 )
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import clip_mouth, predicted_mouth, real_mouth
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.alignment import drop_pauses
@@ -112,7 +112,7 @@ def _pairs_with_tracked(
 ) -> list[MouthPair]:
     clips = [sentence.sentence.clip for sentence in sentences]
     return [
-        (predicted_mouth(faps), real_mouth(clip.time_s, real_faps(clip)))
+        (predicted_mouth(faps), clip_mouth(clip))
         for faps, clip in zip(frames, clips, strict=True)
         if faps is not None and len(clip.time_s)
     ]

@@ -12,7 +12,7 @@ from pathlib import Path
 from kouxing.evaluation.source_tree import ROOT
 
 _PACKAGES = {"kouxing": "", "kouxing_client": "clients/python/kouxing_client"}
-_SOURCES = {".py", ".js", ".mjs", ".ts", ".json", ".toml", ".tsv", ".npz", ".txt"}
+_SOURCES = {".py", ".js", ".mjs", ".ts", ".html", ".json", ".toml", ".tsv", ".npz", ".txt"}
 _INSTALLED = {"node_modules", ".venv"}
 
 

@@ -137,7 +137,7 @@ STEPS: Mapping[str, Step] = {
     "faults": Step(("evaluate faults",), ("evaluation/system/faults.py", *_SERVICES), ()),
     "browser": Step(
         (f"bench lips-page {SAMPLE.relative_to(ROOT)} --clips {{lips}}",),
-        ("clients/kouxing-lips", "evaluation/system/lips_page.py"),
+        ("clients/kouxing-lips", "evaluation/system/lips_page.*"),
         (f"bench lips-page {SAMPLE.relative_to(ROOT)}",),
     ),
     "package": Step(

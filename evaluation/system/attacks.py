@@ -12,7 +12,6 @@ On Linux only: memory is read from ``/proc``.
 import contextlib
 import multiprocessing
 import os
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,7 +26,7 @@ from rich.console import Console
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import stream
-from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.system.systems import LocalSystem, run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -101,7 +100,7 @@ def measure(path: Path, console: Console) -> list[AttackResult]:
     length_s = len(PHASES) * PHASE_S + 2 * SESSION_START_S
     speech = np.resize(to_16_khz(*read_audio(path)), round(length_s * MEDIA_RATE_HZ))
     runs = [(name, target) for name, attack in ATTACKS.items() for target in attack.targets]
-    with tempfile.TemporaryDirectory() as folder, LocalSystem(Path(folder), console) as system:
+    with run_all_services(console) as system:
         _delays_ms(system.control, speech)  # the first session of a process is slow
         results = []
         for number, (name, target) in enumerate(runs, start=2):

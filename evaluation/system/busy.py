@@ -10,7 +10,6 @@ import contextlib
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.load import SETTLE_S, LoadGenerator, Speaker
-from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.system.systems import run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.audio_file import read_audio
@@ -117,11 +116,7 @@ def measure(
     speech = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
     runs: list[BusyRun] = []
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        LocalSystem(Path(folder), console) as system,
-        connect_client(system.control) as client,
-    ):
+    with run_all_services(console) as system, connect_client(system.control) as client:
         processes = {name: system.supervisor.process(name).pid for name in KINDS}
         time.sleep(SETTLE_S)
         idle = _measure_usage(processes, lambda: time.sleep(QUIET_S))

@@ -12,7 +12,6 @@ CPU time is measured by the processes, per second of audio.
 """
 
 import math
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from rich.console import Console
 
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK_S, speak
-from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.system.systems import run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
@@ -53,11 +52,7 @@ def measure(path: Path, console: Console, language: str | None = None) -> Latenc
     """
     sound = to_16_khz(*read_audio(path))
     delay_s = SynthesizerConfig().delay_ms / 1e3
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        LocalSystem(Path(folder), console) as system,
-        connect_client(system.control) as client,
-    ):
+    with run_all_services(console) as system, connect_client(system.control) as client:
         before = _cpu_s(client)
         delays = [stream(client, sound, delay_s, language)[1:] for _ in range(NUM_REPEATS)]
         time.sleep(1.0)  # for the last heartbeats

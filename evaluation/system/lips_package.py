@@ -21,7 +21,7 @@ from rich.progress import track
 from kouxing.corpora.scoring import ErrorCounts, count_errors
 from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, animate_live
-from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import clip_mouth, predicted_mouth
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording, align_corpus
 from kouxing.evaluation.rivals.tables import find_node
@@ -161,7 +161,7 @@ def _compare_lips(models: Path, folder: Path) -> tuple[int, dict[str, Agreement]
     clips = clips_to_score(folder, language=None)
     pairs: dict[str, list[Any]] = {SERVER: [], PACKAGE: []}
     for clip in track(clips, "clips", console=CONSOLE, transient=True):
-        real = real_mouth(clip.time_s, real_faps(clip))
+        real = clip_mouth(clip)
         faps = {
             SERVER: server_faps(server_events(clip.samples)),
             PACKAGE: package_faps(package_output(models, clip.samples)),

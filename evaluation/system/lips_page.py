@@ -30,7 +30,7 @@ from rich.progress import track
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
 from kouxing.evaluation.lips.references import read_parts
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.rivals.tables import find_node
@@ -46,6 +46,7 @@ Array = NDArray[np.float64]
 OURS = "kouxing-lips"
 _NONE = "none"  # a page without lip sync
 _OURS_FOLDER = ROOT / "clients" / OURS
+_PAGE = ROOT / "evaluation" / "system" / "lips_page.html"
 MEASURE_S = 20.0
 _SIZE_PX = (400, 300)
 _CODE = ("index.js", "worker.js", "worklet.js", "frame-track.js", "engine")
@@ -60,72 +61,6 @@ _DOWNLOADS = {  # patterns of files
     "wLipSync": (f"{_PACKAGES}/wlipsync/dist/wlipsync-single.js", "wlipsync-profile.json"),
     "wawa-lipsync": (f"{_PACKAGES}/wawa-lipsync/dist/wawa-lipsync.es.js",),
 }
-_PAGE = """<!doctype html><link rel="icon" href="data:,"><button id="start">Start</button>
-<script type="importmap">{ "imports": {
-  "@met4citizen/headaudio": "./packages/@met4citizen/headaudio/dist/headaudio.min.mjs",
-  "wlipsync": "./packages/wlipsync/dist/wlipsync-single.js",
-  "wawa-lipsync": "./packages/wawa-lipsync/dist/wawa-lipsync.es.js"
-} }</script>
-<script type="module">
-import { LipSync } from "./index.js";
-import { headAudio, wLipSync, wawa } from "./rivals.js";
-const STARTS = { "kouxing-lips": ours, HeadAudio: headAudio, wLipSync, "wawa-lipsync": wawa, none };
-const names = new URL(location).searchParams.getAll("name");
-const openingOf = ({ faps }) => { const now = faps(); return now ? -now[3] - now[4] : 0; };
-window.delays = [];
-function none(context) {
-  return { node: new GainNode(context), faps: () => null };
-}
-async function ours(context) {
-  const lips = await LipSync.create({ context });
-  lips.addEventListener("frames", ({ detail: { frames, startS } }) => {
-    for (const { timeS } of frames) window.delays.push(context.currentTime - startS - timeS);
-  });
-  const node = new GainNode(context);
-  await lips.listenTo(node);
-  return { node, faps: () => lips.current?.faps };
-}
-document.getElementById("start").onclick = async () => {
-  const startMs = performance.now();
-  const context = new AudioContext({ latencyHint: "interactive" });
-  const packages = [];
-  for (const name of names) packages.push(await STARTS[name](context));
-  window.loadedMs = performance.now() - startMs;
-  if (names.length > 1) {
-    window.play = (url) => play(context, packages, url);
-    return;
-  }
-  const [lips] = packages;
-  const stream = await navigator.mediaDevices.getUserMedia({ audio: true });
-  new MediaStreamAudioSourceNode(context, { mediaStream: stream }).connect(lips.node);
-  const draw = () => {
-    requestAnimationFrame(draw);
-    if (openingOf(lips) > 100) window.movedMs ??= performance.now() - startMs;
-  };
-  draw();
-};
-async function play(context, packages, url) {
-  const buffer = await context.decodeAudioData(await (await fetch(url)).arrayBuffer());
-  const source = new AudioBufferSourceNode(context, { buffer });
-  for (const { node } of packages) source.connect(node);
-  await new Promise((done) => setTimeout(done, 700)); // all mouths rest
-  const startS = context.currentTime;
-  source.start(startS);
-  const rows = [];
-  await new Promise((done) => {
-    const timer = setInterval(() => {
-      const timeS = context.currentTime - startS;
-      rows.push([timeS, ...packages.map(openingOf)]);
-      if (timeS < buffer.duration + 0.4) return;
-      clearInterval(timer);
-      done();
-    }, 20);
-  });
-  source.disconnect();
-  window.rows = rows;
-}
-window.isReady = true;
-</script>"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,6 +80,30 @@ class LipsPage:
     closure_f1: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class _Site:
+    """A web site with the page and all packages."""
+
+    folder: Path
+    origin: str
+    voice: Path  # recording that the microphone plays
+
+    @contextmanager
+    def open_page(self, names: Sequence[str]) -> Iterator[Chromium]:
+        """Open the page with some packages, and start them."""
+        with tempfile.TemporaryDirectory(dir=self.folder, ignore_cleanup_errors=True) as profile:
+            browser = Chromium(Path(profile), _SIZE_PX, self.voice)
+            try:
+                query = "&".join(f"name={name}" for name in names)
+                browser.command("Page.navigate", url=f"{self.origin}/?{query}")
+                browser.wait_for("window.isReady")
+                browser.click("start")
+                browser.wait_for("window.loadedMs")
+                yield browser
+            finally:
+                browser.close()
+
+
 def measure(audio: Path, clips: Path | None = None) -> list[LipsPage]:
     """Measure kouxing-lips, then other packages if ``npm ci`` has installed them.
 
@@ -158,25 +117,22 @@ def measure(audio: Path, clips: Path | None = None) -> list[LipsPage]:
     if has_rivals:
         names = [*_DOWNLOADS]
         profile = _wlipsync_profile(_recordings(training) if clips else _demo_samples())
-    with _build_site(profile) as folder:
-        voice = folder / "voice.wav"
-        write_microphone(audio, voice)
-        try:
-            with serve_folder(folder) as origin:
-                with _page(folder, voice, origin, [_NONE]) as browser:
-                    page_share = _processor_share(browser)
-                pages = [
-                    _measure_page(folder, voice, origin, name, page_share)
-                    for name in track(names, description="packages", transient=True)
-                ]
-                return _with_accuracy(pages, folder, voice, origin, held_out)
-        except TimeoutError as error:
-            raise UserError(f"the page did not respond in time: {error}") from None
+    try:
+        with _serve_site(audio, profile) as site:
+            with site.open_page([_NONE]) as browser:
+                page_share = _processor_share(browser)
+            pages = [
+                _measure_page(site, name, page_share)
+                for name in track(names, description="packages", transient=True)
+            ]
+            return _with_accuracy(pages, site, held_out) if held_out else pages
+    except TimeoutError as error:
+        raise UserError(f"the page did not respond in time: {error}") from None
 
 
 @contextmanager
-def _build_site(profile: bytes | None) -> Iterator[Path]:
-    """Write the page with all packages, and the profile of wLipSync, to a temporary folder."""
+def _serve_site(audio: Path, profile: bytes | None) -> Iterator[_Site]:
+    """Serve the page with all packages, and the profile of wLipSync, from a temporary folder."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
         for file in _CODE:
@@ -186,13 +142,15 @@ def _build_site(profile: bytes | None) -> Iterator[Path]:
         (folder / _PACKAGES).symlink_to(_OURS_FOLDER / "node_modules")
         (folder / "rivals.js").symlink_to(_OURS_FOLDER / "demo" / "rivals.js")
         (folder / "visemes.tsv").symlink_to(ROOT / "shared/face/high_level.tsv")
+        (folder / "index.html").symlink_to(_PAGE)
         (folder / "models").mkdir()
         for file, content in web_model().items():
             (folder / "models" / file).write_bytes(content)
-        (folder / "index.html").write_text(_PAGE, encoding="utf-8")
         if profile is not None:
             (folder / "wlipsync-profile.json").write_bytes(profile)
-        yield folder
+        write_microphone(audio, folder / "voice.wav")
+        with serve_folder(folder) as origin:
+            yield _Site(folder, origin, folder / "voice.wav")
 
 
 def _recordings(clips: Sequence[LipClip]) -> list[NDArray[np.float32]]:
@@ -218,22 +176,6 @@ def _wlipsync_profile(recordings: Iterable[NDArray[np.float32]]) -> bytes:
     return done.stdout
 
 
-@contextmanager
-def _page(folder: Path, voice: Path, origin: str, names: Sequence[str]) -> Iterator[Chromium]:
-    """Open the page with some packages, and start them."""
-    with tempfile.TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as profile:
-        browser = Chromium(Path(profile), _SIZE_PX, voice)
-        try:
-            query = "&".join(f"name={name}" for name in names)
-            browser.command("Page.navigate", url=f"{origin}/?{query}")
-            browser.wait_for("window.isReady")
-            browser.click("start")
-            browser.wait_for("window.loadedMs")
-            yield browser
-        finally:
-            browser.close()
-
-
 def _processor_share(browser: Chromium) -> float:
     """Measure the processor time of the page, as a fraction of one core."""
     start_s, start_cpu_s = time.monotonic(), browser.cpu_s("renderer")
@@ -241,13 +183,13 @@ def _processor_share(browser: Chromium) -> float:
     return (browser.cpu_s("renderer") - start_cpu_s) / (time.monotonic() - start_s)
 
 
-def _measure_page(folder: Path, voice: Path, origin: str, name: str, page_share: float) -> LipsPage:
-    with _page(folder, voice, origin, [name]) as browser:
+def _measure_page(site: _Site, name: str, page_share: float) -> LipsPage:
+    with site.open_page([name]) as browser:
         browser.wait_for("window.movedMs")
         browser.evaluate("window.delays.length = 0")
         processor_share = _processor_share(browser)
         delays_ms = 1e3 * np.array(browser.evaluate("window.delays"))
-        files = {path for pattern in _DOWNLOADS[name] for path in folder.glob(pattern)}
+        files = {path for pattern in _DOWNLOADS[name] for path in site.folder.glob(pattern)}
         return LipsPage(
             name=name,
             download_bytes=sum(len(gzip.compress(path.read_bytes())) for path in files),
@@ -260,20 +202,18 @@ def _measure_page(folder: Path, voice: Path, origin: str, name: str, page_share:
 
 
 def _with_accuracy(
-    pages: Sequence[LipsPage], folder: Path, voice: Path, origin: str, clips: Sequence[LipClip]
+    pages: Sequence[LipsPage], site: _Site, clips: Sequence[LipClip]
 ) -> list[LipsPage]:
     """Add the figures of the clips."""
-    if not clips:
-        return list(pages)
     played_clips = []
-    with _page(folder, voice, origin, [page.name for page in pages]) as browser:
+    with site.open_page([page.name for page in pages]) as browser:
         browser.wait_for("window.play !== undefined")
         for number, clip in enumerate(track(clips, description="clips", transient=True)):
-            write_wav(folder / f"{number}.wav", clip.samples[:, np.newaxis], SAMPLE_RATE_HZ)
+            write_wav(site.folder / f"{number}.wav", clip.samples[:, np.newaxis], SAMPLE_RATE_HZ)
             browser.evaluate(f"window.rows = null; window.play('{number}.wav'); 1")
             browser.wait_for("window.rows !== null", 60.0 * clip.minutes + _LIMIT_S)
             rows = np.array(browser.evaluate("window.rows"))
-            played_clips.append((rows, real_mouth(clip.time_s, real_faps(clip))))
+            played_clips.append((rows, clip_mouth(clip)))
     return [_add_accuracy(page, column, played_clips) for column, page in enumerate(pages, 1)]
 
 

@@ -7,7 +7,6 @@ as late.
 """
 
 import os
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +21,7 @@ from rich.console import Console
 from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK, CHUNK_S
-from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.evaluation.system.systems import run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -116,10 +115,7 @@ def measure(
     settings = {"KOUXING_CONTROL_MAX_SESSIONS": "2000"}  # so that only load causes refusals
     delay_s = read_settings().load(SynthesizerConfig).delay_ms / 1e3
     steps: list[Step] = []
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        LocalSystem(Path(folder), console, settings=settings) as system,
-    ):
+    with run_all_services(console, settings) as system:
         for num in step_sizes(num_sessions):
             steps.append(_step(system.control, speech, num, step_s, delay_s, language))
             time.sleep(PAUSE_S)

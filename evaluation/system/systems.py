@@ -4,8 +4,9 @@ import contextlib
 import os
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Self
 
@@ -126,6 +127,18 @@ class LocalSystem(System):
         """Return the id of the process that serves a session."""
         is_spare = self.instance_of(session, service) == SPARE
         return self.supervisor.process(self._spare_name if is_spare else service).pid
+
+
+@contextlib.contextmanager
+def run_all_services(
+    console: Console, settings: Mapping[str, str] | None = None
+) -> Iterator[LocalSystem]:
+    """Run all services on free ports of this host. Their logs are deleted at the end."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        LocalSystem(Path(folder), console, settings=settings) as system,
+    ):
+        yield system
 
 
 class HostsSystem(System):
