@@ -254,7 +254,7 @@ def lips_package(
     from kouxing.evaluation.system.lips_package import compare
 
     check_output(json_file, force=force)
-    results = asdict(compare(clips, corpus))
+    results = compare(clips, corpus)
     show_results(json_file, results, system_table(package=results))
 
 

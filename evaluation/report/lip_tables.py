@@ -197,28 +197,22 @@ def better_programs(faces: Figures) -> list[list[str]]:
     rows = []
     for group, group_title in _COMPARED_GROUPS.items():
         real = faces[REAL][CLEAN].get(group, {})
+        of_group = {face: scores[face].get(group, {}) for face in (own, *others)}
         for measure, name in _MEASURE_NAMES.items():
-            if measure in _REALISM_MEASURES and group != ALL:
+            is_realism = measure in _REALISM_MEASURES
+            if is_realism and (group != ALL or real.get(measure) is None):
                 continue
-            values = {face: scores[face].get(group, {}).get(measure) for face in (own, *others)}
             losses = {
-                face: _loss(measure, value, real.get(measure))
-                for face, value in values.items()
-                if value is not None and (measure in _COMPARED or real.get(measure) is not None)
+                face: _loss(measure, values[measure], real.get(measure))
+                for face, values in of_group.items()
+                if values.get(measure) is not None
             }
-            best = min(losses, key=lambda face: losses[face], default=own)
+            best = min(losses, key=losses.__getitem__, default=own)
             if own in losses and losses[best] < losses[own]:
-                figures = [_format_compared(measure, values[face]) for face in (best, own)]
-                if "precision" in measure:
-                    recalls = (scores[face][group].get("closure_recall") for face in (best, own))
-                    figures = [
-                        f"{figure}, recall {format_number(recall)}"
-                        for figure, recall in zip(figures, recalls, strict=True)
-                    ]
-                if measure in _REALISM_MEASURES:
-                    figures.append(f"real lips {_format_compared(measure, real[measure])}")
-                program, ours = title_of(best), ", ".join(figures[1:])
-                rows.append([f"{group_title}, {name}", program, figures[0], ours])
+                theirs, ours = (_describe(measure, of_group[face]) for face in (best, own))
+                if is_realism:
+                    ours += f", real lips {_describe(measure, real)}"
+                rows.append([f"{group_title}, {name}", title_of(best), theirs, ours])
     return rows
 
 
@@ -229,10 +223,12 @@ def _loss(measure: str, value: float, real: float | None) -> float:
     return -value if _COMPARED[measure][1] else value
 
 
-def _format_compared(measure: str, value: float | None) -> str:
-    if measure.endswith("_ms"):
-        return f"{format_number(value, '.0f')} ms"
-    return format_number(value, ".0f" if measure in ("rest_opening", "phone_spread") else ".2f")
+def _describe(measure: str, scores: Figures) -> str:
+    """Return a figure with its unit; a precision also with the recall."""
+    if measure in _WHOLE_MEASURES:
+        return f"{scores[measure]:.0f}" + (" ms" if measure.endswith("_ms") else "")
+    recall = f", recall {format_number(scores.get('closure_recall'))}"
+    return f"{scores[measure]:.2f}" + (recall if "precision" in measure else "")
 
 
 def disturbed_lips(faces: Figures) -> list[str]:

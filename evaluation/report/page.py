@@ -5,14 +5,13 @@
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from kouxing.corpora.figures import new_figure, save_figure
 from kouxing.evaluation.report import lip_tables, paper_tables, recognition_table, system_tables
-from kouxing.evaluation.report.markdown import bullets, markdown
 from kouxing.evaluation.report.steps import STEPS
 from kouxing.evaluation.tables import Figures, Table
 
@@ -70,6 +69,17 @@ def write_page(folder: Path, page: Path) -> None:
     page.write_text(parts, encoding="utf-8")
     if "lookahead" in results:
         save_figure(_lookahead_figure(results["lookahead"]), page.with_name(PICTURE))
+
+
+def markdown(table: Table) -> str:
+    """Return a table in Markdown."""
+    lines = [table.columns, ["---"] * len(table.columns), *table.rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def bullets(sentences: Iterable[str]) -> str:
+    """Return a list in Markdown."""
+    return "".join(f"- {sentence}\n" for sentence in sentences)
 
 
 def _render_table(name: str, steps: Figures, results: Figures) -> str:

@@ -10,7 +10,6 @@ import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,18 +44,6 @@ SERVER, PACKAGE, DIFFERENCE = "server", "package", "difference"
 _SCRIPT = ROOT / "clients/kouxing-lips/demo/frames.mjs"
 _PHONES = {"light": True, "blocks": "final"}  # the package's option for each acoustic model
 _LIMIT_S = 600.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
-    """Figures of the server and of the package, by these names."""
-
-    num_clips: int
-    opening_correlation: dict[str, float | None]
-    closure_f1: dict[str, float | None]
-    num_recordings: int
-    # by acoustic model; "difference" is between package and server
-    phone_error_rate: dict[str, dict[str, float]]
 
 
 @contextmanager
@@ -131,9 +118,11 @@ def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> F
     return np.array([faps for _, faps in animate_live(face, events)])
 
 
-def compare(clips: Path, corpus: Path | None = None) -> Comparison:
+def compare(clips: Path, corpus: Path | None = None) -> dict[str, Any]:
     """Compare on held-out clips with tracked lips and, if given, the split test of a corpus.
 
+    Returns figures for a JSON file. Those of the lips have the keys ``server`` and ``package``. The
+    phone error rates, by acoustic model, also have ``difference``, between package and server.
     Raises ``UserError`` if a folder has no recordings, if Node is not installed, or outside a
     checkout, which has the package.
     """
@@ -143,18 +132,16 @@ def compare(clips: Path, corpus: Path | None = None) -> Comparison:
     with exported_models() as models:
         num_clips, agreements = _compare_lips(models, clips)
         counts = {name: _compare_phones(models, references, name) for name in _PHONES if references}
-    return Comparison(
-        num_clips=num_clips,
-        opening_correlation={
-            name: figures.correlation["opening"] for name, figures in agreements.items()
-        },
-        closure_f1={name: figures.closure_f1 for name, figures in agreements.items()},
-        num_recordings=len(references),
-        phone_error_rate={
+    return {
+        "num_clips": num_clips,
+        "opening_correlation": {name: a.correlation["opening"] for name, a in agreements.items()},
+        "closure_f1": {name: a.closure_f1 for name, a in agreements.items()},
+        "num_recordings": len(references),
+        "phone_error_rate": {
             model: {name: errors.rate for name, errors in by_name.items()}
             for model, by_name in counts.items()
         },
-    )
+    }
 
 
 def _compare_lips(models: Path, folder: Path) -> tuple[int, dict[str, Agreement]]:
