@@ -51,6 +51,13 @@ def samples_of_file(path: Path) -> NDArray[np.float32]:
 
 
 HELLO = samples_of_file(DEMO / "hello-female.wav")[:24_000]  # 1.5 s
+# Runs the command line. A shell's background processes ignore Ctrl-C, and so do their children.
+CTRL_C_COMMAND = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from kouxing.__main__ import main
+main()
+"""
 
 
 def free_port() -> int:

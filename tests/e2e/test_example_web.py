@@ -20,12 +20,6 @@ EXAMPLES = ROOT / "examples"
 
 
 @pytest.fixture(scope="module")
-def control() -> Iterator[PageControl]:
-    with PageControl() as control:
-        yield control
-
-
-@pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The example's page with an avatar; yields the origin."""
     folder = tmp_path_factory.mktemp("site")

@@ -16,6 +16,7 @@ import pytest
 
 from tests.e2e.conftest import CommandRunner
 from tests.system import (
+    CTRL_C_COMMAND,
     LIGHT_MODEL,
     LIMIT_S,
     ONE_THREAD,
@@ -28,13 +29,6 @@ from tests.system import (
 )
 
 SENTENCE = VOWELS_FILE
-# A shell's background processes ignore Ctrl-C, and so do their children.
-COMMAND = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from kouxing.__main__ import main
-main()
-"""
 CTRL_C_AT_FIRST_IMAGE = """
 import signal
 from kouxing.services.driver.video.video_writer import VideoWriter
@@ -139,7 +133,7 @@ def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
     }
     control = tmp_path / "out" / "logs" / "control.log"
     with subprocess.Popen(
-        [sys.executable, "-c", COMMAND, "run", "--no-browser", "--port", "0"],
+        [sys.executable, "-c", CTRL_C_COMMAND, "run", "--no-browser", "--port", "0"],
         env=os.environ | environment,
         cwd=tmp_path,
         stderr=subprocess.PIPE,
@@ -157,8 +151,9 @@ def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_render_leaves_no_file(tmp_path: Path) -> None:
+    program = CTRL_C_AT_FIRST_IMAGE + CTRL_C_COMMAND
     result = subprocess.run(
-        [sys.executable, "-c", CTRL_C_AT_FIRST_IMAGE + COMMAND, "render", SENTENCE, "face.mp4"],
+        [sys.executable, "-c", program, "render", SENTENCE, "face.mp4"],
         env=os.environ | ONE_THREAD | {"PYTHONPATH": str(ROOT)},
         cwd=tmp_path,
         capture_output=True,

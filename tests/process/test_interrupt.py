@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system import LIMIT_S, ROOT, VOWELS_FILE, start_python
+from tests.system import CTRL_C_COMMAND, LIMIT_S, ROOT, VOWELS_FILE, start_python
 
 INSTALL = """
 import signal
@@ -43,7 +43,7 @@ with catch_interrupt():
     signal.raise_signal(signal.SIGINT)
 print(signal.getitimer(signal.ITIMER_REAL))
 """
-# `COMMAND` runs as the command line, with Ctrl-C in a function that FFmpeg calls.
+# `CTRL_C_COMMAND` runs as the command line, with Ctrl-C in a function that FFmpeg calls.
 INTERRUPT_IN_FFMPEG = """
 import signal
 from kouxing.shared import media_file
@@ -118,12 +118,6 @@ RECIPES = (
     *("bench load --json {out}/a.json", "bench busy --json {out}/a.json"),
     "evaluate attacks --json {out}/a.json",
 )
-COMMAND = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from kouxing.__main__ import main
-main()
-"""
 
 
 @pytest.mark.parametrize(
@@ -141,13 +135,13 @@ def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) 
 
 @pytest.mark.parametrize("place", ["FFmpeg", "import", "shutdown", "options"])
 def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) -> None:
-    program, path = COMMAND, str(ROOT)
+    program, path = CTRL_C_COMMAND, str(ROOT)
     if place == "FFmpeg":
-        program = INTERRUPT_IN_FFMPEG + COMMAND
+        program = INTERRUPT_IN_FFMPEG + CTRL_C_COMMAND
     elif place == "shutdown":
-        program = HANG_IN_SHUTDOWN + INTERRUPT_IN_FFMPEG + COMMAND
+        program = HANG_IN_SHUTDOWN + INTERRUPT_IN_FFMPEG + CTRL_C_COMMAND
     elif place == "options":
-        program = INTERRUPT_IN_OPTIONS + COMMAND
+        program = INTERRUPT_IN_OPTIONS + CTRL_C_COMMAND
     else:
         (tmp_path / "onnxruntime.py").write_text(INTERRUPT_IN_IMPORT)
         path = f"{tmp_path}{os.pathsep}{ROOT}"

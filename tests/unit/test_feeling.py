@@ -9,16 +9,8 @@ from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.phones.events import Progress, SpeechChange
 from tests.lips import DELAY_S, LIPS, lip_gaps, phone
 
-BROW, LID, CORNER, PITCH, JAW = (
-    FAP_NUMBER[name] - 1
-    for name in (
-        "raise_l_m_eyebrow",
-        "close_t_l_eyelid",
-        "raise_l_cornerlip",
-        "head_pitch",
-        "open_jaw",
-    )
-)
+NAMES = "raise_l_m_eyebrow close_t_l_eyelid raise_l_cornerlip head_pitch open_jaw"
+BROW, LID, CORNER, PITCH, JAW = (FAP_NUMBER[name] - 1 for name in NAMES.split())
 FRAME_S = 0.02
 CLOSED = 20.0  # FAP units between lips
 

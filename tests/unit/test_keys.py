@@ -130,35 +130,37 @@ def test_creates_no_key_for_control_on_another_machine() -> None:
     assert load_key("lamp", ("service:lamp",), control="tcp://127.0.0.1:5550")
 
 
+def use_other_secret(path: Path) -> None:
+    own, other = load_key("lamp", ()).secret, load_key("client", ()).secret
+    path.write_text(path.read_text().replace(own, other))
+
+
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("name", "damage", "message"),
     [
-        (lambda folder: (folder / "allowed").write_text(""), r"allowed does not allow .*rm .*lamp"),
+        ("allowed", lambda path: path.write_text(""), r"allowed does not allow .*rm .*lamp"),
         (
-            lambda folder: (folder / "lamp.key").write_text(
-                (folder / "lamp.key")
-                .read_text()
-                .replace(load_key("lamp", ()).secret, load_key("client", ()).secret)
-            ),
-            r"lamp\.key: the secret key .*run: kouxing keys revoke lamp; rm .*lamp\.key",
+            "lamp.key",
+            use_other_secret,
+            r"the secret key .*run: kouxing keys revoke lamp; rm .*lamp",
         ),
         (
-            lambda folder: (folder / "lamp.key").write_text(""),
-            r"lamp\.key is not a key file.*run: kouxing keys revoke lamp; rm -r .*lamp\.key",
+            "lamp.key",
+            lambda path: path.write_text(""),
+            r"is not a key file.*revoke lamp; rm -r .*lamp",
         ),
-        (
-            lambda folder: (folder / "control.key").write_text("{"),
-            r"control\.key .*rm -r .*kouxing",
-        ),
-        (lambda folder: (folder / "control.key").unlink(), r"control\.key .*rm -r .*kouxing"),
-        (lambda folder: (folder / "lamp.key").unlink(), r"another key has the name 'lamp'"),
-        (lambda folder: (folder / "lamp.key").chmod(0), r"no permission .*chmod 600 .*lamp"),
-        (lambda folder: (folder / "allowed").write_text("no key"), r"delete this line.*rm -r "),
+        ("control.key", lambda path: path.write_text("{"), r"control\.key .*rm -r .*kouxing"),
+        ("control.key", Path.unlink, r"control\.key .*rm -r .*kouxing"),
+        ("lamp.key", Path.unlink, r"another key has the name 'lamp'"),
+        ("lamp.key", lambda path: path.chmod(0), r"no permission .*chmod 600 .*lamp"),
+        ("allowed", lambda path: path.write_text("no key"), r"delete this line.*rm -r "),
     ],
 )
-def test_checks_the_keys_of_a_system(damage: Callable[[Path], object], message: str) -> None:
+def test_checks_the_keys_of_a_system(
+    name: str, damage: Callable[[Path], object], message: str
+) -> None:
     check_keys({"lamp": ("service:lamp",), "control": ()})
-    damage(key_folder())
+    damage(key_folder() / name)
     with pytest.raises(UserError, match=message):
         check_keys({"lamp": ("service:lamp",), "control": ()})
 
