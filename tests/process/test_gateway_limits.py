@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import socket
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -30,7 +30,6 @@ LONG = b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n"
 SLOW = b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n"
 UPGRADE = b"GET /long HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: upgrade\r\n\r\n"
 SDP = {"Content-Type": "application/sdp"}
-CHECK_S = 0.01
 UNUSED: Any = None
 
 
@@ -41,7 +40,17 @@ class LimitedServer:
     address: tuple[str, int]
     now_s: float = 0.0
     writers: list[asyncio.StreamWriter] = field(default_factory=list)
+    open_answers: list[web.StreamResponse] = field(default_factory=list)
     has_ended: asyncio.Event = field(default_factory=asyncio.Event)  # the endless answer
+
+    async def never_end(self, request: web.Request) -> web.StreamResponse:
+        await request.read()
+        response = web.StreamResponse()
+        await response.prepare(request)
+        self.open_answers.append(response)
+        await response.write(b"begun")
+        await asyncio.sleep(3600)
+        return response
 
     async def write_endlessly(self, request: web.Request) -> web.StreamResponse:
         response = web.StreamResponse()
@@ -78,19 +87,10 @@ async def fail(request: web.Request) -> web.StreamResponse:
     raise {"value": ValueError, "other": RuntimeError}[request.query["error"]]
 
 
-async def never_end(request: web.Request) -> web.StreamResponse:
-    await request.read()
-    response = web.StreamResponse()
-    await response.prepare(request)
-    await response.write(b"begun")
-    await asyncio.sleep(3600)
-    return response
-
-
 @asynccontextmanager
 async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[LimitedServer]:
     """Serve with other limits; ``/long`` has no time limit."""
-    for name, limit in {"_CHECK_S": CHECK_S, "_SHUTDOWN_S": 0.01, **limits}.items():
+    for name, limit in {"_CHECK_S": 0.01, "_SHUTDOWN_S": 0.01, **limits}.items():
         monkeypatch.setattr(web_server, name, limit)
     bound = web_server.bind_port("127.0.0.1", 0)
     limited = LimitedServer(bound.getsockname())
@@ -101,9 +101,9 @@ async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterat
         [
             web.get("/", answer),
             web.get("/fail", fail),
-            web.get("/slow", never_end),
+            web.get("/slow", limited.never_end),
             web.get("/endless", limited.write_endlessly),
-            web.route("*", "/long", never_end),
+            web.route("*", "/long", limited.never_end),
         ]
     )
     await http_server.start(application, {"/long"})
@@ -128,22 +128,13 @@ async def wait_for_answers(*readers: asyncio.StreamReader) -> None:
         await asyncio.wait_for(reader.readuntil(b"begun"), LIMIT_S)
 
 
-async def check_open(*readers: asyncio.StreamReader) -> None:
-    """Check that endless answers continue."""
-    reading = [asyncio.ensure_future(reader.read()) for reader in readers]
-    ended, continuing = await asyncio.wait(reading, timeout=0.1)
-    assert not ended
-    for task in continuing:
-        task.cancel()
-
-
-async def pass_time(server: LimitedServer, ended: Awaitable[Any], timeout_s: float) -> None:
-    """Let time pass in steps until just after a timeout, and wait until something has ended."""
-    waiting = asyncio.ensure_future(ended)
-    for _ in range(11):
-        server.now_s += timeout_s / 10
-        await asyncio.wait([waiting], timeout=3 * CHECK_S)
-    await asyncio.wait_for(waiting, LIMIT_S)
+async def check_open(server: LimitedServer, *readers: asyncio.StreamReader) -> None:
+    """Check that endless answers continue: their next bytes arrive."""
+    for response in server.open_answers:
+        with contextlib.suppress(ConnectionError):
+            await response.write(b"more")
+    for reader in readers:
+        await asyncio.wait_for(reader.readuntil(b"more"), LIMIT_S)
 
 
 @async_test
@@ -166,7 +157,8 @@ async def test_closes_connections_without_a_request(
     async with serve(monkeypatch) as server:
         reader = await server.connect(part)
         assert await server.answers(), "it was accepted after the other one"
-        await pass_time(server, reader.read(), web_server.IDLE_TIMEOUT_S)
+        server.now_s += web_server.IDLE_TIMEOUT_S + 1.0
+        await asyncio.wait_for(reader.read(), LIMIT_S)
         assert await server.answers()
 
 
@@ -175,8 +167,9 @@ async def test_ends_slow_answers_except_on_unlimited_paths(monkeypatch: pytest.M
     async with serve(monkeypatch) as server:
         long, slow = await server.connect(LONG), await server.connect(SLOW)
         await wait_for_answers(long, slow)
-        await pass_time(server, slow.read(), web_server.ANSWER_TIMEOUT_S)
-        await check_open(long)
+        server.now_s += web_server.ANSWER_TIMEOUT_S + 1.0
+        await asyncio.wait_for(slow.read(), LIMIT_S)
+        await check_open(server, long)
 
 
 INCOMPLETE = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1"
@@ -201,8 +194,9 @@ async def test_a_body_has_a_deadline_and_its_answer_has_none(
         await wait_for_answers(*complete)
         incomplete = await server.connect(part)
         assert await server.answers()
-        await pass_time(server, read_to_end(incomplete), web_server.BODY_TIMEOUT_S)
-        await check_open(*complete)
+        server.now_s += web_server.BODY_TIMEOUT_S + 1.0
+        await read_to_end(incomplete)
+        await check_open(server, *complete)
     assert not caplog.records
 
 
@@ -231,7 +225,7 @@ async def test_a_client_takes_the_place_of_one_without_a_complete_request(
             server.now_s += 1.0
         late = [await server.connect(LONG, source) for source in ("127.0.0.1", "127.0.0.3")]
         await wait_for_answers(*late)
-        await check_open(*clients, *late)
+        await check_open(server, *clients, *late)
 
 
 @async_test
@@ -255,9 +249,10 @@ async def test_refuses_connections_while_all_places_have_complete_requests(
 @async_test
 async def test_ends_answers_that_are_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
     async with serve(monkeypatch) as server:
-        await server.connect(b"GET /endless HTTP/1.1\r\nHost: a\r\n\r\n")
-        assert await server.answers()
-        await pass_time(server, server.has_ended.wait(), web_server.ANSWER_TIMEOUT_S)
+        reader = await server.connect(b"GET /endless HTTP/1.1\r\nHost: a\r\n\r\n")
+        await asyncio.wait_for(reader.readexactly(1), LIMIT_S)
+        server.now_s += web_server.ANSWER_TIMEOUT_S + 1.0
+        await asyncio.wait_for(server.has_ended.wait(), LIMIT_S)
 
 
 CLIENTS: dict[str, Callable[[float], Handler]] = {

@@ -3,7 +3,6 @@
 import errno
 import math
 import socket
-import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -14,13 +13,16 @@ from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import Peer, key_folder, revoke_key
+from kouxing.shared.keys import key_folder, revoke_key
 from kouxing.shared.service import (
     EXIT_AFTER_S,
     HEARTBEAT_S,
+    IDLE_HEARTBEAT_S,
     MAX_LATE_S,
+    NO_REPLY_S,
     RESYNC_AFTER_S,
     SESSIONS_PER_HEARTBEAT,
+    TICK_S,
     Service,
 )
 from kouxing.shared.service_kind import ServiceKind
@@ -33,18 +35,42 @@ from tests.raw_bytes import answer_handshake
 from tests.samples import START
 from tests.system import LIMIT_S, wait_until
 
+STALL_S = HEARTBEAT_S + RESYNC_AFTER_S + 0.1
+
+
+class Clock:
+    """Replaces the module ``time`` in the loop of a service; a test lets the time pass."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def process_time(self) -> float:
+        return 0.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    new_clock = Clock()
+    for module in ("service", "message_loop"):
+        monkeypatch.setattr(f"kouxing.shared.{module}.time", new_clock)
+    return new_clock
+
 
 class SlowService(Service):
     """Takes 5 ms for a message; counts ticks, heartbeats and messages."""
 
     kind = ServiceKind(name="slow", role="worker")
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
         super().__init__(ServiceConfig(insecure=True), has_control=False)
+        self.clock = clock
         self.num_ticks = self.num_beats = self.num_handled = 0
         self.tick_due_s = math.inf
         self.input = self.bus.bind_router("tcp://127.0.0.1:*", "slow.input")
-        self.register(self.input, {Progress: self._on_progress})
+        self.register(self.input, {Progress: lambda *_: self.on_progress()})
 
     def on_tick(self, now_s: float) -> float:
         self.num_ticks += 1
@@ -53,9 +79,9 @@ class SlowService(Service):
     def deliver_heartbeat(self, heartbeat: Heartbeat) -> None:
         self.num_beats += 1
 
-    def _on_progress(self, _progress: Progress, _sender: Peer) -> None:
+    def on_progress(self) -> None:
         self.num_handled += 1
-        time.sleep(0.005)
+        self.clock.now_s += 0.005
 
 
 class ServiceWithKey(Service):
@@ -63,8 +89,8 @@ class ServiceWithKey(Service):
 
 
 @pytest.fixture
-def slow() -> Iterator[SlowService]:
-    service = SlowService()
+def slow(clock: Clock) -> Iterator[SlowService]:
+    service = SlowService(clock)
     yield service
     service.bus.close()
 
@@ -83,7 +109,9 @@ def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: SlowServic
     assert slow.num_beats >= 2
 
 
-def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: SlowService) -> None:
+def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(
+    slow: SlowService, clock: Clock
+) -> None:
     waits: list[float] = []
 
     def wait(timeout_s: float) -> list[Socket]:
@@ -93,16 +121,16 @@ def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(slow: Slow
     slow.wait = wait  # type: ignore[method-assign]
     slow.step(60.0)
     assert waits == [0.0], "the first tick and heartbeat are due"
-    slow._heartbeat_due_s = time.monotonic() + 30.0
     slow.step(60.0)
-    assert 20.0 < waits[-1] <= 30.0
+    assert waits[-1] == IDLE_HEARTBEAT_S
     assert slow.num_ticks == 1, "nothing is due"
-    slow._last_tick_s, slow.tick_due_s = 0.0, time.monotonic() + 20.0
+    clock.now_s += TICK_S
+    slow.tick_due_s = clock.now_s + 0.5
     slow.waker.wake()
     slow.step(60.0)
-    slow.step(60.0)
     assert slow.num_ticks == 2
-    assert 10.0 < waits[-1] <= 20.0
+    slow.step(60.0)
+    assert waits[-1] == pytest.approx(0.5)
 
 
 def test_answers_counts_and_drops_unexpected_messages(slow: SlowService) -> None:
@@ -117,15 +145,15 @@ def test_answers_counts_and_drops_unexpected_messages(slow: SlowService) -> None
     assert slow.metrics.snapshot(0.0)["dropped_unexpected"] == 1
 
 
-def test_drops_a_message_when_no_file_can_be_opened(slow: SlowService) -> None:
-    handle_progress = slow._on_progress
-
-    def open_nothing(progress: Progress, sender: Peer) -> None:
-        handle_progress(progress, sender)
+def test_drops_a_message_when_no_file_can_be_opened(
+    slow: SlowService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def open_nothing() -> None:
+        slow.num_handled += 1
         if slow.num_handled == 1:
             raise OSError(errno.EMFILE, "Too many open files")
 
-    slow._handlers[slow.input][Progress] = open_nothing
+    monkeypatch.setattr(slow, "on_progress", open_nothing)
     with Bus() as bus:
         sender = bus.connect_dealer(slow.input.endpoint)
         for _ in range(2):
@@ -153,7 +181,10 @@ class Worker(SessionService):
         self.endpoints = {"audio": self.input.endpoint}
         self.happened: list[str] = []
         self.names = [f"s{number}" for number in range(num_sessions)]
-        self.register(self.input, {Progress: lambda *_: self.happened.append("input")})
+        self.register(self.input, {Progress: lambda *_: self.on_progress()})
+
+    def on_progress(self) -> None:
+        self.happened.append("input")
 
     def stop_session(self, session: str) -> None:
         self.happened.append(f"stop {session}")
@@ -163,7 +194,7 @@ class Worker(SessionService):
 
 
 @pytest.fixture
-def worker(control: FakeControl) -> Iterator[Worker]:
+def worker(control: FakeControl, clock: Clock) -> Iterator[Worker]:
     new_worker = Worker(control.address)
     yield new_worker
     new_worker.bus.close()
@@ -173,56 +204,51 @@ def run_until(worker: Worker, condition: Callable[[], object]) -> None:
     wait_until(condition, step=lambda: worker.step(0.01))
 
 
-@pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a service wait longer for control on a busy machine."""
-    monkeypatch.setattr("kouxing.shared.service.REPLY_TIMEOUT_S", LIMIT_S)
-
-
-@pytest.mark.usefixtures("patient")
-def test_resyncs_with_control_after_a_stall(control: FakeControl, worker: Worker) -> None:
+def test_resyncs_with_control_after_a_stall(
+    control: FakeControl, worker: Worker, clock: Clock
+) -> None:
     run_until(worker, lambda: control.heartbeats)
     with Bus() as bus:
-        sender = bus.connect_dealer(worker.input.endpoint)
-        sender.send(Progress(level_db=0.0))
-        time.sleep(HEARTBEAT_S + RESYNC_AFTER_S + 0.1)
+        bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
+        assert worker.input.wait(LIMIT_S)
+        clock.now_s += STALL_S
         control.stops = ["s0"]
         run_until(worker, lambda: "input" in worker.happened)
     assert worker.happened[:2] == ["stop s0", "input"]
 
 
-@pytest.mark.usefixtures("patient")
 def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
-    control: FakeControl, worker: Worker, monkeypatch: pytest.MonkeyPatch
+    control: FakeControl, worker: Worker, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_until(worker, lambda: control.heartbeats)
 
-    def stall(*_: object) -> None:
+    def stall() -> None:
         control.stops = ["s0"]
-        time.sleep(HEARTBEAT_S + RESYNC_AFTER_S + 0.1)
+        clock.now_s += STALL_S
         worker.happened.append("input")
 
     def on_tick(_now_s: float) -> float:
         worker.happened.append("tick")
         return math.inf
 
-    worker._handlers[worker.input][Progress] = stall
+    monkeypatch.setattr(worker, "on_progress", stall)
     monkeypatch.setattr(worker, "on_tick", on_tick)
     with Bus() as bus:
         bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
-        run_until(worker, lambda: "input" in worker.happened)
+        run_until(worker, lambda: "tick" in worker.happened)
     after = worker.happened.index("input")
     assert worker.happened[after : after + 3] == ["input", "stop s0", "tick"]
 
 
 def test_a_restarted_control_learns_the_sessions(
-    monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker
+    monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker, clock: Clock
 ) -> None:
     start = replace(START, session="s0", epoch=3)
     monkeypatch.setattr(worker, "served_sessions", lambda: [start])
     run_until(worker, lambda: control.heartbeats)
     assert not control.messages_of(SessionStarted)
     control.name = "control-2"
+    clock.now_s += HEARTBEAT_S
     run_until(worker, lambda: control.messages_of(SessionStarted))
     assert [started.start for started in control.messages_of(SessionStarted)] == [start]
 
@@ -233,8 +259,9 @@ def test_a_restarted_control_learns_the_sessions(
 def test_registers_at_an_address_where_another_program_answered_before(
     monkeypatch: pytest.MonkeyPatch, curve: bool, rest: bytes
 ) -> None:
-    monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.3)
-    monkeypatch.setattr(Service, "_warn_about_control", lambda self: None)
+    for limit in ("NO_REPLY_S", "FIRST_REPLY_S"):
+        monkeypatch.setattr(f"kouxing.shared.service.{limit}", 0.3)
+    monkeypatch.setattr("kouxing.shared.service.reach_error", lambda *_, **__: "not asked")
     listener = socket.create_server(("127.0.0.1", 0))
     commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
     worker = Worker(commands)
@@ -253,17 +280,23 @@ def test_registers_at_an_address_where_another_program_answered_before(
 
 
 @pytest.mark.usefixtures("new_keys")
-def test_starts_again_when_a_rejected_key_was_replaced() -> None:
+def test_starts_again_when_a_rejected_key_was_replaced(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
     local = "tcp://127.0.0.1:*"
     control = ControlService(ControlConfig(control=local, events=local))
     address, _, _ = control.endpoints["commands"].partition(" ")
     service = ServiceWithKey(ServiceConfig(control=address))
+
+    def step() -> None:
+        clock.now_s += 0.02 * NO_REPLY_S
+        service.step(0.01)
+
     revoke_key("keyed")
-    service._warn_about_control()
+    wait_until(lambda: "does not accept" in caplog.text, step=step)
     assert not service.should_exit
     (key_folder() / "keyed.key").unlink()
-    service._warn_about_control()
-    assert service.should_exit
+    wait_until(lambda: service.should_exit, step=step)
     assert service.has_new_key
     for one in (service, control):
         one.bus.close()
@@ -297,15 +330,15 @@ def test_heartbeats_report_many_sessions_in_turn(control: FakeControl) -> None:
 
 
 def test_a_health_check_ends_a_process_whose_loop_hangs(
-    slow: SlowService, monkeypatch: pytest.MonkeyPatch
+    slow: SlowService, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[int] = []
     monkeypatch.setattr("kouxing.shared.service.os._exit", ends.append)
     slow.step(0.0)
     assert slow.check_health()
-    slow._heartbeat_due_s -= MAX_LATE_S + 1.0
+    clock.now_s += IDLE_HEARTBEAT_S + MAX_LATE_S
     assert not slow.check_health()
     assert ends == []
-    slow._heartbeat_due_s -= EXIT_AFTER_S
+    clock.now_s += EXIT_AFTER_S
     slow.check_health()
     assert ends == [1]
