@@ -34,6 +34,7 @@ RECOVERED_S = 0.05  # maximum lateness of a face that has recovered
 STEADY_S = 1.0  # time for which the lateness must stay at or below this maximum
 QUIET_S = 5.0  # measured time before the load
 AFTER_S = 15.0  # measured time after the load
+FIRST_FRAME_LIMIT_S = 30.0
 STEP_S = 0.02  # interval of the lateness values
 _PROC = Path("/proc")
 
@@ -132,13 +133,19 @@ def measure(
 def _speaker(
     client: Client, speech: NDArray[np.float32], language: str | None
 ) -> Iterator[tuple[LoadGenerator, float]]:
-    """Open a session and speak for a moment; yield the speaker and the time reached."""
+    """Open a session, speak until frames arrive; yield the speaker and the time reached."""
     generator = LoadGenerator(client, speech, 1, language)
     if not generator.speakers:
         raise UserError(f"control rejects the session: {', '.join(generator.refusals)}")
     generator.start()
-    quiet_s = time.perf_counter() + SETTLE_S
-    generator.speak_until(quiet_s)
+    (speaker,) = generator.speakers
+    quiet_s = time.perf_counter()
+    limit_s = quiet_s + FIRST_FRAME_LIMIT_S
+    while not speaker.arrived_s:
+        if quiet_s > limit_s:
+            raise UserError("no frame arrives; close other programs and try again")
+        quiet_s += SETTLE_S
+        generator.speak_until(quiet_s)
     yield generator, quiet_s
     generator.close()
 

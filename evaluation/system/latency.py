@@ -59,6 +59,8 @@ def measure(path: Path, console: Console, language: str | None = None) -> Latenc
         after = _cpu_s(client)
     audio_s = NUM_REPEATS * len(sound) / MEDIA_RATE_HZ
     to_frame_ms, from_sound_ms = (np.concatenate(part) * 1e3 for part in zip(*delays, strict=True))
+    if not len(to_frame_ms):
+        raise UserError("no frame arrived in time; close other programs and try again")
     return Latency(
         chunk_to_frame_ms=percentiles(to_frame_ms),
         sound_to_frame_ms=percentiles(from_sound_ms),

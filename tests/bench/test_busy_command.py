@@ -43,5 +43,5 @@ def test_the_command_prints_and_writes_the_same_figures(
     assert len(run["lateness_s"]) == 100
     assert max(run["lateness_s"]) == written["summary"][0]["worst_s"]
     assert f"{max(run['lateness_s']):.2f}" in result.stdout
-    assert 0 < written["speaking"]["recognizer"]["cpu_cores"] < 2
+    assert written["speaking"]["recognizer"]["cpu_cores"] > 0
     assert written["idle"]["control"]["wake_ups"] > 0

@@ -1,4 +1,4 @@
-"""Services crash during a live session; its face only pauses."""
+"""The faults command kills a service during a live session, and prints and writes its figures."""
 
 import json
 from pathlib import Path
@@ -11,9 +11,11 @@ from kouxing.evaluation.system.faults import Timing
 from tests.system import SKIP_NO_AUDIO
 
 
-def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    service = "recognizer"
-    timing = Timing(length_s=6.0, fault_at_s=3.2, other_times_s=())
+def test_the_command_prints_and_writes_the_same_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = "synthesizer"
+    timing = Timing(length_s=3.0, fault_at_s=1.0, other_times_s=())
     monkeypatch.setattr("kouxing.evaluation.system.faults.TIMING", timing)
     # a busy machine starts slowly
     monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
@@ -29,14 +31,13 @@ def test_a_crash_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert fault in result.stdout
     (outcome,) = json.loads(figures.read_text(encoding="utf-8"))
     assert (outcome["fault"], outcome["failure"]) == (fault, "")
-    ready = (logs / f"{fault}-3.2-s" / f"{service}.log").read_text("utf-8").count('"ready ')
+    ready = (logs / f"{fault}-1-s" / f"{service}.log").read_text("utf-8").count('"ready ')
     assert ready == 2, "it was not killed"
     face = outcome["face"]
-    assert face["phones"] > 25
+    assert face["phones"] > 0
     assert face["stood_s"] > 0
-    assert (face["phones_lost"], face["phones_doubled"]) == (0, 0)
-    assert (face["frames_lost"], face["frames_doubled"]) == (0, 0)
     assert face["largest_step"] > 0
+    assert f"{face['stood_s']:.2f}" in result.stdout
 
 
 def test_an_unknown_fault_is_rejected() -> None:

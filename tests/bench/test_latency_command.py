@@ -24,7 +24,7 @@ def test_the_command_prints_and_writes_the_same_figures(
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     latency = json.loads(figures.read_text(encoding="utf-8"))
-    assert latency["num_frames"] > 50
+    assert latency["num_frames"] > 0
     assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
     assert latency["delay_ms"] == 60.0
     assert latency["sound_to_frame_ms"]["p50"] > 0

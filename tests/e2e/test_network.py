@@ -3,7 +3,6 @@
 The hosts are network namespaces; where they are forbidden, these tests are skipped.
 """
 
-import difflib
 import functools
 import time
 from collections.abc import Callable, Iterator
@@ -22,11 +21,14 @@ CUT_AT_S = 1.0
 SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
 
 
+LOST_AFTER = {"KOUXING_CONTROL_LOST_AFTER_S": "5"}  # a busy service is not lost
+
+
 @pytest.fixture(scope="module")
 def _complete() -> Iterator[None]:
     """Let services process everything on a busy machine, with the block network."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in SKIP_NO_AUDIO.items():
+        for name, value in (SKIP_NO_AUDIO | LOST_AFTER).items():
             patch.setenv(name, value)
         yield
 
@@ -82,6 +84,7 @@ def stream_live(
 
     (received,) = speak([session], SAMPLES, on_step=on_step)
     session.close()
+    system.network.restore()
     assert received.ended, received.error
     return received
 
@@ -118,8 +121,5 @@ def test_a_session_continues_when_a_host_falls_silent(
 ) -> None:
     """No service is notified that the connections are gone."""
     received = stream_live(client, system, "recognizer")
-    epoch = max(frame.epoch for _, frame in received.frames)
-    assert epoch > 1
-    alike = difflib.SequenceMatcher(None, symbols(received), symbols(expected)).ratio()
-    # On a busy machine, the session may move again, to a worker with only the last seconds.
-    assert alike == 1.0 or (epoch > 2 and alike > 0.7)
+    assert {frame.epoch for _, frame in received.frames} == {1, 2}
+    assert_same(received, expected)

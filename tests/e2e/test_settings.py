@@ -32,7 +32,6 @@ SETTINGS = {
         for key in ("lips", "delay_ms", "frame_rate_hz", "idle_motion")
     },
     "KOUXING_CONTROL_MAX_LOAD": "0.1",  # less than one session needs
-    "KOUXING_CONTROL_IDLE_LIMIT_S": "15",
 }
 SAMPLES = samples_of_file(VOWELS_FILE)
 
@@ -116,6 +115,9 @@ async def _rejections(page: str) -> tuple[dict[str, object], aiohttp.ClientRespo
 
 
 def test_control_closes_a_session_without_audio(system: System) -> None:
+    assert system.lose("control", signal.SIGTERM).wait(LIMIT_S) == 0
+    system.start("control", KOUXING_CONTROL_IDLE_LIMIT_S="5")
+    system.wait_until(lambda report: {*KINDS} <= {state.service for state in report.services})
     with Client(system.control) as client:
         idle = client.open_session(encoding="f32le")
         event = next(event for event in idle.events() if event.name == "session-closed")
