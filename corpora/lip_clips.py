@@ -277,7 +277,7 @@ def aligned_phones(model: AcousticModel, clip: LipClip) -> list[Phone] | None:
     if not clip.transcript or clip.language != model.inventory.code:
         return None
     try:
-        return align_text(model, clip.samples, SAMPLE_RATE_HZ, clip.transcript)
+        return align_text(model, clip.samples, clip.transcript)
     except UserError:
         return None
 
@@ -290,4 +290,4 @@ def label_clips(model: AcousticModel, clips: Iterable[LipClip]) -> dict[str, lis
 
 def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
     """Find the phones of a clip: aligned if its text is known, otherwise recognized."""
-    return aligned_phones(model, clip) or recognize_recording(model, clip.samples, SAMPLE_RATE_HZ)
+    return aligned_phones(model, clip) or recognize_recording(model, clip.samples)

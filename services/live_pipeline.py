@@ -82,10 +82,7 @@ class LivePipeline:
         )
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:
-        """Process samples, shape (n,), and return the frames that are due.
-
-        Raises ``UserError`` if the samples have another shape or are not finite.
-        """
+        """Process finite samples, shape (n,), and return the frames that are due."""
         self._stream.accept_waveform(samples)
         return self._animate()
 

@@ -25,7 +25,7 @@ def read_mono_16k(
     source = open_audio(path, block_s=1.0, track=track)
     for notice in source.notices:
         print_message(notice)
-    resampler = Resampler(source.sample_rate_hz, source.num_channels)
+    resampler = Resampler(source.sample_rate_hz)
     content = bytearray()  # grows in place, because joining pieces would need twice the memory
     num_samples = clipped = 0
     blocks: Iterable[Samples] = limited_blocks(source)

@@ -38,7 +38,6 @@ from kouxing.services.recording_pipeline import (
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 
@@ -130,7 +129,7 @@ def recognize_all(
             tested.name: RecognizerOutput(
                 analyze_recording(
                     samples,
-                    recognize_recording(tested.model, samples, MEDIA_RATE_HZ),
+                    recognize_recording(tested.model, samples),
                     lips,
                     is_text_known=False,
                 ),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, aligned_phones
+from kouxing.corpora.lip_clips import LipClip, aligned_phones
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -52,7 +52,7 @@ def corpus_sentences(model: AcousticModel, corpus: Path) -> list[Sentence]:
     for utterance in choose_utterances(utterances):
         clip = _make_clip(model, utterance.path, utterance.utterance_id, utterance.speaker)
         syllables = syllables_of(utterance, model.inventory)
-        phones = align_syllables(model, clip.samples, SAMPLE_RATE_HZ, syllables).phones
+        phones = align_syllables(model, clip.samples, syllables).phones
         sentences.append(Sentence(clip, phones))
     return sentences
 

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, openings_of, read_clips
+from kouxing.corpora.lip_clips import LipClip, openings_of, read_clips
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
@@ -155,9 +155,9 @@ def _syllables_and_phones(
     if clip.transcript:
         with contextlib.suppress(UserError):  # a transcript with words in another language
             syllables = model.inventory.pronounce(clip.transcript)
-            phones = align_syllables(model, samples, SAMPLE_RATE_HZ, syllables).phones
+            phones = align_syllables(model, samples, syllables).phones
             return syllables, drop_pauses(phones, model.inventory)
-    phones = drop_pauses(recognize_recording(model, samples, SAMPLE_RATE_HZ), model.inventory)
+    phones = drop_pauses(recognize_recording(model, samples), model.inventory)
     groups = group_syllables(phones, model.inventory)
     return [tuple(phone.symbol for phone in group) for group in groups], phones
 

@@ -15,7 +15,6 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syl
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
-from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.terminal import CONSOLE, print_message
@@ -61,7 +60,7 @@ def align_corpus(
         try:
             samples = read_audio(utterance.path)
             syllables = syllables_of(utterance, model.inventory)
-            phones = align_syllables(model, samples, SAMPLE_RATE_HZ, syllables).phones
+            phones = align_syllables(model, samples, syllables).phones
         except (UserError, ValueError) as error:
             errors.add(utterance.utterance_id, str(error))
             continue

@@ -27,7 +27,6 @@ from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.fast_record import replace
@@ -143,9 +142,7 @@ def animate(
         phones = None
         if transcript is not None:
             with_progress = partial(progress.track, description="aligning")
-            alignment = align_syllables(
-                model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress
-            )
+            alignment = align_syllables(model, samples, transcript.phones, with_progress)
             report_mismatch(source, alignment)
             if alignment.fits or not text_may_differ:
                 phones, has_wrong_text = alignment.phones, not alignment.fits
@@ -153,7 +150,7 @@ def animate(
                 transcript = None
         if phones is None:
             with_progress = partial(progress.track, description="recognizing")
-            phones = recognize_recording(model, samples, MEDIA_RATE_HZ, with_progress)
+            phones = recognize_recording(model, samples, with_progress)
         with_progress = partial(progress.track, description="finding the lips")
         recording = analyze_recording(
             samples,

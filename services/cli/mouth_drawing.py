@@ -172,8 +172,8 @@ def _time_phones(
         return phones
     model = load_model_for_language(inventory.language)
     if transcript is None:
-        return recognize_recording(model, samples, MEDIA_RATE_HZ, with_progress)
-    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
+        return recognize_recording(model, samples, with_progress)
+    alignment = align_syllables(model, samples, transcript.phones, with_progress)
     report_mismatch(source, alignment)
     return alignment.phones
 

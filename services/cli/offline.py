@@ -267,7 +267,7 @@ def phones(
             samples = read_mono_16k(source, track, progress)
             duration_s = len(samples) / MEDIA_RATE_HZ
             with_progress = partial(progress.track, description="recognizing")
-            recognized = recognize_recording(model, samples, MEDIA_RATE_HZ, with_progress)
+            recognized = recognize_recording(model, samples, with_progress)
         if not recognized:
             print_message(f"{source}: no speech was found")
         written = [*respell(recognized, model.inventory, alphabet)]
@@ -311,7 +311,7 @@ def align(
     with open_progress() as progress:
         samples = read_mono_16k(audio, track, progress)
         with_progress = partial(progress.track, description="aligning")
-        alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones, with_progress)
+        alignment = align_syllables(model, samples, transcript.phones, with_progress)
     duration_s = len(samples) / MEDIA_RATE_HZ
     syllables = find_syllable_times(alignment.phones, transcript, model.inventory)
     written = [*respell(alignment.phones, model.inventory, alphabet)]

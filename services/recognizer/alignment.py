@@ -22,7 +22,6 @@ from kouxing.services.recognizer.front_end.features import (
     count_frames,
     frame_time_s,
 )
-from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.offline_recognition import WithProgress
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
@@ -53,13 +52,10 @@ class Alignment:
         return self.fit >= MIN_FIT
 
 
-def align_text(
-    model: AcousticModel, samples: NDArray[np.float32], sample_rate_hz: int, text: str
-) -> list[Phone]:
+def align_text(model: AcousticModel, samples: NDArray[np.float32], text: str) -> list[Phone]:
     """Find the onset and duration of each phone and pause of a text.
 
-    ``samples`` have the shape (n,) or (n, channels). The text is in a spelling that the model's
-    language can read.
+    ``samples`` are 16 kHz mono, (n,). The text is in a spelling that the model's language can read.
 
     Raises ``UserError`` if the text is empty or unreadable, or the recording is too short for the
     text.
@@ -67,13 +63,12 @@ def align_text(
     syllables = model.inventory.pronounce(text)
     if not syllables:
         raise UserError("the text is empty; enter the spoken words")
-    return align_syllables(model, samples, sample_rate_hz, syllables).phones
+    return align_syllables(model, samples, syllables).phones
 
 
 def align_syllables(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    sample_rate_hz: int,
     syllables: Sequence[Syllable],
     with_progress: WithProgress = iter,
 ) -> Alignment:
@@ -89,13 +84,13 @@ def align_syllables(
         topology.first_state,
         silence=silence,
     )
-    num_frames = count_frames(-(-len(samples) * SAMPLE_RATE_HZ // sample_rate_hz))
+    num_frames = count_frames(len(samples))
     if num_frames < graph.num_needed[0]:
         raise UserError(
             f"{num_frames * HOP_S:.2f} s of audio is too short for the phones of the text,"
             f" {sum(map(len, syllables))}; check that the text matches the recording"
         )
-    scores = _score_recording(model, samples, sample_rate_hz, num_frames, with_progress)
+    scores = _score_recording(model, samples, num_frames, with_progress)
     path, _ = viterbi_path(scores, graph.states, graph, topology.log_stay, topology.log_leave)
     phones: list[Phone] = []
     for segment in segments_of_path(path, graph):
@@ -120,12 +115,10 @@ def align_syllables(
 def _score_recording(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    sample_rate_hz: int,
     num_frames: int,
     with_progress: WithProgress,
 ) -> Floats:
     """Score a recording second by second; return the scores of all frames, (frames, states)."""
-    resampler = Resampler(sample_rate_hz, 1 if samples.ndim == 1 else samples.shape[1])
     front_end, stream = model.create_front_end(), model.create_stream()
     scores = np.empty((num_frames, model.topology.num_states), np.float32)
     num_scored = 0
@@ -135,10 +128,9 @@ def _score_recording(
         scores[num_scored : num_scored + len(rows)] = rows
         num_scored += len(rows)
 
-    for start in with_progress(range(0, len(samples), sample_rate_hz)):
-        piece = resampler.accept_waveform(samples[start : start + sample_rate_hz])
+    for start in with_progress(range(0, len(samples), SAMPLE_RATE_HZ)):
+        piece = samples[start : start + SAMPLE_RATE_HZ]
         append(stream.score(front_end.accept_waveform(piece)))
-    append(stream.score(front_end.accept_waveform(resampler.finish())))
     append(stream.score(None))
     return scores[:num_scored]
 

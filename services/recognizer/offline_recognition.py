@@ -5,6 +5,7 @@ from typing import Any, TypeAlias
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
 
@@ -12,16 +13,15 @@ WithProgress: TypeAlias = Callable[[Sequence[Any]], Iterable[Any]]  # ``iter``, 
 
 
 def recognize_recording(
-    model: AcousticModel, samples: Floats, sample_rate_hz: int, with_progress: WithProgress = iter
+    model: AcousticModel, samples: Floats, with_progress: WithProgress = iter
 ) -> list[Phone]:
-    """Return the phones of a recording, (n,) or (n, channels), and silence within speech.
+    """Return the phones of a recording, 16 kHz mono, (n,), and silence within speech.
 
     A live session with the same audio has the same final phones. ``with_progress`` wraps the loop
     to show progress.
     """
     recognizer = Recognizer(model)
-    num_channels = 1 if samples.ndim == 1 else samples.shape[1]
-    stream = recognizer.create_stream(sample_rate_hz=sample_rate_hz, num_channels=num_channels)
+    stream = recognizer.create_stream()
     phones: list[Phone] = []
 
     def decode() -> None:
@@ -30,8 +30,8 @@ def recognize_recording(
             if isinstance(result, Phone) and result.final and not result.is_withdrawn:
                 phones.append(replace(result, index=len(phones)))
 
-    for start in with_progress(range(0, len(samples), sample_rate_hz)):
-        stream.accept_waveform(samples[start : start + sample_rate_hz])
+    for start in with_progress(range(0, len(samples), MEDIA_RATE_HZ)):
+        stream.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
         decode()
     stream.input_finished()
     decode()

@@ -56,7 +56,6 @@ class Recognizer:
         self,
         *,
         sample_rate_hz: int = SAMPLE_RATE_HZ,
-        num_channels: int = 1,
         lip_predictor: LipFrameModel | None = None,
         face_delay_s: float = 0.0,
         speech_time: int = 0,
@@ -64,20 +63,18 @@ class Recognizer:
     ) -> SpeechStream:
         """Create the stream of one session.
 
-        The rate is 8000 to 48000 Hz; channels are averaged. Without ``lip_predictor``, there are no
+        The rate is 8000 to 48000 Hz. Channels are averaged. Without ``lip_predictor``, there are no
         lip frames. Otherwise, they get the longest delay that is in time for a face with the delay
         ``face_delay_s``. ``speech_time`` is the media time, samples at 16 kHz, at which the current
         speech started at another recognizer. The networks' blocks then align with the other
         recognizer's. ``language`` is as for :meth:`model_of`.
 
-        Raises ``UserError`` if the rate or the channels are out of range, or no model has the
-        language.
+        Raises ``UserError`` if no model has the language.
         """
         return SpeechStream(
             self.model_of(language),
             self._rule,
             sample_rate_hz=sample_rate_hz,
-            num_channels=num_channels,
             lip_predictor=lip_predictor,
             face_delay_s=face_delay_s,
             speech_time=speech_time,

@@ -80,7 +80,6 @@ class RecognizerSession:
         face_delay_s = (start.facts.delay_ms or 0.0) / 1e3
         self.stream = recognizer.create_stream(
             sample_rate_hz=opening.sample_rate_hz,
-            num_channels=opening.num_channels,
             lip_predictor=lip_predictor,
             face_delay_s=face_delay_s,
             speech_time=start.speech_time or 0,

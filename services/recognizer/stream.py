@@ -48,7 +48,6 @@ class SpeechStream:
         rule: OutputRuleConfig,
         *,
         sample_rate_hz: int,
-        num_channels: int,
         lip_predictor: LipFrameModel | None,
         face_delay_s: float,
         speech_time: int,
@@ -59,7 +58,6 @@ class SpeechStream:
         self._model = model
         self._rule = rule
         self._rate_hz = sample_rate_hz
-        self._num_channels = num_channels
         self._lip_predictor = lip_predictor
         self._face_delay_s = face_delay_s
         self._speech_time = speech_time
@@ -108,11 +106,9 @@ class SpeechStream:
         return [segment.scorer for segment in self._segments]
 
     def accept_waveform(self, samples: Floats, media_time: int | None = None) -> None:
-        """Queue samples, (n,) or (n, channels), in [-1, 1], for decoding.
+        """Queue finite samples, (n,) or (n, channels), in [-1, 1], for decoding.
 
         ``media_time`` is the time of the first sample, samples at 16 kHz. None: no gap.
-
-        Raises ``UserError`` if the samples have another shape or are not finite.
         """
         if media_time is None:
             media_time = self.next_media_time
@@ -221,7 +217,7 @@ class SpeechStream:
         scorer.set_hop(self._hop)
         return _AudioSegment(
             media_time,
-            Resampler(self._rate_hz, self._num_channels),
+            Resampler(self._rate_hz),
             scorer,
             LiveDecoder(self._model.topology, self._rule),
         )

@@ -33,7 +33,6 @@ from kouxing.services.synthesizer.modifiers.speech_motion import (
 )
 from kouxing.services.synthesizer.phone_renumberer import PhoneRenumberer
 from kouxing.shared.clock import MAX_GAP_S
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.expression_motion import JAW, mix_expression
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import (
@@ -76,8 +75,6 @@ class FaceAnimator:
     all were known. ``idle_motion_seed`` is for blinks, gaze, brows and head motion; with 0 only the
     mouth moves. ``expressiveness`` scales the mouth movements, 0.5 to 2. ``feeling`` is how
     strongly the face shows the feeling in the voice, 0 to 1.
-
-    Raises ``UserError`` if a value is out of range.
     """
 
     def __init__(
@@ -90,10 +87,6 @@ class FaceAnimator:
         expressiveness: float = 1.0,
         feeling: float = 0.0,
     ) -> None:
-        if not 0.0 <= delay_s <= MAX_DELAY_S:
-            raise UserError(f"delay_s is {delay_s:g}; it must be from 0 to {MAX_DELAY_S:g} seconds")
-        if not 10.0 <= frame_rate_hz <= 240.0:
-            raise UserError(f"frame_rate_hz is {frame_rate_hz:g}; it must be from 10 to 240")
         self._lip_model = lip_model
         self._frame_rate_hz = frame_rate_hz
         self._delay_s = delay_s

@@ -10,7 +10,6 @@ import json
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.transcript import TimedSyllable
@@ -24,10 +23,8 @@ def format_phones(
     """Write the spoken phones, in order, as ``table``, ``csv``, ``json`` or ``textgrid``.
 
     ``total_s`` is the length of the recording. A TextGrid and JSON also contain the syllables of a
-    known text. Raises ``UserError`` if the style is unknown.
+    known text.
     """
-    if style not in _STYLES:
-        raise UserError(f"unknown format {style!r}; choose from {', '.join(_STYLES)}")
     spoken = (phone for phone in phones if phone.is_spoken)
     numbered = [replace(phone, index=number) for number, phone in enumerate(spoken)]
     return _STYLES[style](numbered, total_s, syllables)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.live_faces import live_events, live_frames
 from kouxing.services.live_pipeline import LivePipeline
+from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -171,7 +172,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def expected(recordings: list[Path]) -> dict[str, list[events.Phone]]:
     """The phones of each recording by its name, found by a single call."""
     model = load_model()
-    return {path.name: recognize_recording(model, *read_audio(path)) for path in recordings}
+    return {path.name: recognize_recording(model, read_mono_16k(path)) for path in recordings}
 
 
 def without_silence(phones: list[events.Phone]) -> list[events.Phone]:

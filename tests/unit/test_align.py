@@ -16,19 +16,17 @@ from kouxing.services.recognizer.alignment import (
     drop_pauses,
     find_syllable_times,
 )
-from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.phone_files import format_phones
 from tests import lips
-from tests.system import DEMO, VOWELS_FILE
+from tests.system import DEMO, VOWELS_FILE, samples_of_file
 
 
 @pytest.fixture(scope="module")
 def vowels() -> list[Phone]:
-    samples, rate_hz = read_audio(VOWELS_FILE)
-    return align_text(load_model(), samples, rate_hz, "啊，喔，鹅，衣，乌，迂。")
+    return align_text(load_model(), samples_of_file(VOWELS_FILE), "啊，喔，鹅，衣，乌，迂。")
 
 
 def test_all_phones_in_order_without_gaps(vowels: list[Phone]) -> None:
@@ -90,10 +88,9 @@ def test_rejects_a_text_that_does_not_fit(
 )  # fmt: skip
 def test_the_fit_shows_whether_the_text_was_spoken(text: str, *, fits: bool) -> None:
     model = load_model("blocks")
-    samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     syllables = model.inventory.pronounce(text)
-    padded = np.concatenate([np.zeros((3 * rate_hz, 1), np.float32), samples])
-    assert align_syllables(model, padded, rate_hz, syllables).fits is fits, "pauses do not count"
+    padded = np.append(np.zeros(48_000, np.float32), samples_of_file(DEMO / "hello-female.wav"))
+    assert align_syllables(model, padded, syllables).fits is fits, "pauses do not count"
 
 
 def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:

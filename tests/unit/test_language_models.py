@@ -41,7 +41,7 @@ def test_other_languages_use_their_phones_of_the_universal_model() -> None:
     assert isinstance(english, BlockModel)
     assert isinstance(universal, BlockModel)
     assert english.runner is universal.runner  # in memory once
-    symbols = {phone.symbol for phone in recognize_recording(english, SAMPLES, 16_000)}
+    symbols = {phone.symbol for phone in recognize_recording(english, SAMPLES)}
     assert symbols & load_inventory("english").vowels
     assert symbols <= {*load_inventory("english").phones}
 
@@ -54,12 +54,12 @@ def test_a_model_of_other_phones_is_an_error() -> None:
 def test_limits_the_phones_of_a_model() -> None:
     model = load_model("gmm")
     limited = restrict_phones(model, ("sil", "i", "u"))
-    assert {phone.symbol for phone in recognize_recording(limited, SAMPLES, 16_000)} <= {
+    assert {phone.symbol for phone in recognize_recording(limited, SAMPLES)} <= {
         "sil",
         "i",
         "u",
     }
-    assert "ao" in {phone.symbol for phone in recognize_recording(model, SAMPLES, 16_000)}
+    assert "ao" in {phone.symbol for phone in recognize_recording(model, SAMPLES)}
 
 
 def test_languages_have_codes_and_titles() -> None:

@@ -12,16 +12,15 @@ from kouxing.services.recording_pipeline import analyze_recording, animate_recor
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.audio_file import read_audio
-from tests.system import DEMO, VOWELS_FILE
+from tests.system import DEMO, VOWELS_FILE, samples_of_file
 
 STILL = SynthesizerConfig(idle_motion=False, expressiveness=1.0, feeling=0.0)
 
 
 def test_dynamic_visemes_are_the_full_model() -> None:
-    samples = read_audio(VOWELS_FILE)[0][:, 0]
+    samples = samples_of_file(VOWELS_FILE)
     analyzed = analyze_recording(
-        samples, recognize_recording(load_model(), samples, 16_000), is_text_known=False
+        samples, recognize_recording(load_model(), samples), is_text_known=False
     )
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
@@ -34,10 +33,10 @@ def test_dynamic_visemes_are_the_full_model() -> None:
 
 
 def test_lips_close_and_open_for_the_phones_of_a_known_text() -> None:
-    samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
+    samples = samples_of_file(DEMO / "bilabials-female.wav")
     model = load_model()
-    aligned = align_text(model, samples, rate_hz, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")
-    analyzed = analyze_recording(samples[:, 0], aligned, load_lip_predictor())
+    aligned = align_text(model, samples, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")
+    analyzed = analyze_recording(samples, aligned, load_lip_predictor())
     frames = animate_recording(analyzed, load_lip_model(name="learned"), STILL)
     times_s = np.array([time_s for time_s, _ in frames])
     opening = np.array([-faps[3] - faps[4] for _, faps in frames])  # of the inner lips
@@ -52,9 +51,9 @@ def test_lips_close_and_open_for_the_phones_of_a_known_text() -> None:
 
 
 def test_every_phone_of_a_sentence_with_many_rounded_vowels_is_right() -> None:
-    samples = read_audio(DEMO / "lake-male.wav")[0][:, 0]
+    samples = samples_of_file(DEMO / "lake-male.wav")
     model = load_model()
-    phones = recognize_recording(model, samples, 16_000)
+    phones = recognize_recording(model, samples)
     spoken = [phone.symbol for phone in phones if phone.symbol != model.inventory.silence]
     text = model.inventory.pronounce("五月的湖边，我和女儿读书、画鱼。")
     assert spoken == [phone for syllable in text for phone in syllable]

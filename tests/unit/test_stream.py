@@ -270,7 +270,7 @@ def test_silence_and_noise_have_no_phones() -> None:
     noise = np.random.default_rng(0).normal(0, 0.01, 32_000).astype(np.float32)
     outputs = recognize_live(MODEL, noise, 320)
     assert not any(isinstance(output, Phone | SpeechChange) for output in outputs)
-    assert recognize_recording(MODEL, noise, 16_000) == []
+    assert recognize_recording(MODEL, noise) == []
 
 
 @pytest.mark.slow

@@ -39,7 +39,6 @@ from kouxing.services.synthesizer.lips.ferguson.contour import load_lip_points
 from kouxing.services.synthesizer.lips.ferguson.key_frames import build_anchors
 from kouxing.services.synthesizer.lips.ferguson.phone_table import COLUMNS, MAX_OPENING, PhoneTable
 from kouxing.services.synthesizer.lips.ferguson.timing import OnsetCrossings
-from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress
@@ -292,7 +291,7 @@ def aligned_speech(
         syllables = syllables_of(row, model.inventory)
         try:
             samples = read_audio(row.path)
-            phones = align_syllables(model, samples, MEDIA_RATE_HZ, syllables).phones
+            phones = align_syllables(model, samples, syllables).phones
         except UserError as error:
             errors.add(row.utterance_id, str(error))
             continue

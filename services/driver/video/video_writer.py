@@ -153,7 +153,7 @@ class VideoWriter:
     have an alpha channel. Unless ``overwrite`` is set, ``close`` adds a number to the name of an
     existing file.
 
-    Raises ``UserError`` if the file cannot be written or a value is not possible.
+    Raises ``UserError`` if the file cannot be written, or cannot be transparent.
     """
 
     def __init__(
@@ -175,12 +175,6 @@ class VideoWriter:
             raise UserError(
                 f"{self._path}: MP4 cannot be transparent; write .mov, .webm or pictures (a folder)"
             )
-        if width_px < 2 or height_px < 2 or width_px % 2 or height_px % 2:
-            raise UserError(
-                f"cannot make a video of {width_px} x {height_px} pixels; use even, positive sizes"
-            )
-        if not 1 <= frame_rate_hz <= 1000:
-            raise UserError(f"the frame rate is {frame_rate_hz} Hz; choose one from 1 to 1000 Hz")
         sound_codec = None if sample_rate_hz is None else form.sound
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz

@@ -28,33 +28,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.shared.errors import UserError
 
-MIN_RATE_HZ = 8_000
-MAX_RATE_HZ = 48_000
-MAX_CHANNELS = 8
 _HALF_WIDTH = 32  # samples of the lower rate
 _CUTOFF = 15 / 16  # relative to half the lower rate
 _KAISER_BETA = 8.0
 
 
 class Resampler:
-    """Streaming resampler to 16 kHz mono; averages the channels.
+    """Streaming resampler from 8 to 48 kHz to 16 kHz mono; averages the channels."""
 
-    Raises ``UserError`` if the rate (8000 to 48000 Hz) or the number of channels (1 to 8) is out of
-    range.
-    """
-
-    def __init__(self, sample_rate_hz: int, num_channels: int = 1) -> None:
-        if not MIN_RATE_HZ <= sample_rate_hz <= MAX_RATE_HZ:
-            raise UserError(
-                f"the sample rate {sample_rate_hz} Hz is out of range; "
-                f"use {MIN_RATE_HZ} to {MAX_RATE_HZ} Hz"
-            )
-        if not 1 <= num_channels <= MAX_CHANNELS:
-            raise UserError(f"{num_channels} channels are out of range; use 1 to {MAX_CHANNELS}")
+    def __init__(self, sample_rate_hz: int) -> None:
         self._rate_hz = sample_rate_hz
-        self._num_channels = num_channels
         self._filter = _filter_table(sample_rate_hz)
         half = self._filter.shape[1] // 2
         self._known = np.zeros(half, dtype=np.float32)  # recent input, zeros at first
@@ -63,11 +47,8 @@ class Resampler:
         self._num_out = 0
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Accept samples, (n,) or (n, channels); return the new samples at 16 kHz, (m,).
-
-        Raises ``UserError`` if the shape does not match the channels, or a sample is not finite.
-        """
-        mono = self._mono(samples)
+        """Accept finite samples, (n,) or (n, channels); return the new samples at 16 kHz, (m,)."""
+        mono = _mix_and_clip(samples)
         self._num_in += len(mono)
         return mono if self._rate_hz == SAMPLE_RATE_HZ else self._resample(mono)
 
@@ -94,24 +75,19 @@ class Resampler:
         self._known, self._first = self._known[drop:], self._first + drop
         return out
 
-    def _mono(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        num_channels = 1 if samples.ndim == 1 else samples.shape[1]
-        if samples.ndim > 2 or num_channels != self._num_channels:
-            raise UserError(
-                f"samples have shape {samples.shape}; expected {self._num_channels} channels"
-            )
-        if not np.isfinite(samples).all():
-            raise UserError("some samples are not finite; send values in [-1, 1]")
-        mono = samples.mean(axis=1) if num_channels > 1 else samples.reshape(-1)
-        clipped: NDArray[np.float32] = np.minimum(np.maximum(mono, -1.0), 1.0)
-        return clipped.astype(np.float32, copy=False)
-
 
 def to_16_khz(samples: NDArray[np.float32], sample_rate_hz: int) -> NDArray[np.float32]:
     """Resample a whole recording of shape (n,) or (n, channels) to 16 kHz mono."""
-    num_channels = 1 if samples.ndim == 1 else samples.shape[1]
-    resampler = Resampler(sample_rate_hz, num_channels)
+    resampler = Resampler(sample_rate_hz)
     return np.concatenate([resampler.accept_waveform(samples), resampler.finish()])
+
+
+def _mix_and_clip(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return samples as one channel, (n,), in [-1, 1]."""
+    has_channels = samples.ndim == 2 and samples.shape[1] > 1
+    mono = samples.mean(axis=1) if has_channels else samples.reshape(-1)
+    clipped: NDArray[np.float32] = np.minimum(np.maximum(mono, -1.0), 1.0)
+    return clipped.astype(np.float32, copy=False)
 
 
 def _ratio(rate_hz: int) -> tuple[int, int]:
