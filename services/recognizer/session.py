@@ -187,8 +187,8 @@ class RecognizerSession:
         duration_s = len(samples) / rate_hz
         if self.is_paced and not self._lead_limit.allows(to_seconds(media_time), duration_s, now_s):
             text = (
-                f"the audio is more than {MAX_LEAD_S:g} s ahead of the clock; check sample_rate_hz, "
-                "or, to send faster than real time, open the session with paced = false"
+                f"the audio is more than {MAX_LEAD_S:g} s ahead of the clock; check sample_rate_hz,"
+                " or, to send faster than real time, open the session with paced = false"
             )
             raise Rejected(ErrorCode.BAD_AUDIO, text)
         end = media_time + len(samples) * MEDIA_RATE_HZ // rate_hz
