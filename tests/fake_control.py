@@ -12,10 +12,10 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.sockets import Poller, Socket
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import (
+    AudioChunk,
     CloseSession,
     Done,
     Error,

@@ -8,8 +8,7 @@ from kouxing.shared.errors import Rejected
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import MessageLoop
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AudioChunk
-from kouxing.shared.wire.session import Error, ErrorCode
+from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode
 
 
 class AudioIntake:

@@ -39,11 +39,10 @@ from kouxing.shared.metrics import trim_heap
 from kouxing.shared.phones.events import Progress, Waveform
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.session import Error, ErrorCode
+from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode
 from kouxing.shared.wire.speech import Acknowledge
 
 MAX_QUEUED_S = 60.0  # limit for live audio; later audio waits at the clients

@@ -24,11 +24,10 @@ from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange
 from kouxing.shared.replaying_publisher import ReplayingPublisher
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_to_message, message_to_event
 from kouxing.shared.wire.face import CurrentFace
-from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.session import AudioChunk, ErrorCode
 from kouxing.shared.wire.speech import (
     Acknowledge,
     Acoustic,

@@ -1,10 +1,10 @@
-"""Messages between a client and control."""
+"""The messages of a client: to control and back, and its audio."""
 
 from enum import StrEnum
 from typing import Annotated
 
 from kouxing_client.audio import SAMPLE_BYTES
-from kouxing_client.field_types import Count, Endpoint, Name, Seconds, Text
+from kouxing_client.field_types import MAX_AUDIO_BYTES, Count, Endpoint, Name, Seconds, Text
 from kouxing_client.messages import ServiceState, SessionFacts, SessionState
 from kouxing_client.options import MAX_CHANNELS, MAX_RATE_HZ, MIN_RATE_HZ
 from msgspec import Meta, field
@@ -77,6 +77,15 @@ class SessionMoved(ServiceMessage, frozen=True, kw_only=True):
     phones: Endpoint
     faps: Endpoint
     next_sequence: Count | None = None  # first audio message to resend; None: the recognizer stays
+
+
+class AudioChunk(ServiceMessage, frozen=True, kw_only=True):
+    """PCM in the session's encoding; media_time is the time of its first sample."""
+
+    token: Name
+    pcm: Annotated[bytes, Meta(max_length=MAX_AUDIO_BYTES)] = b""  # interleaved, little-endian
+    last: bool = False  # no more audio follows: finish the session
+    acknowledge: bool = False  # the client reads acknowledge messages and resends lost messages
 
 
 class CloseSession(ServiceMessage, frozen=True, kw_only=True):

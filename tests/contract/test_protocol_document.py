@@ -26,13 +26,13 @@ from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.name_rules import NAME_RULE, is_name
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import AllowedKey, EventName, SessionProgress
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import MAX_MESSAGE_BYTES
 from kouxing.shared.wire.schema import schema
 from kouxing.shared.wire.session import (
+    AudioChunk,
     ErrorCode,
     SessionMoved,
     SessionOpened,

@@ -9,7 +9,7 @@ from kouxing_client.messages import EndOfFaps, FapFrame, Phone, Sound
 from numpy.typing import NDArray
 
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.session import AudioChunk
 from tests.fake_control import EPOCH, FakeControl
 
 FRAME = 320  # samples; 20 ms

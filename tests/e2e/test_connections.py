@@ -13,8 +13,8 @@ from kouxing.shared import connection_limits, peer_quota, tarpit
 from kouxing.shared.bus import Bus
 from kouxing.shared.connection_limits import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
 from kouxing.shared.sockets import MAX_DROPPED, Poller, ReceivedMessage, Socket
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.codec import encode
+from kouxing.shared.wire.session import AudioChunk
 from kouxing.shared.wire.speech import Progress
 from tests.raw_bytes import connect_raw, frame
 from tests.system import LIMIT_S, wait_until

@@ -27,10 +27,9 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import add_key, key_folder, load_key, load_user_key, revoke_key
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionProgress
 from kouxing.shared.wire.events import batch_messages
-from kouxing.shared.wire.session import Error
+from kouxing.shared.wire.session import AudioChunk, Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Progress
 from tests.e2e.streaming import StreamedSession
 from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until

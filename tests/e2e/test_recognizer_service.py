@@ -19,9 +19,9 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
+from kouxing.shared.wire.session import AudioChunk
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
 from tests.samples import with_opening

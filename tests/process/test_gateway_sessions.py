@@ -8,9 +8,8 @@ import pytest
 from kouxing_client.base import MAX_UNACKNOWLEDGED
 from kouxing_client.messages import EndOfFaps
 
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import SessionStarted
-from kouxing.shared.wire.session import CloseSession, FlushSession
+from kouxing.shared.wire.session import AudioChunk, CloseSession, FlushSession
 from tests.fake_control import EPOCH, FakeControl
 from tests.process.web_clients import (
     async_test,

@@ -21,9 +21,8 @@ from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.session import AudioChunk, ErrorCode
 from kouxing.shared.wire.speech import Acknowledge, AcousticModelName, AudioState, Progress
 from tests.live_streams import START
 from tests.samples import with_opening

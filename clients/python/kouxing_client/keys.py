@@ -1,23 +1,26 @@
 """The CURVE key pair of this program, stored where kouxing's own commands store theirs."""
 
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import msgspec
 
 from kouxing_client.errors import KouxingError
 
 _FILE = "client.key"
 _MAX_BYTES = 1000
+Z85Key = Annotated[str, msgspec.Meta(min_length=40, max_length=40)]
 
 
 @dataclass(frozen=True)
 class Key:
-    """A key pair and the public key of control; Z85, 40 characters each."""
+    """A key pair and the public key of control, in Z85."""
 
-    public: str
-    secret: str
-    control: str
+    public: Z85Key
+    secret: Z85Key
+    control: Z85Key
 
 
 def find_key() -> Key:
@@ -53,17 +56,13 @@ def read_key(path: str | Path) -> Key:
     """
     try:
         with open(path, "rb", opener=_open_nonblocking) as file:
-            fields = json.loads(file.read(_MAX_BYTES))
-        key = Key(*(fields[name] for name in ("public", "secret", "control")))
+            return msgspec.json.decode(file.read(_MAX_BYTES), type=Key)
     except OSError as error:
         raise KouxingError(
             f"{path}: {error.strerror}. 'kouxing run' writes this file on its own machine. For "
             "another machine, run 'kouxing keys add NAME --role client' there and copy the file"
         ) from None
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError):
         raise KouxingError(
             f"{path} is not a key file; copy it again from control's machine"
         ) from None
-    if not all(isinstance(part, str) and len(part) == 40 for part in vars(key).values()):
-        raise KouxingError(f"{path} is not a key file; copy it again from control's machine")
-    return key

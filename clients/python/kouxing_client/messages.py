@@ -311,11 +311,11 @@ class Decoders:
     """Decodes messages of some classes."""
 
     def __init__(self, *classes: type[Message]) -> None:
-        self._decoders = {cls.kind: msgspec.msgpack.Decoder(cls) for cls in classes}
+        self._decoders = {cls.kind.encode(): msgspec.msgpack.Decoder(cls) for cls in classes}
 
     def decode(self, parts: list[bytes]) -> Message | None:
         """Return a message; None for other kinds, other versions and malformed messages."""
-        decoder = self._decoders.get(kind_of(parts))
+        decoder = self._decoders.get(parts[0].partition(b"/")[0])
         if decoder is None or len(parts) != 2:
             return None
         try:

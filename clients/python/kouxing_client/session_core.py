@@ -72,7 +72,7 @@ class Subscription:
         self._on_result = on_result or inbox.add
         self._classes = classes
         self._phones = PhoneTrack()
-        needed: set[type[Any]] = {
+        needed: set[type[Message]] = {
             EndOfFaps,
             *(FapFrame if cls is Shapes else cls for cls in classes),
         }
