@@ -95,10 +95,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "_HOLD_S _LEAD_S _LAUGH_EASE_S _LOUDNESS_DB _FORGET_DB_S _BREATH _SMILING _LOUD_NOTE",
     ),
     "pcm": (pcm, "MEDIA_RATE_HZ SLICE"),
-    "resample": (
-        resample,
-        "SAMPLE_RATE_HZ MIN_RATE_HZ MAX_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA",
-    ),
+    "resample": (resample, "SAMPLE_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA"),
     "rest": (
         resting_lips,
         "HOLD_S LEAD_S PART_S CLOSE_S CERTAIN _YIELD_S _END_S _MIN_PAUSE_S _RANGE_DB _FADE_DB "
