@@ -7,7 +7,6 @@ immediately. The loop sends the heartbeats, so that control detects a loop that 
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import math
 import os
@@ -367,13 +366,17 @@ class Service(MessageLoop):
         if reason := reach_error(host, port, is_zeromq=True):
             LOG.warning("waiting for control at %s: %s", self.config.control, reason)
             return
-        with contextlib.suppress(UserError), Bus(self.key) as bus:
-            if bus.probe(self.control_endpoint) is ProbeResult.REFUSED:
-                if self.key is not None and self._load_key() != self.key:
-                    LOG.warning("restarting with a new key")
-                    self.has_new_key = self._exit_requested = True
+        try:
+            with Bus(self.key) as bus:
+                if bus.probe(self.control_endpoint) is not ProbeResult.REFUSED:
                     return
-                LOG.warning(rejection_hint(self.control_endpoint, self.name, self.kind.key_roles))
+            if self.key is not None and self._load_key() != self.key:
+                LOG.warning("restarting with a new key")
+                self.has_new_key = self._exit_requested = True
+                return
+            LOG.warning(rejection_hint(self.control_endpoint, self.name, self.kind.key_roles))
+        except UserError as error:  # such as a new key that does not fit control's key
+            LOG.warning("waiting for control at %s: %s", self.config.control, error)
 
     def _log_ready(self) -> None:
         LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))
