@@ -99,6 +99,11 @@ class _Session:
     feelings: Sequence[tuple[float, float]]  # estimated at the end of each recording
     stressed_s: Times
 
+    def select_spoken(self, times_s: Times, margin_s: float = 0.0) -> Times:
+        """Return the times during a recording, or less than ``margin_s`` after it."""
+        is_spoken = [(start <= times_s) & (times_s < end + margin_s) for start, end in self.spans]
+        return np.asarray(times_s[np.any(is_spoken, axis=0)])
+
 
 def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -> FaceFigures:
     """Animate all recordings that name an emotion, and a face at rest."""
@@ -116,38 +121,38 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
         np.array([FEELINGS[recording.emotion or ""] for recording in speech])
         for speech in by_speaker
     ]
-    frames = np.concatenate([session.faps for session in sessions])
+    rate_hz = config.frame_rate_hz
     minutes = sum(end - start for session in sessions for start, end in session.spans) / 60
+    frames = np.concatenate([session.faps for session in sessions])
+    blinks_s = _blink_durations_s(frames, rate_hz)
+    nods_s = [_find_peaks(session, _PITCH, _NOD_DEG * _DEGREE, rate_hz) for session in sessions]
+    brow_raises_s = [_find_peaks(session, _BROW, _BROW_UNITS, rate_hz) for session in sessions]
+    all_times_s = [
+        np.concatenate([np.arange(*span, 0.02) for span in session.spans]) for session in sessions
+    ]
+    still = [_is_still(session.faps) for session in sessions]
+    still_at_rest = _is_still(_face_at_rest(config))
+    return FaceFigures(
+        correlations=_correlations(sessions, labels, rate_hz),
+        nods=_movement_stats(nods_s, sessions, minutes),
+        brow_raises=_movement_stats(brow_raises_s, sessions, minutes),
+        chance=_match_rate(all_times_s, sessions),
+        blinks_per_minute=60 * rate_hz * len(blinks_s) / len(frames),
+        blink_s=float(np.median(blinks_s)) if len(blinks_s) else 0.0,
+        still_speaking=float(np.concatenate(still).mean()),
+        still_at_rest=float(still_at_rest.mean()),
+        longest_still_s=max(map(_longest_run, [*still, still_at_rest])) / rate_hz,
+    )
+
+
+def _face_at_rest(config: SynthesizerConfig) -> Floats:
     face = FaceAnimator(
         load_lip_model(name=config.lips),
         frame_rate_hz=config.frame_rate_hz,
         delay_s=config.delay_ms / 1e3,
         idle_motion_seed=config.idle_motion_seed,
     )
-    rest = np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
-    blinks_s = _blink_durations_s(frames, config.frame_rate_hz)
-    nods = [
-        _find_peaks(session, _PITCH, _NOD_DEG * _DEGREE, config.frame_rate_hz)
-        for session in sessions
-    ]
-    brow_raises_s = [
-        _find_peaks(session, _BROW, _BROW_UNITS, config.frame_rate_hz) for session in sessions
-    ]
-    all_times_s = [
-        np.concatenate([np.arange(*span, 0.02) for span in session.spans]) for session in sessions
-    ]
-    still = [_is_still(session.faps) for session in sessions]
-    return FaceFigures(
-        correlations=_correlations(sessions, labels, config.frame_rate_hz),
-        nods=_movement_stats(nods, sessions, minutes),
-        brow_raises=_movement_stats(brow_raises_s, sessions, minutes),
-        chance=_match_rate(all_times_s, sessions),
-        blinks_per_minute=60 * config.frame_rate_hz * len(blinks_s) / len(frames),
-        blink_s=float(np.median(blinks_s)) if len(blinks_s) else 0.0,
-        still_speaking=float(np.concatenate(still).mean()),
-        still_at_rest=float(_is_still(rest).mean()),
-        longest_still_s=max(map(_longest_run, [*still, _is_still(rest)])) / config.frame_rate_hz,
-    )
+    return np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
 
 
 def _animate(
@@ -208,10 +213,7 @@ def _correlations(
 def _find_peaks(session: _Session, fap: int, prominence: float, rate_hz: float) -> Times:
     """Return the times of the peaks of a FAP while the speaker speaks."""
     peaks, _ = find_peaks(session.faps[:, fap], prominence=prominence)
-    times_s = peaks / rate_hz
-    is_spoken = [(start <= times_s) & (times_s < end + _PAUSE_S) for start, end in session.spans]
-    chosen: Times = times_s[np.any(is_spoken, axis=0)]
-    return chosen
+    return session.select_spoken(peaks / rate_hz, _PAUSE_S)
 
 
 def _movement_stats(
@@ -219,13 +221,7 @@ def _movement_stats(
 ) -> MovementStats:
     num_movements = sum(map(len, times))
     within = [
-        times_s[
-            np.any(
-                [(start <= times_s) & (times_s < end) for start, end in session.spans],
-                axis=0,
-            )
-        ]
-        for times_s, session in zip(times, sessions, strict=True)
+        session.select_spoken(times_s) for times_s, session in zip(times, sessions, strict=True)
     ]
     at_end = 1.0 - sum(map(len, within)) / max(num_movements, 1)
     return MovementStats(num_movements / minutes, at_end, _match_rate(within, sessions))
@@ -234,16 +230,14 @@ def _movement_stats(
 def _match_rate(times: Sequence[Times], sessions: Sequence[_Session]) -> float | None:
     """Return the fraction of times that follow the start of a stressed vowel."""
     shortest_s, longest_s = _MATCH_S
-    lags_s = []
+    lags_s: list[float] = []
     for times_s, session in zip(times, sessions, strict=True):
         starts_s = np.array([-np.inf, *session.stressed_s])
         if len(starts_s) > 1:
-            lags_s += (
-                times_s - starts_s[np.searchsorted(starts_s, times_s, side="right") - 1]
-            ).tolist()
-    lag_s = np.array(lags_s)
-    matches = (lag_s >= shortest_s) & (lag_s <= longest_s)
-    return float(matches.mean()) if len(matches) else None
+            last_s = starts_s[np.searchsorted(starts_s, times_s, side="right") - 1]
+            lags_s += (times_s - last_s).tolist()
+    matches = [shortest_s <= lag_s <= longest_s for lag_s in lags_s]
+    return sum(matches) / len(matches) if matches else None
 
 
 def _blink_durations_s(faps: Floats, rate_hz: float) -> Times:
