@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
+from kouxing.evaluation.tables import show_results
 from kouxing.services.cli.options import Assignments, ConfigFile, Language, Output
 from kouxing.shared.terminal import (
     Force,
@@ -14,7 +14,6 @@ from kouxing.shared.terminal import (
     check_output,
     plural,
     print_message,
-    write_json,
     write_output,
 )
 
@@ -100,15 +99,14 @@ def report(
     force: Force = False,
 ) -> None:
     """Print mean opinion scores with 95 % confidence intervals, with and without outliers."""
-    from kouxing.evaluation.mos.report import make_report, print_report
+    from kouxing.evaluation.mos.report import make_report, opinions_table
     from kouxing.evaluation.mos.store import read_answers
     from kouxing.evaluation.mos.study import load_study
 
     check_output(json_file, force=force)
-    study = load_study(folder)
-    results = make_report(study, read_answers(folder))
-    print_report(study, results, Console())
-    write_json(json_file, {"opinions": [asdict(opinion) for opinion in results]})
+    opinions = make_report(load_study(folder), read_answers(folder))
+    results = {"opinions": [asdict(opinion) for opinion in opinions]}
+    show_results(json_file, results, opinions_table(opinions))
 
 
 @app.command()
@@ -119,4 +117,5 @@ def export(folder: Folder, output: Output = None, force: Force = False) -> None:
     from kouxing.evaluation.mos.study import load_study
 
     check_output(output, force=force)
-    write_output(to_csv(load_study(folder), read_answers(folder)), output)
+    load_study(folder)  # raises UserError if the folder is not a study
+    write_output(to_csv(read_answers(folder)), output)

@@ -13,13 +13,12 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from rich.console import Console
 from scipy import stats
 
 from kouxing.evaluation.mos.store import Answer
 from kouxing.evaluation.mos.study import SCALES, Study
+from kouxing.evaluation.tables import Table
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import print_table
 
 FENCE_RANGES = 1.5  # distance of the fences from the quartiles, in interquartile ranges
 Scores = dict[tuple[int, str], int]  # one condition on one scale, by judge and sentence
@@ -105,9 +104,8 @@ def mean_of(scores: Scores) -> MeanScore:
     )
 
 
-def print_report(study: Study, opinions: Iterable[Opinion], console: Console) -> None:
-    """Print the results as a table."""
-    columns = ("scale", "condition", "all scores", "no outliers", "judges", "outliers")
+def opinions_table(opinions: Iterable[Opinion]) -> Table:
+    """Return the results as a table."""
     rows = [
         [
             opinion.scale,
@@ -117,11 +115,14 @@ def print_report(study: Study, opinions: Iterable[Opinion], console: Console) ->
         ]
         for opinion in opinions
     ]
-    print_table(console, "mean opinion scores, 95 % confidence", columns, rows)
-    console.print("Use the intervals of all scores; those without outliers are too narrow.")
+    columns = ("scale", "condition", "all scores", "no outliers", "judges", "outliers")
+    title = """\
+mean opinion scores, 95 % confidence
+Use the intervals of all scores; those without outliers are too narrow."""
+    return Table(columns, rows, title)
 
 
-def to_csv(study: Study, answers: Iterable[Answer]) -> str:
+def to_csv(answers: Iterable[Answer]) -> str:
     """Return a table with a line per score; ``practice`` is True for those that do not count."""
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")

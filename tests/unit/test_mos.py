@@ -3,17 +3,15 @@
 import itertools
 import json
 from collections import Counter
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner
 
 from kouxing.evaluation.head_videos import join_recordings
 from kouxing.evaluation.mos.commands import app
-from kouxing.evaluation.mos.report import make_report, mean_of, opinion_of, print_report
+from kouxing.evaluation.mos.report import mean_of, opinion_of
 from kouxing.evaluation.mos.store import FILE_NAME as ANSWERS
 from kouxing.evaluation.mos.store import Answer, AnswerStore, read_answers
 from kouxing.evaluation.mos.study import FILE_NAME, load_study, new_study, williams_design
@@ -136,6 +134,7 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     store.close()
     result = run(app, [*report, "--json", str(folder / "figures.json")])
     assert result.exit_code == 0, result.output
+    assert "5.00" in result.output
     figures = json.loads((folder / "figures.json").read_text())
     means = {item["condition"]: item["of_all"]["value"] for item in figures["opinions"]}
     assert means == pytest.approx(given)
@@ -145,6 +144,3 @@ def test_the_commands_report_what_judges_scored(folder: Path) -> None:
     assert head == "judge,place,sentence,condition,scale,score,language,unix_s,practice"
     assert first == "0,0,a,anchor,realism,1,zh,0.0,False"
     assert last == "1,-1,a,reference,sync,1,zh,0.0,True"
-    text = StringIO()
-    print_report(study, make_report(study, read_answers(folder)), Console(file=text, width=80))
-    assert "reference" in text.getvalue()
