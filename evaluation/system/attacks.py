@@ -27,6 +27,7 @@ from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import stream
 from kouxing.evaluation.system.systems import LocalSystem, run_all_services
+from kouxing.evaluation.system.wait import wait_until
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -67,12 +68,7 @@ class MemoryUsage:
 
     def wait_until_kept(self, limit_mb: float, timeout_s: float = 10.0) -> bool:
         """Wait until ``kept_mb`` is at most ``limit_mb``; return False after the timeout."""
-        end_s = time.monotonic() + timeout_s
-        while self.kept_mb > limit_mb:
-            if time.monotonic() > end_s:
-                return False
-            time.sleep(0.05)
-        return True
+        return wait_until(lambda: self.kept_mb <= limit_mb, timeout_s)
 
     def _read_mb(self, name: str) -> float:
         lines = (self._folder / "status").read_text("ascii").splitlines()

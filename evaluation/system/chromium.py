@@ -8,9 +8,8 @@ import json
 import shutil
 import subprocess
 import threading
-import time
 import wave
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import aiohttp
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.evaluation.system.wait import wait_until
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 
@@ -64,11 +64,11 @@ class Chromium:
         self._num_sent = 0
         self.page_errors: list[str] = []
         port_file = folder / "DevToolsActivePort"
-        try:
-            wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), _TIMEOUT_S)
-        except TimeoutError:
+        if not wait_until(
+            lambda: port_file.is_file() and "\n" in port_file.read_text(), _TIMEOUT_S
+        ):
             self._process.kill()
-            raise UserError(f"{program} did not start within {_TIMEOUT_S:g} s") from None
+            raise UserError(f"{program} did not start within {_TIMEOUT_S:g} s")
         self._port = int(port_file.read_text().split()[0])
         self._loop.run_until_complete(self._connect())
         self.command("Runtime.enable")
@@ -176,11 +176,9 @@ class Chromium:
                     return False
                 raise
 
-        try:
-            wait_until(holds, limit_s)
-        except TimeoutError:
+        if not wait_until(holds, limit_s):
             state = self.evaluate("JSON.stringify(window.kouxing?.state)")
-            raise TimeoutError(f"{condition}; state {state}; {self.page_errors}") from None
+            raise TimeoutError(f"{condition}; state {state}; {self.page_errors}")
 
 
 @contextlib.contextmanager
@@ -215,15 +213,6 @@ def write_wav(path: Path, samples: NDArray[np.float32], rate_hz: int) -> None:
     with wave.open(str(path), "wb") as file:
         file.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
         file.writeframes((samples * 32767).astype("<i2").tobytes())
-
-
-def wait_until(condition: Callable[[], object], limit_s: float) -> None:
-    """Wait until a condition holds; raises TimeoutError after ``limit_s``."""
-    end_s = time.monotonic() + limit_s
-    while not condition():
-        if time.monotonic() > end_s:
-            raise TimeoutError
-        time.sleep(0.03)
 
 
 def _find_chromium() -> str | None:

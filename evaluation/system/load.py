@@ -22,6 +22,7 @@ from kouxing.corpora.figures import new_figure
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK, CHUNK_S
 from kouxing.evaluation.system.systems import run_all_services
+from kouxing.evaluation.system.wait import wait_until
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -182,22 +183,19 @@ class CumulativeUsage:
 
 def usage_of(client: Client) -> dict[str, CumulativeUsage]:
     """Return the resources used by each service; raises UserError if one stays lost."""
-    end_s = time.monotonic() + MAX_LOST_S
-    while True:
-        states = client.status().services
-        now_s = time.monotonic()
-        usage = {
-            state.service: CumulativeUsage(
-                now_s - state.age_s, state.metrics["cpu_s"], state.metrics["memory_mb"]
-            )
-            for state in states
-        }
-        if usage.keys() >= {*KINDS}:
-            return usage
-        if now_s > end_s:
-            missing = ", ".join({*KINDS} - usage.keys())
-            raise UserError(f"no heartbeat for {MAX_LOST_S:g} s: {missing}")
-        time.sleep(0.1)
+    usage: dict[str, CumulativeUsage] = {}
+
+    def is_complete() -> bool:
+        for state in client.status().services:
+            at_s = time.monotonic() - state.age_s
+            cpu_s, memory_mb = state.metrics["cpu_s"], state.metrics["memory_mb"]
+            usage[state.service] = CumulativeUsage(at_s, cpu_s, memory_mb)
+        return usage.keys() >= {*KINDS}
+
+    if not wait_until(is_complete, MAX_LOST_S):
+        missing = ", ".join({*KINDS} - usage.keys())
+        raise UserError(f"no heartbeat for {MAX_LOST_S:g} s: {missing}")
+    return usage
 
 
 def draw(load: Load) -> Any:

@@ -12,12 +12,12 @@ import secrets
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from kouxing.evaluation.system.wait import wait_until
 from kouxing.shared.errors import UserError
 
 TOOLS = ("ip", "nft", "nsenter")
@@ -132,11 +132,9 @@ class Network:
         self._delayer = subprocess.Popen(  # noqa: S603 - our own module
             _command(self._router, *module, *delay_ms)
         )
-        end_s = time.monotonic() + _READY_S
-        while DELAY_DEVICE not in self._on_router("ip", "-brief", "link", "show", "up"):
-            if time.monotonic() > end_s or self._delayer.poll() is not None:
-                raise UserError("cannot delay packets; check that /dev/net/tun exists")
-            time.sleep(0.02)
+        show = ("ip", "-brief", "link", "show", "up")
+        if not wait_until(lambda: DELAY_DEVICE in self._on_router(*show), _READY_S):
+            raise UserError("cannot delay packets; check that /dev/net/tun exists")
         self._on_router("ip", "route", "add", "default", "dev", DELAY_DEVICE, "table", "77")
         for host in self._addresses:
             self._on_router("ip", "rule", "add", "iif", host, "table", "77")

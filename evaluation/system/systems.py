@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Self
@@ -15,6 +14,7 @@ from kouxing_client.keys import Key
 from rich.console import Console
 
 from kouxing.evaluation.system.network import Network
+from kouxing.evaluation.system.wait import wait_until
 from kouxing.services.cli.supervisor import Supervisor
 from kouxing.services.service_kinds import (
     KINDS,
@@ -211,14 +211,16 @@ class HostsSystem(System):
 
     def _wait_until_ready(self) -> None:
         """Wait until services have registered at control; raises UserError after READY_S."""
-        end_s = time.monotonic() + READY_S
-        while True:
-            with contextlib.suppress(UserError):  # control may not run yet
-                if {*self._services} <= {state.instance for state in self.status().services}:
-                    return
-            if time.monotonic() > end_s:
-                raise UserError(f"the services did not start within {READY_S:g} s")
-            time.sleep(0.1)
+
+        def is_ready() -> bool:
+            try:
+                states = self.status().services
+            except UserError:  # control does not run yet
+                return False
+            return {*self._services} <= {state.instance for state in states}
+
+        if not wait_until(is_ready, READY_S):
+            raise UserError(f"the services did not start within {READY_S:g} s")
 
     def _control_address(self) -> str:
         return f"tcp://{self.network.address('control')}:{PORTS['control']['control']}"
