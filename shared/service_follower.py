@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from kouxing_client.follower import Follower
-from kouxing_client.messages import Joined, Message
+from kouxing_client.messages import Message
 
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
@@ -87,10 +87,12 @@ class _ServiceTransport:
         on_message: Callable[[Any], None],
     ) -> Socket:
         socket = self._service.bus.connect_subscriber(*sorted(addresses), live=live_addresses)
-        kinds: list[type[Message]] = [*classes, Joined]
-        self._service.register(socket, dict.fromkeys(kinds, lambda message, _: on_message(message)))
+        self._service.register(
+            socket, dict.fromkeys(classes, lambda message, _: on_message(message))
+        )
         self._on_message[socket] = on_message
-        socket.subscribe_session(classes, session)
+        for kind in classes:
+            socket.subscribe(kind, session)
         return socket
 
     def drain(self, connection: Socket) -> None:

@@ -128,16 +128,6 @@ class Socket:
         prefix = f"{kind.kind}/".encode() if session is None else topic(kind.kind, session)
         self.raw.setsockopt(zmq.SUBSCRIBE, prefix)
 
-    def subscribe_session(self, kinds: Iterable[type[Message]], session: str) -> None:
-        """Subscribe to kinds of message of one session, and request a confirmation.
-
-        Every publisher answers with one ``joined`` message when all of them are in effect:
-        subscriptions keep their order, and the one to ``joined`` is the last.
-        """
-        subscribed: list[type[Message]] = [*kinds, Joined]
-        for kind in subscribed:
-            self.subscribe(kind, session)
-
     def receive(self) -> Iterator[ReceivedMessage]:
         """Yield the messages that have arrived, at most ``MAX_BATCH``.
 

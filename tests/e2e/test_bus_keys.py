@@ -163,7 +163,8 @@ def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> 
         subscriber = bus.connect_subscriber(endpoint)
         for session in (None, "theirs"):
             subscriber.subscribe(FapFrame, session)
-        subscriber.subscribe_session([FapFrame], "mine")
+        subscriber.subscribe(FapFrame, "mine")
+        subscriber.subscribe(Joined, "mine")
         received: list[tuple[type, str]] = []
 
         def exchange() -> None:

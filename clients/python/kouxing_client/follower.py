@@ -35,7 +35,7 @@ class Transport(Protocol):
         live_addresses: Collection[str],
         on_message: Callable[[Any], None],
     ) -> object:
-        """Connect and subscribe to classes of messages of a session, with ``joined`` as the last.
+        """Connect and subscribe to classes of messages of a session, in order.
 
         The kernel buffers only a little of what ``live_addresses`` publish.
         """
@@ -186,7 +186,7 @@ class Follower:
         self._retry_s = self._transport.now_s + RETRY_S
         self._connection = self._transport.subscribe(
             self.session,
-            self._classes,
+            (*self._classes, Joined),  # a publisher confirms it after the others
             self._addresses - self._live_addresses,
             self._live_addresses,
             lambda message: self._on_arrival(message, confirmed),

@@ -14,7 +14,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
-from kouxing_client.messages import Decoders, Joined, Message, topic
+from kouxing_client.messages import Decoders, Message, topic
 from kouxing_client.reach import reach_error
 
 QUEUE = 20_000  # messages: a subscriber to a recording may pause for 400 s
@@ -145,7 +145,7 @@ class Sockets:
         on_message: Callable[[Message], None],
     ) -> Connection:
         """Subscribe to a session's messages, as ``Transport.subscribe`` describes."""
-        decoders = Decoders(*classes, Joined)
+        decoders = Decoders(*classes)
 
         def decode(parts: list[bytes]) -> None:
             if (message := decoders.decode(parts)) is not None:
@@ -157,8 +157,7 @@ class Sockets:
         raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER)
         for endpoint in sorted(live_addresses):
             self._connect(raw, endpoint)
-        for kind in (*(cls.kind for cls in classes), Joined.kind):
-            raw.setsockopt(zmq.SUBSCRIBE, topic(kind, session))
+        self.set_topics(raw, [topic(cls.kind, session) for cls in classes], on=True)
         return raw
 
     def connect_events(
