@@ -51,11 +51,7 @@ CHINESE = "普通话 {zh}%，德语 {de}%，英语 {en}%，意大利语 {it}%，
 
 
 @pytest.mark.parametrize(
-    ("file", "text", "to"),
-    [
-        ("README.md", ENGLISH, " to "),
-        ("README.zh.md", CHINESE, "% 至 "),
-    ],
+    ("file", "text", "to"), [("README.md", ENGLISH, " to "), ("README.zh.md", CHINESE, "% 至 ")]
 )
 def test_the_errors_by_language_are_those_of_the_report(file: str, text: str, to: str) -> None:
     shown: dict[str, list[str]] = {}

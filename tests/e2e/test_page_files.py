@@ -11,15 +11,7 @@ import soundfile
 from kouxing_client import Session
 
 from tests.browser import SIZE_PX, Browser
-from tests.e2e.page_actions import (
-    A_FACE,
-    NOTICE,
-    STATE,
-    choose,
-    colorfulness,
-    is_loud,
-    write_tone,
-)
+from tests.e2e.page_actions import A_FACE, NOTICE, STATE, choose, colorfulness, is_loud, write_tone
 from tests.e2e.page_control import PageControl
 from tests.system import wait_until
 

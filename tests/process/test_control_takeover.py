@@ -8,13 +8,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionProgress, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.session import (
-    CloseSession,
-    Done,
-    Error,
-    OpenSession,
-    SessionMoved,
-)
+from kouxing.shared.wire.session import CloseSession, Done, Error, OpenSession, SessionMoved
 from tests.control_harness import ControlHarness, make_heartbeat
 from tests.samples import START
 

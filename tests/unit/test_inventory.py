@@ -43,10 +43,7 @@ def test_mandarin_has_the_phones_of_the_paper() -> None:
         ({"kinds": ("initial", "vowel", "vowel")}, "exactly one phone must be silence"),
         ({"kinds": ("initial", "silence", "vowel")}, "exactly one phone must be silence: sil"),
         ({"kinds": ("initial", "final", "silence")}, "one of initial, vowel, silence"),
-        (
-            {"visemes": {"m": (("b", 1.0),), "a": (("a", 0.9),)}},
-            "fractions of a must add up",
-        ),
+        ({"visemes": {"m": (("b", 1.0),), "a": (("a", 0.9),)}}, "fractions of a must add up"),
     ],
 )
 def test_rejects_bad_phones(changes: dict[str, object], message: str) -> None:

@@ -133,14 +133,8 @@ def test_reads_the_particle_only_after_an_adverb(texts: str, spelling: str) -> N
 @pytest.mark.parametrize(
     ("texts", "phone"),
     [
-        (
-            "我得走了 他还得回家 他得出门 我得知道 大家都得来 我得天天练 我覺得他得來",
-            "ei",
-        ),
-        (
-            "他得了第一 他得出结论 我得知消息 她得奖了 我得一百分 使他得以生存 唱得好 值得",
-            "e",
-        ),
+        ("我得走了 他还得回家 他得出门 我得知道 大家都得来 我得天天练 我覺得他得來", "ei"),
+        ("他得了第一 他得出结论 我得知消息 她得奖了 我得一百分 使他得以生存 唱得好 值得", "e"),
     ],
 )
 def test_reads_must_only_between_a_pronoun_and_a_verb(texts: str, phone: str) -> None:

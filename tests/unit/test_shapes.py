@@ -148,10 +148,7 @@ def test_knows_all_shapes_and_every_program_has_the_same_table() -> None:
         assert find_shapes(set_name, shapes.names) == dict(
             zip(shapes.names, shapes.names, strict=True)
         )
-    for path in (
-        "clients/javascript/shape-names.js",
-        "examples/blender/kouxing_face.py",
-    ):
+    for path in ("clients/javascript/shape-names.js", "examples/blender/kouxing_face.py"):
         text = (ROOT / path).read_text(encoding="utf-8")
         assert TABLE in text, f"copy shared/face/shape_names.txt into {path}"
         assert "the avatar cannot speak: it has no shape" in text, path

@@ -54,13 +54,7 @@ def test_trains_resumes_and_writes_model_and_card(
     output = tmp_path / "universal.npz"
     languages = [write_corpus(tmp_path / "corpus")]
     train = partial(
-        train_universal,
-        [],
-        output,
-        learners=[],
-        languages=languages,
-        clips=None,
-        any_license=False,
+        train_universal, [], output, learners=[], languages=languages, clips=None, any_license=False
     )
     with monkeypatch.context() as patch:
         patch.setattr(recipe, "export_extension", interrupt)
