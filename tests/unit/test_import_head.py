@@ -169,9 +169,8 @@ def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, message: str)
 def test_rejects_points_that_are_not_a_face(
     face: Path, tmp_path: Path, change: Callable[[str], str], message: str
 ) -> None:
-    (tmp_path / "points.tsv").write_text(
-        change(point_lines(ORIGINAL, lambda p: p)), encoding="utf-8"
-    )
+    points = change(point_lines(ORIGINAL, lambda place: place))
+    (tmp_path / "points.tsv").write_text(points, encoding="utf-8")
     with pytest.raises(UserError, match=message):
         import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
     assert not (tmp_path / "out.npz").exists()

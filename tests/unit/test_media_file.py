@@ -42,32 +42,23 @@ def test_gaps_in_timestamps_become_silence(tmp_path: Path, name: str, codec: str
     assert source.warnings == []
 
 
-def test_an_avi_file_with_a_gap_is_not_cut_off(tmp_path: Path) -> None:
-    write_tracks(tmp_path / "a.avi", "libmp3lame", [[(0.0, TONE), (5.0, TONE)]], RATE_HZ)
-    source = open_audio(tmp_path / "a.avi")
-    assert len(_read(source)) == pytest.approx(2 * RATE_HZ, abs=3000)
-    assert source.warnings == []
-
-
 @pytest.mark.parametrize(
-    ("name", "codec"), [("a.mkv", "aac"), ("a.mp4", "aac"), ("a.ts", "aac"), ("a.mov", "pcm_s16le")]
+    ("name", "codec", "start_s", "video_s", "heard_s"),
+    [
+        ("a.mkv", "aac", 2.0, 5.0, 2.0),
+        ("a.mp4", "aac", 2.0, 5.0, 2.0),
+        ("a.ts", "aac", 2.0, 5.0, 2.0),
+        ("a.mov", "pcm_s16le", 2.0, 5.0, 2.0),
+        ("a.mkv", "pcm_s16le", 2.0, 0.0, 2.0),
+        ("a.mkv", "pcm_s16le", 40_000.0, 0.0, 0.0),  # the time of day
+    ],
 )
-def test_honors_the_start_of_a_late_track(tmp_path: Path, name: str, codec: str) -> None:
-    write_media(tmp_path / name, codec, TONE, RATE_HZ, start_s=2.0, video_s=5.0)
-    source = open_audio(tmp_path / name)
-    assert _spans(_read(source)) == [pytest.approx((2.0, 3.0), abs=0.06)]
-    assert source.warnings == []
-
-
-@pytest.mark.parametrize(
-    ("start_s", "silence_s"), [(2.0, 2.0), (40_000.0, 0.0)], ids=["late", "time of day"]
-)
-def test_honors_the_start_of_the_only_track(
-    tmp_path: Path, start_s: float, silence_s: float
+def test_honors_the_start_of_a_track(
+    tmp_path: Path, name: str, codec: str, start_s: float, video_s: float, heard_s: float
 ) -> None:
-    write_media(tmp_path / "a.mkv", "pcm_s16le", TONE, RATE_HZ, start_s=start_s)
-    source = open_audio(tmp_path / "a.mkv")
-    assert _spans(_read(source)) == [pytest.approx((silence_s, silence_s + 1.0), abs=0.02)]
+    write_media(tmp_path / name, codec, TONE, RATE_HZ, start_s=start_s, video_s=video_s)
+    source = open_audio(tmp_path / name)
+    assert _spans(_read(source)) == [pytest.approx((heard_s, heard_s + 1.0), abs=0.06)]
     assert source.warnings == []
 
 
@@ -166,10 +157,18 @@ def test_warns_about_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     assert "of 3." in warning or name == "a.opus"  # its header states no length
 
 
-def test_a_track_that_ends_before_the_video_is_not_cut_off(tmp_path: Path) -> None:
-    write_media(tmp_path / "a.mkv", "aac", TONE, RATE_HZ, video_s=4.0)
-    source = open_audio(tmp_path / "a.mkv")
-    assert len(_read(source)) == pytest.approx(RATE_HZ, abs=4000)
+@pytest.mark.parametrize(
+    ("name", "codec", "starts_s", "video_s"),
+    [("a.mkv", "aac", [0.0], 4.0), ("a.avi", "libmp3lame", [0.0, 5.0], 0.0)],
+    ids=["before the video", "after a gap"],
+)
+def test_a_track_that_ends_early_is_not_cut_off(
+    tmp_path: Path, name: str, codec: str, starts_s: list[float], video_s: float
+) -> None:
+    track = [(start_s, TONE) for start_s in starts_s]
+    write_tracks(tmp_path / name, codec, [track], RATE_HZ, video_s=video_s)
+    source = open_audio(tmp_path / name)
+    assert len(_read(source)) == pytest.approx(len(starts_s) * RATE_HZ, abs=4000)
     assert source.warnings == []
 
 

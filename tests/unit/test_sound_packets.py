@@ -30,13 +30,7 @@ def test_joins_two_pieces_of_20_ms_and_sends_the_rest_at_the_end() -> None:
     assert np.frombuffer(sounds[0].pcm, "<i2").tolist() == [0] * 320 + [320] * 320
 
 
-def test_does_not_join_sound_across_a_gap() -> None:
+def test_does_not_join_across_a_gap_long_pieces_or_for_a_face_without_delay() -> None:
     assert spans(messages(0, 640, 960)) == [(0, 320), (640, 640)]
-
-
-def test_sends_long_pieces_at_once() -> None:
     assert spans(messages(0, 800, num_samples=800)) == [(0, 800), (800, 800)]
-
-
-def test_sound_does_not_wait_for_a_face_without_delay() -> None:
     assert spans(messages(0, 320, face_delay_s=0.0)) == [(0, 320), (320, 320)]
