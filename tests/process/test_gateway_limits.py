@@ -88,11 +88,13 @@ async def fail(request: web.Request) -> web.StreamResponse:
 
 
 @asynccontextmanager
-async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[LimitedServer]:
+async def serve(
+    monkeypatch: pytest.MonkeyPatch, bound: socket.socket | None = None, **limits: float
+) -> AsyncIterator[LimitedServer]:
     """Serve with other limits; ``/long`` has no time limit."""
     for name, limit in {"_CHECK_S": 0.01, "_SHUTDOWN_S": 0.01, **limits}.items():
         monkeypatch.setattr(web_server, name, limit)
-    bound = web_server.bind_port("127.0.0.1", 0)
+    bound = bound or web_server.bind_port("127.0.0.1", 0)
     limited = LimitedServer(bound.getsockname())
     monkeypatch.setattr(web_server, "time", SimpleNamespace(monotonic=lambda: limited.now_s))
     http_server = WebServer(bound, None)
@@ -367,12 +369,7 @@ async def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPat
             return super().accept()
 
     failures = ["Too many open files"]
-    monkeypatch.setattr(web_server, "_RETRY_S", 0.05)
     exhausted = Exhausted(fileno=web_server.bind_port("127.0.0.1", 0).detach())
-    http_server = WebServer(exhausted, None)
-    application = web.Application()
-    application.add_routes([web.get("/", answer)])
-    await http_server.start(application, set())
-    assert await LimitedServer(exhausted.getsockname()).answers()
+    async with serve(monkeypatch, exhausted, _RETRY_S=0.05) as server:
+        assert await server.answers()
     assert not failures
-    await http_server.stop()
