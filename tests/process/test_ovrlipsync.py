@@ -180,7 +180,7 @@ def laughter_of(samples: Frames) -> list[float]:
     return values
 
 
-def test_laughter_scores_are_the_servers_evidence(folder: Path, library: Any) -> None:
+def test_laughter_scores_are_the_servers_evidence(folder: Path) -> None:
     sound, rows = run_program(folder, "lake-male")
     scores, expected = rows[:, 2], np.clip(laughter_of(sound), 0.0, 1.0)
     assert scores.max() > 0.1

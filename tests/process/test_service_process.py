@@ -74,7 +74,7 @@ def test_reports_a_wrong_setting_before_it_binds_anything(key: str) -> None:
     assert "Traceback" not in log
 
 
-def test_a_service_ends_with_its_supervisor(tmp_path: Path) -> None:
+def test_a_service_ends_with_its_supervisor() -> None:
     command = [sys.executable, *SERVICE, "synthesizer"]
     starter = (
         "import os, subprocess\n"

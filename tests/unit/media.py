@@ -12,14 +12,11 @@ from numpy.typing import NDArray
 from kouxing.shared.audio_file import AudioSource
 
 SUFFIXES = {  # of each codec, for formats that soundfile cannot write
-    "aac": "aac m4a mp4 flv ts latm",
-    "libopus": "webm opus",
-    "pcm_s16le": "avi mkv voc sf",
-    "mp2": "nut mp2 wtv",
-    **{"pcm_bluray": "m2ts", "ac3": "rm", "wavpack": "wv", "sbc": "sbc", "pcm_s32le": "sox"},
-    **{"adpcm_yamaha": "mmf", "pcm_s16be_planar": "ast", "libopencore_amrnb": "amr"},
-    **{"wmav2": "wma", "adpcm_adx": "adx"},
-}
+    "aac": "aac m4a mp4 flv ts latm", "libopus": "webm opus", "pcm_s16le": "avi mkv voc sf",
+    "mp2": "nut mp2 wtv", "pcm_bluray": "m2ts", "ac3": "rm", "wavpack": "wv", "sbc": "sbc",
+    "pcm_s32le": "sox", "adpcm_yamaha": "mmf", "pcm_s16be_planar": "ast", "adpcm_adx": "adx",
+    "libopencore_amrnb": "amr", "wmav2": "wma",
+}  # fmt: skip
 CODECS = {suffix: codec for codec, suffixes in SUFFIXES.items() for suffix in suffixes.split()}
 Part = tuple[float, NDArray[np.float32]]  # start in seconds, and samples
 

@@ -143,7 +143,7 @@ def test_two_channels_stay_unchanged(tmp_path: Path) -> None:
     ],
 )
 def test_reads_the_formats_of_phones_and_browsers(
-    tmp_path: Path, name: str, codec: str, rate_hz: int, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, name: str, codec: str, rate_hz: int
 ) -> None:
     sine = (0.5 * np.sin(2 * np.pi * 440 * np.arange(rate_hz) / rate_hz)).astype(np.float32)
     write_media(tmp_path / name, codec, sine, rate_hz)
