@@ -27,7 +27,7 @@ of two native speakers of English (``en-native``) and of one of Korean.
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -50,6 +50,7 @@ _CLOSED_LICENSE = re.compile(
     r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube", re.I
 )
 _MIN_PHONE_S = 0.03
+_MAX_WORD_PHONES = 8  # a recording with more phones is connected speech
 _MAX_LIST_BYTES = 256 << 20
 _AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
 _KALDI_SPLITS = ("train", "dev", "test")
@@ -129,6 +130,13 @@ def may_distribute(license_name: str) -> bool:
 def is_synthetic(license_name: str) -> bool:
     """Return whether data under this license is synthetic speech."""
     return "synthetic" in license_name.lower()
+
+
+def kind_of_speech(license_name: str, phones: Sequence[int]) -> str:
+    """Return the kind of a recording: ``sentence``, ``word`` or ``synthetic``."""
+    if is_synthetic(license_name):
+        return "synthetic"
+    return "word" if len(phones) <= _MAX_WORD_PHONES else "sentence"
 
 
 def read_corpus(

@@ -8,7 +8,7 @@ each, and a synthesizer makes any amount. The weight of a recording is
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +20,12 @@ from kouxing.corpora.speech_corpus import (
     Utterance,
     audio_files,
     is_synthetic,
+    kind_of_speech,
     read_corpus,
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
 from kouxing.shared.phones.inventory import PhoneInventory
 
-MAX_WORD_PHONES = 8  # a recording with more phones is connected speech
 FRAMES_PER_MINUTE = 6000
 _SYNTHETIC_WEIGHT = 0.3  # relative to natural speech; chosen on development data
 _NEUTRAL_MINUTES = 30.0  # a speaker with this much speech has weight 1
@@ -34,7 +34,6 @@ _MIN_FRAMES_PER_PHONE = 3
 _MARGIN_FRAMES = 25  # silence that is kept at both ends
 _MIN_PIECE_FRAMES = 20  # shorter recordings without text are skipped
 _MAX_PIECE_FRAMES = 2000  # longer recordings without text are cut
-_NO_SAMPLES = np.empty(0, np.int16)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,20 +41,17 @@ class Example:
     """One recording to train on."""
 
     log_mel: NDArray[np.float16]  # (frames, 41)
+    samples: NDArray[np.int16]  # (n,) 16 kHz, the samples of these frames
     phones: tuple[int, ...]  # indices into the inventory's phones
     syllables: tuple[int, ...]  # number of phones in each syllable
     weight: float  # weight of its frames in the estimates
-    license: str = ""
-    speaker: str = ""
-    # samples of the frames at 16 kHz, (n,), if they were loaded
-    samples: NDArray[np.int16] = field(default_factory=lambda: _NO_SAMPLES)
+    license: str
+    speaker: str
 
     @property
     def kind(self) -> str:
-        """The kind of speech: ``sentence``, ``word`` or ``synthetic``."""
-        if is_synthetic(self.license):
-            return "synthetic"
-        return "word" if len(self.phones) <= MAX_WORD_PHONES else "sentence"
+        """The kind of speech, see :func:`kind_of_speech`."""
+        return kind_of_speech(self.license, self.phones)
 
     @property
     def minutes(self) -> float:
@@ -70,13 +66,11 @@ def load_examples(
     *,
     any_license: bool,
     split: str = "train",
-    with_samples: bool = False,
 ) -> list[Example]:
-    """Read the recordings of one split, with their log-mel features and weights.
+    """Read the recordings of one split, with their log-mel features, samples and weights.
 
     ``errors`` receives a message for every row that cannot be used. For ``any_license``, see
-    :func:`read_corpus`. ``with_samples`` also loads the samples. Raises UserError if no recording
-    can be used.
+    :func:`read_corpus`. Raises UserError if no recording can be used.
     """
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
@@ -85,7 +79,7 @@ def load_examples(
         rows = read_corpus(corpus, errors, inventory, split=split, any_license=any_license)
         utterances += rows
         log_mels += log_mel_of(rows, errors)
-        sounds += samples_of(rows) if with_samples else [_NO_SAMPLES] * len(rows)
+        sounds += samples_of(rows)
     weights = weights_of(utterances)
     examples = []
     for utterance, weight, log_mel, sound in zip(
@@ -101,12 +95,12 @@ def load_examples(
         examples.append(
             Example(
                 log_mel=trimmed,
+                samples=sound[_samples_of(span, len(trimmed))],
                 phones=utterance.phones,
                 syllables=utterance.syllables,
                 weight=weight,
                 license=utterance.license,
                 speaker=utterance.speaker,
-                samples=sound[_samples_of(span, len(trimmed))],
             )
         )
     if not examples:
@@ -127,28 +121,27 @@ def weights_of(utterances: Sequence[Utterance]) -> list[float]:
     return weights
 
 
-def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArray[np.int16]]:
+def load_untranscribed(folder: Path, errors: RowErrors) -> list[NDArray[np.int16]]:
     """Read recordings without text, in any language, except those held out for measuring.
 
     Returns samples at 16 kHz, trimmed and cut into pieces of up to 20 s. ``errors`` receives a
     message for every file that cannot be used. Raises UserError if no file can be used.
     """
+    files = [Utterance(utterance_id=str(path), path=path) for path in audio_files(folder)]
+    sounds = samples_of(files)
     pieces = []
-    for folder in folders:
-        files = [Utterance(utterance_id=str(path), path=path) for path in audio_files(folder)]
-        sounds = samples_of(files)
-        for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
-            if log_mel is None:
-                continue
-            span = speech_span(log_mel)
-            num_frames = len(log_mel[span])
-            if num_frames < _MIN_PIECE_FRAMES:
-                errors.add(file.utterance_id, "it is too short")
-            for start in range(0, num_frames - _MIN_PIECE_FRAMES + 1, _MAX_PIECE_FRAMES):
-                piece = slice(span.start + start, span.stop)
-                pieces.append(sound[_samples_of(piece, min(_MAX_PIECE_FRAMES, num_frames - start))])
+    for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
+        if log_mel is None:
+            continue
+        span = speech_span(log_mel)
+        num_frames = len(log_mel[span])
+        if num_frames < _MIN_PIECE_FRAMES:
+            errors.add(file.utterance_id, "it is too short")
+        for start in range(0, num_frames - _MIN_PIECE_FRAMES + 1, _MAX_PIECE_FRAMES):
+            piece = slice(span.start + start, span.stop)
+            pieces.append(sound[_samples_of(piece, min(_MAX_PIECE_FRAMES, num_frames - start))])
     if not pieces:
-        raise errors.no_recording_error(f"in {', '.join(map(str, folders))}")
+        raise errors.no_recording_error(f"in {folder}")
     return pieces
 
 

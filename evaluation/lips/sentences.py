@@ -15,7 +15,6 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syl
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_syllables
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 
@@ -76,10 +75,6 @@ def clip_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
 def _make_clip(
     model: AcousticModel, path: Path, name: str, speaker: str, text: str = ""
 ) -> LipClip:
-    try:
-        samples = read_audio(path)
-    except ValueError as error:
-        raise UserError(str(error)) from error
     return LipClip(
         name=name,
         speaker=speaker,
@@ -88,5 +83,5 @@ def _make_clip(
         transcript=text,
         time_s=np.zeros(0),
         faps=np.zeros((0, len(MOUTH_FAPS))),
-        samples=samples,
+        samples=read_audio(path),
     )

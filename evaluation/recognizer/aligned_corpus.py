@@ -61,7 +61,7 @@ def align_corpus(
             samples = read_audio(utterance.path)
             syllables = syllables_of(utterance, model.inventory)
             phones = align_syllables(model, samples, syllables).phones
-        except (UserError, ValueError) as error:
+        except UserError as error:
             errors.add(utterance.utterance_id, str(error))
             continue
         references.append(AlignedRecording(utterance, drop_pauses(phones, model.inventory)))

@@ -84,9 +84,7 @@ def train_blocks(
     whole = init_encoder(whisper)
     errors = RowErrors()
     backgrounds = training_backgrounds(read_sounds(sounds, any_license=any_license))
-    examples = load_examples(
-        corpora, errors, before.inventory, any_license=any_license, with_samples=True
-    )
+    examples = load_examples(corpora, errors, before.inventory, any_license=any_license)
     labels, checkpoint = (output.with_suffix(end) for end in (".labels.npz", ".network.pt"))
 
     def compute_labels() -> dict[str, ArrayLike]:

@@ -61,7 +61,7 @@ def train_gmm(
     train on.
     """
     errors = RowErrors()
-    examples = load_examples(corpora, errors, inventory, any_license=any_license, with_samples=True)
+    examples = load_examples(corpora, errors, inventory, any_license=any_license)
     lm = load_phone_lm(phone_lm, inventory) if phone_lm else phone_lm_of(examples, inventory)
     rng = np.random.default_rng(SEED)
     copies = [copy for example in examples for copy in _copies(example, rng)]

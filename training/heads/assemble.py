@@ -78,6 +78,7 @@ class HeadBuilder:
         self._layout = subdivide(self._plain, self._face).vertices
         self._cavity = mouth_cavity(mesh, subdivide(self._plain, self._face))
         self.reference = self._skin(self._plain)
+        self._outer = self._outer_vertices()
         self._map = self._face_map()
         self._scalp = paint.scalp(self._map, textures.load(folder, _PAINTED_HAIR))
         self._teeth = fitted_mesh.read(folder, "teeth/teeth_base/teeth_base")
@@ -287,15 +288,18 @@ class HeadBuilder:
         shifts = {fap: shift[at] for fap, shift in fields.items() if np.abs(shift[at]).max() > 1e-6}
         return HeadPiece("tears", part, "eye", 0.05, np.ones(len(at)), shifts)
 
-    def _face_map(self) -> paint.FaceMap:
+    def _outer_vertices(self) -> Index:
+        """Find the vertices of the left half that face outward."""
         skin = self.reference
-        uv = paint.skin_uv(skin.vertices)
         normals = subdivision.vertex_normals(skin.vertices, subdivision.triangles_of(skin.quads))
         outward = skin.vertices - [0, 0, paint.AXIS_Z]
         outward[:, 1] = 0
         outer = ((normals * outward).sum(axis=1) > 0) & (skin.vertices[:, 0] > -1e-6)
-        self._outer = np.flatnonzero(outer & ~self._cavity)
-        return paint.face_map(skin.vertices[self._outer], uv[self._outer], self._skin_source())
+        return np.flatnonzero(outer & ~self._cavity)
+
+    def _face_map(self) -> paint.FaceMap:
+        outer = self.reference.vertices[self._outer]
+        return paint.face_map(outer, paint.skin_uv(outer), self._skin_source())
 
     def _skin_source(self) -> Float:
         """Return the coordinates (V, 2) of the outer vertices in MakeHuman's skin, v downward."""

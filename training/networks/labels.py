@@ -78,7 +78,7 @@ def label(
     alignments of the recordings with text, and all recordings.
     """
     rng = np.random.default_rng(SEED)
-    folders = [load_untranscribed([folder], errors) for folder in untranscribed]
+    folders = [load_untranscribed(folder, errors) for folder in untranscribed]
     in_random_order = [examples[index] for index in rng.permutation(len(examples))]
     aligned, alignments = _align_examples(aligner, in_random_order)
     recordings = _recordings(aligned, alignments, mix)

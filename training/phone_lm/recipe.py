@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.speech_corpus import RowErrors, is_synthetic, read_corpus
+from kouxing.corpora.speech_corpus import RowErrors, kind_of_speech, read_corpus
 from kouxing.services.recognizer.acoustic.model_file import (
     parse_phone_lm,
     phone_lm_arrays,
@@ -39,7 +39,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.shared.user_file import read_text
-from kouxing.training.training_set import MAX_WORD_PHONES, Example
+from kouxing.training.training_set import Example
 
 PhoneStream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
 
@@ -222,7 +222,7 @@ def train_phone_lm(
         row.phones
         for corpus in corpora
         for row in read_corpus(corpus, errors, inventory, split="train")
-        if len(row.phones) > MAX_WORD_PHONES and not is_synthetic(row.license)
+        if kind_of_speech(row.license, row.phones) == "sentence"
     }
     corpus_stream = join_sentences(sorted(sentences), inventory)
     num_text = sum(map(len, streams))

@@ -67,10 +67,6 @@ def train_universal(
     store.standardize(data.recordings)
     stored = list(store.read(data.recordings))
     by_name = {recording.utterance_id: recording for recording in data.recordings}
-    weight_of = {
-        recording.utterance_id: weight
-        for recording, weight in zip(data.recordings, data.weights, strict=True)
-    }
     aligner = Aligner(by_name, inventory)
     saved = load_or_compute(states_file, partial(_aligned_states, aligner, stored))
     pieces = np.split(saved["states"].astype(np.int64), np.cumsum(saved["lengths"])[:-1])
@@ -80,11 +76,11 @@ def train_universal(
         new_readout(STATES_PER_PHONE * len(inventory)),
         aligned,
         states,
-        [weight_of[features.name] for features in aligned],
+        [data.weights[features.name] for features in aligned],
         num_steps=num_steps,
         checkpoint=checkpoint,
     )
-    topology, log_prior = _statistics(by_name, states, weight_of, inventory)
+    topology, log_prior = _statistics(by_name, states, data.weights, inventory)
     readout.mean[:] = torch.from_numpy(store.mean)
     readout.deviation[:] = torch.from_numpy(store.deviation)
     extension = export_extension(readout, model, LAYERS)

@@ -15,13 +15,13 @@ from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
     is_synthetic,
+    kind_of_speech,
     may_distribute,
     read_corpus,
     syllables_of,
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, load_inventory
-from kouxing.training.training_set import MAX_WORD_PHONES
 
 _MANDARIN_LIMITS = {"sentence": 560, "word": 350, "synthetic": 450}  # limits for a corpus
 _MAX_OF_SPEAKER = 13  # recordings of a speaker of English by native speakers of Mandarin
@@ -44,7 +44,7 @@ class TrainingSet:
     """Recordings with the phones of their words, and their sampling weights."""
 
     recordings: list[Utterance]
-    weights: list[float]
+    weights: dict[str, float]  # by the recording's id
 
 
 def read_training_set(
@@ -74,17 +74,19 @@ def read_training_set(
             groups[_group_of(recording)].append(recording)
     if clips:
         groups["grid"] += _grid_clips(clips, errors)
-    recordings, weights = [], []
+    recordings: list[Utterance] = []
+    weights: dict[str, float] = {}
     for name, group in sorted(groups.items()):
         usable = [
             recording
             for recording in group
             if _may_train(recording) and (any_license or may_distribute(recording.license))
         ]
-        minutes = sum(recording.seconds for recording in usable)
+        total_s = sum(recording.seconds for recording in usable)
         recordings += usable
         fraction = _FRACTIONS.get(name, _SYNTHETIC_FRACTION)
-        weights += [fraction * recording.seconds / minutes for recording in usable]
+        for recording in usable:
+            weights[recording.utterance_id] = fraction * recording.seconds / total_s
     if not recordings:
         raise errors.no_recording_error("in the corpora")
     return TrainingSet(recordings, weights)
@@ -112,8 +114,7 @@ def _sample_mandarin(corpus: Path, errors: RowErrors, *, any_license: bool) -> l
     random.Random(3).shuffle(rows)  # noqa: S311 - reproducible
     by_kind: dict[str, list[Utterance]] = defaultdict(list)
     for row in rows:
-        kind = "word" if len(row.phones) <= MAX_WORD_PHONES else "sentence"
-        by_kind["synthetic" if is_synthetic(row.license) else kind].append(row)
+        by_kind[kind_of_speech(row.license, row.phones)].append(row)
     drawn = [row for kind, some in by_kind.items() for row in some[: _MANDARIN_LIMITS[kind]]]
     converted = []
     for row in drawn:
