@@ -36,6 +36,7 @@ from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_e
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import MIN_VOICE, VoiceReadout
 from kouxing.training.model_card import write_card
+from kouxing.training.model_files import save_voice_readout
 from kouxing.training.networks.augmentation import disturb, scale_level
 from kouxing.training.seed import SEED
 
@@ -89,7 +90,7 @@ def train_traits(
         for parts in zip(feeling_fit, sound_fit, strict=True)
     )
     mean = (voice @ weights[:, :2] + bias[:2]).mean(axis=0)
-    VoiceReadout(weights, bias, mean.astype(np.float32)).save(output)
+    save_voice_readout(output, VoiceReadout(weights, bias, mean.astype(np.float32)))
     arousal, valence = _test_speakers(voice, feelings, speakers)
     write_card(
         output,

@@ -39,7 +39,7 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import Archive, load_component, write_archive
+from kouxing.services.recognizer.acoustic.model_file import Archive, load_component
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
@@ -143,13 +143,6 @@ class LipPredictor:
         output[..., faps] += profile.residual
         bias[..., faps] += profile.offset
         return replace(self, lip_weights=lips, output_weights=output, output_bias=bias)
-
-    def save(self, path: Path) -> None:
-        """Write the model as an npz file (arrays only, no pickle), weights in 16 bits."""
-        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
-        halves = {name: array.astype(np.float16) for name, array in arrays.items()}
-        exact = {name: arrays[name] for name in ("delays", "output_bias")}
-        write_archive(path, {"format": np.array(FORMAT), **halves, **exact})
 
 
 class LipPredictorStream:

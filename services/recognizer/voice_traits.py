@@ -27,10 +27,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.acoustic.model_file import Archive, load_component, write_archive
+from kouxing.services.recognizer.acoustic.model_file import Archive, load_component
 from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 
 TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
@@ -68,11 +66,6 @@ class VoiceReadout:
     def create_stream(self) -> VoiceTraitsStream:
         """Create the stream of one session."""
         return VoiceTraitsStream(self)
-
-    def save(self, path: Path) -> None:
-        """Write the model as an npz file (arrays only, no pickle)."""
-        arrays = {name: getattr(self, name) for name in ("weights", "bias", "mean")}
-        write_archive(path, {"format": np.array(FORMAT), **arrays})
 
 
 class VoiceTraitsStream:

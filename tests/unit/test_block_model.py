@@ -10,12 +10,13 @@ import torch
 from kouxing.services.recognizer.acoustic import blocks as blocks_module
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
+from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import export_onnx
 from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout, block_layout
+from kouxing.training.model_files import save_blocks, write_archive
 from kouxing.training.networks.network import EncoderShape
 from tests.system import HELLO
 
@@ -137,7 +138,7 @@ def test_long_speech_restarts_the_table_with_an_empty_past(monkeypatch: pytest.M
 
 def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
     path = tmp_path / "blocks.npz"
-    blocks().save(path)
+    save_blocks(path, blocks())
     arrays = read_archive(path).arrays
     changes: list[tuple[dict[str, np.ndarray], str]] = [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),

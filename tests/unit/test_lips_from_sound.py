@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.acoustic.model_file import write_archive
 from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     FORMAT,
@@ -18,6 +17,7 @@ from kouxing.services.recognizer.lip_predictor import (
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions
+from kouxing.training.model_files import save_lip_predictor, write_archive
 from tests.lip_predictors import NUM_FEATURES, NUM_LIPS, UNITS, random_lip_predictor
 from tests.live_streams import recognize_live
 from tests.system import VOWELS_FILE, samples_of_file
@@ -66,7 +66,7 @@ def test_each_delay_has_separate_outputs_and_times() -> None:
 
 def test_rejects_a_predictor_for_another_encoder(tmp_path: Path) -> None:
     path = tmp_path / "lips.npz"
-    MODEL.save(path)
+    save_lip_predictor(path, MODEL)
     assert load_lip_predictor(path).delays_s == MODEL.delays_s
     wider = np.pad(MODEL.projection, ((0, 2), (0, 0)))
     mean = np.pad(MODEL.feature_mean, (0, 2))

@@ -21,6 +21,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.training.model_files import save_gmm
 from tests.languages import flat_language, install_language
 from tests.live_streams import recognize_live
 from tests.system import VOWELS_FILE
@@ -67,7 +68,7 @@ def path(toy: PhoneInventory, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
     )
     path = tmp_path_factory.mktemp("model") / "toy.npz"
-    model.save(path)
+    save_gmm(path, model)
     return path
 
 

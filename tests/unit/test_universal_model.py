@@ -11,7 +11,6 @@ import torch
 from kouxing.services.recognizer.acoustic import load
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.acoustic.universal import save_universal
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared import fast_record
@@ -19,6 +18,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.training.blocks.network import BlockReadout, block_layout
+from kouxing.training.model_files import save_universal
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.universal.encoder import BLOCK_LENGTH, RIGHT_CONTEXT, FeatureEncoder
 from kouxing.training.universal.export import export_extension

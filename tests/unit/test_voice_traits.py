@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.acoustic.model_file import write_archive
 from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.voice_traits import (
@@ -16,6 +15,7 @@ from kouxing.services.recognizer.voice_traits import (
     load_voice_readout,
 )
 from kouxing.shared.errors import UserError
+from kouxing.training.model_files import save_voice_readout, write_archive
 
 PER_S = 50  # positions
 
@@ -118,7 +118,7 @@ def test_silence_and_speech_end_laughter() -> None:
 
 def test_the_shipped_readout_fits_the_encoder_and_others_are_rejected(tmp_path: Path) -> None:
     assert load_voice_readout().weights.shape == (load_encoder().state_width, NUM_TRAITS)
-    READOUT.save(tmp_path / "small.npz")
+    save_voice_readout(tmp_path / "small.npz", READOUT)
     with pytest.raises(UserError, match="weights has shape"):
         load_voice_readout(tmp_path / "small.npz")
     write_archive(tmp_path / "other.npz", {"format": np.array("encoder 1")})

@@ -32,7 +32,6 @@ from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
     parse_topology,
-    topology_arrays,
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, count_frames
 from kouxing.shared.terminal import print_message
@@ -42,6 +41,7 @@ from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
 from kouxing.training.encoder.singing import sing
 from kouxing.training.model_card import write_card
+from kouxing.training.model_files import save_blocks, topology_arrays
 from kouxing.training.networks.batches import FrameTargets, LabeledRecording
 from kouxing.training.networks.labels import STATES_PER_PHONE, DataMix, alignment_statistics, label
 from kouxing.training.networks.whisper import init_encoder, load_whisper
@@ -119,7 +119,7 @@ def train_blocks(
         log_prior=saved["log_prior"],
         acoustic_scale=_ACOUSTIC_SCALE,
     )
-    model.save(output)
+    save_blocks(output, model)
     minutes = sum(len(recording.targets) for recording in recordings) / FRAMES_PER_MINUTE
     write_card(
         output,

@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.model_file import write_archive
 from kouxing.services.recognizer.encoder import FORMAT, VoiceKind
 from kouxing.training.encoder.network import (
     MEAN_PITCH,
@@ -31,6 +30,7 @@ from kouxing.training.encoder.network import (
     NUM_INPUTS,
     AudioEncoder,
 )
+from kouxing.training.model_files import write_archive
 from kouxing.training.networks.onnx_graph import Floats, Graph, floats, module_arrays
 
 

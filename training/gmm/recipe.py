@@ -28,6 +28,7 @@ from kouxing.training.gmm.estimation import (
 )
 from kouxing.training.gmm.search_weights import SearchWeights, choose_search_weights
 from kouxing.training.model_card import write_card
+from kouxing.training.model_files import save_gmm
 from kouxing.training.networks.augmentation import augment_samples, scale_level
 from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
 from kouxing.training.seed import SEED
@@ -87,7 +88,7 @@ def train_gmm(
     )
 
     chosen = choose_search_weights(model, corpora, any_license=any_license)
-    (chosen or _UNTUNED).apply_to(model).save(output)
+    save_gmm(output, (chosen or _UNTUNED).apply_to(model))
     write_card(
         output,
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "

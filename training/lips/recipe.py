@@ -40,6 +40,7 @@ from kouxing.training.lips.positions import SpeechStretch, components_of, featur
 from kouxing.training.lips.recurrent import LipNetwork, SpeechExample, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
 from kouxing.training.model_card import write_card
+from kouxing.training.model_files import save_lip_predictor
 from kouxing.training.seed import SEED
 
 Floats = NDArray[np.float32]
@@ -116,7 +117,7 @@ def train_lips(folder: Path, output: Path, *, any_license: bool) -> None:
     ]
     network, losses = train_network(examples, num_epochs=NUM_EPOCHS, seed=SEED)
     lips = combine_parts(basis, network, *fit_linear(filmed, targets, counts))
-    lips.save(output)
+    save_lip_predictor(output, lips)
     write_card(
         output,
         title="Lip model",

@@ -32,13 +32,13 @@ from kouxing.services.recognizer.acoustic.model_file import (
     parse_phone_lm,
     phone_lm_arrays,
     read_archive,
-    write_archive,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.shared.user_file import read_text
+from kouxing.training.model_files import write_archive
 from kouxing.training.training_set import Example
 
 PhoneStream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence

@@ -47,7 +47,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -55,7 +54,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, ScoreRequest
 from kouxing.services.recognizer.acoustic.light import LightModel, build_light_model
-from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology, write_model
+from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     MAX_POSITIONS,
@@ -119,17 +118,6 @@ class BlockModel(NetworkModel):
         # copies: a view would keep the whole batch
         for row, (stream, block) in enumerate(blocks):
             stream.append_outputs(block, scores[row].copy(), states[row].copy(), new[row])
-
-    def save(self, path: Path) -> None:
-        """Write the model as an npz file (arrays only, no pickle)."""
-        write_model(
-            path,
-            FORMAT,
-            self.topology,
-            network=self.network,
-            log_prior=self.log_prior,
-            acoustic_scale=self.acoustic_scale,
-        )
 
 
 @dataclass(frozen=True, slots=True)

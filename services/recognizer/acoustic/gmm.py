@@ -28,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -38,7 +37,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Floats,
     ScoreRequest,
 )
-from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology, write_model
+from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
     NUM_STATIC,
@@ -117,21 +116,6 @@ class GmmModel(AcousticModel):
     def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
         """Score the frames of several streams, one stream at a time."""
         return [stream.score(frames) for stream, frames in requests]
-
-    def save(self, path: Path) -> None:
-        """Write the model as an npz file (arrays only, no pickle)."""
-        write_model(
-            path,
-            FORMAT,
-            self.topology,
-            weights=self.mixtures.weights,
-            means=self.mixtures.means,
-            covars=self.mixtures.covars,
-            rotation=self.rotation,
-            prior_mean=self.prior_mean,
-            half_width=self.half_width,
-            acoustic_scale=self.acoustic_scale,
-        )
 
 
 class GmmStream(AcousticStream):

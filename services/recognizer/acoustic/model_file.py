@@ -1,6 +1,6 @@
 """Model files: npz archives of plain arrays, without pickle. Every size is checked."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,7 +13,6 @@ from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSIT
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
 from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import open_output
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
 # For model files without a phone language model.
@@ -24,7 +23,6 @@ _MAX_STATES = 10_000
 _MAX_NODES = 10_000_000
 _MAX_WEIGHT = 10.0
 _MAX_RATE_WEIGHT = 1000.0
-_LANGUAGE = ("language", "phones")  # arrays
 Component = TypeVar("Component")
 _LOG_STEP = np.float32(0.05)  # nats; a phone language model's logs are stored in 8 bits
 
@@ -80,36 +78,6 @@ def load_component(
         return build(archive)
     except ValueError as error:
         raise UserError(f"{name} {path}: {error}; train it again") from error
-
-
-def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a model file."""
-    with open_output(path) as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-
-
-def write_model(path: Path, form: str, topology: Topology, **arrays: Any) -> None:
-    """Write an acoustic model: its format, its HMMs and other arrays or numbers."""
-    others = {name: np.asarray(values) for name, values in arrays.items()}
-    write_archive(path, {"format": np.array(form), **topology_arrays(topology), **others})
-
-
-def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the HMMs, and of their phone language model unless it is shipped."""
-    arrays, shipped = map(phone_lm_arrays, (topology.phone_lm, shipped_phone_lm()))
-    if all(np.array_equal(array, shipped[name]) for name, array in arrays.items()):
-        arrays = {name: arrays[name] for name in _LANGUAGE}
-    return {
-        **arrays,
-        "lm_scale": np.array(topology.lm_scale, np.float32),
-        "phone_penalty": np.array(topology.phone_penalty, np.float32),
-        "rate_weight": np.array(topology.rate_weight, np.float32),
-        "first_state": topology.first_state,
-        "log_stay": topology.log_stay,
-        "log_leave": topology.log_leave,
-        "duration_mean_s": topology.duration_mean_s,
-        "duration_spread_s": topology.duration_spread_s,
-    }
 
 
 def parse_topology(archive: Archive) -> Topology:

@@ -5,37 +5,24 @@ The file has an extension of the shipped block network instead of a network
 """
 
 import hashlib
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, model_of
-from kouxing.services.recognizer.acoustic.model_file import Archive, write_model
+from kouxing.services.recognizer.acoustic.model_file import Archive
 
 FORMAT = "universal 1"
 
 
 def parse_universal_model(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
     """Build the model on the block network; ``ValueError`` if something does not fit."""
-    if str(archive.array("block_network", ())) != _hash_of(network):
+    if str(archive.array("block_network", ())) != hash_of(network):
         raise ValueError("it belongs to another version of the block model")
     extension = archive.array("extension", None).astype(np.uint8)
     return model_of(archive, np.concatenate([network, extension]))
 
 
-def save_universal(path: Path, model: BlockModel, extension: NDArray[np.uint8]) -> None:
-    """Write a model that extends the network of the shipped block model."""
-    write_model(
-        path,
-        FORMAT,
-        model.topology,
-        block_network=_hash_of(model.network[: -len(extension)]),
-        extension=extension,
-        log_prior=model.log_prior,
-        acoustic_scale=model.acoustic_scale,
-    )
-
-
-def _hash_of(network: NDArray[np.uint8]) -> str:
+def hash_of(network: NDArray[np.uint8]) -> str:
+    """Return the hash that identifies a block network."""
     return hashlib.sha256(network.tobytes()).hexdigest()
