@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 
 from kouxing.services.service_kinds import KINDS
+from kouxing.shared.errors import UserError
 from kouxing.shared.keys import (
     CLIENT,
     add_key,
@@ -50,8 +51,11 @@ def add(
     roles = roles or [CLIENT]
     path = output or Path(f"{name}.key")
     check_output(path, force=force)
-    add_key(name, roles, path)
     kinds = [role.removeprefix("service:") for role in roles if role.startswith("service:")]
+    for kind in kinds:
+        if kind not in KINDS:
+            raise UserError(f"there is no service {kind!r}; choose one of {', '.join(KINDS)}")
+    add_key(name, roles, path)
     print_message(
         f"wrote {path}; move it to ~/.local/state/kouxing/{(kinds or [CLIENT])[0]}.key on the other"
         " machine (folder: mode 700, file: mode 600)"

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Callable, Iterator
 
 import pytest
+from kouxing_client.keys import Key, read_key
 from kouxing_client.messages import Speech
 
 from kouxing.services.control.config import ControlConfig
@@ -13,7 +14,7 @@ from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import key_folder, revoke_key
+from kouxing.shared.keys import format_key, key_folder, revoke_key
 from kouxing.shared.service import (
     EXIT_AFTER_S,
     HEARTBEAT_S,
@@ -294,8 +295,12 @@ def test_starts_again_when_a_rejected_key_was_replaced(
 
     revoke_key("keyed")
     wait_until(lambda: "does not accept" in caplog.text, step=step)
+    path = key_folder() / "keyed.key"
+    key = read_key(path)
+    path.write_text(format_key(Key(key.public, key.secret, key.public)), "utf-8")
+    wait_until(lambda: "belongs to another system than" in caplog.text, step=step)
     assert not service.should_exit
-    (key_folder() / "keyed.key").unlink()
+    path.unlink()
     wait_until(lambda: service.should_exit, step=step)
     assert service.has_new_key
     for one in (service, control):
