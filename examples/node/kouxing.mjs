@@ -14,6 +14,7 @@ const key = JSON.parse(await readFile(keyFile, "utf8").catch(() => {
   fail(`${keyFile} does not exist; start kouxing, or copy the file from its machine`);
 }));
 process.stdout.on("error", () => process.exit()); // the reader of the output, such as `head`, has ended
+let controlAddress = "";
 let numRequests = 0;
 
 /** Print a message and exit. */
@@ -37,9 +38,10 @@ function connect(Kind, endpoint) {
 
 export const connectDealer = (endpoint) => connect(Dealer, endpoint);
 
-/** Connect to control, which answers requests. */
-export function connectControl(address = "tcp://127.0.0.1:5550") {
-  const control = connect(Dealer, `${address} ${key.control}`);
+/** Connect to control, which answers requests. Without an address, use $KOUXING_CONTROL. */
+export function connectControl(address) {
+  controlAddress = address || process.env.KOUXING_CONTROL || "tcp://127.0.0.1:5550";
+  const control = connect(Dealer, `${controlAddress} ${key.control}`);
   control.receiveTimeout = 15_000; // ms
   return control;
 }
@@ -65,6 +67,6 @@ export function read([topic, body]) {
 export async function ask(control, kind, session, fields = {}) {
   await send(control, kind, session, { request: String(++numRequests), ...fields });
   return read(await control.receive().catch(() => {
-    fail("control does not answer; start it with: kouxing run");
+    fail(`control at ${controlAddress} does not answer; start it with: kouxing run`);
   }));
 }

@@ -1,7 +1,8 @@
 /* Follows the face of a session from C. Needs only libzmq 4.3 (Debian: libzmq3-dev).
 
    cc -std=c11 -Wall -o follow follow.c -lzmq
-   ./follow [SESSION [CONTROL-ADDRESS]]      (default: the newest session, tcp://127.0.0.1:5550)
+   ./follow [SESSION [CONTROL-ADDRESS]]
+   (default: the newest session, $KOUXING_CONTROL or tcp://127.0.0.1:5550)
 
    Prints a line per frame, 50 per second: the time of its sound and the opening of the jaw, one of
    ARKit's 52 weights. It waits for a session, follows it to other hosts, and ends with the session.
@@ -233,7 +234,8 @@ static void set_subscription(void *socket, int option, const char *kind, const c
 
 int main(int num_arguments, char **arguments) {
   const char *wanted = num_arguments > 1 ? arguments[1] : "";
-  const char *address = num_arguments > 2 ? arguments[2] : "tcp://127.0.0.1:5550";
+  const char *address = num_arguments > 2 ? arguments[2] : getenv("KOUXING_CONTROL");
+  if (!address || !*address) address = "tcp://127.0.0.1:5550";
   if (strlen(wanted) > MAX_NAME) fail("a session's name has at most 64 characters");
   Key key = user_key();
   void *context = zmq_ctx_new();

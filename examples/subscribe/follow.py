@@ -1,6 +1,7 @@
 """Follows the face of a session: pip install ./clients/python.
 
-usage: follow.py [SESSION [CONTROL-ADDRESS]]    (default: the newest session, tcp://127.0.0.1:5550)
+usage: follow.py [SESSION [CONTROL-ADDRESS]]
+(default: the newest session, $KOUXING_CONTROL or tcp://127.0.0.1:5550)
 
 Prints a line per frame, 50 per second: the time of its sound and the opening of the jaw, one of
 ARKit's 52 weights. It waits for a session, follows it to other hosts, and ends with the session.

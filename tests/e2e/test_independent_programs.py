@@ -217,6 +217,7 @@ def test_the_client_streams_wav_files(
 def test_without_a_server_each_program_prints_one_line(
     programs: list[list[str]], client: list[str]
 ) -> None:
+    load_user_key()  # creates it, if no system has started
     address = f"tcp://127.0.0.1:{free_port()}"
     assistant = [sys.executable, str(ROOT / "examples" / "voice-assistant" / "assistant.py")]
     running = [
@@ -233,18 +234,18 @@ def test_without_a_server_each_program_prints_one_line(
         assert process.returncode == 1
 
 
-def test_follow_a_session_that_moves_to_its_end(system: System, programs: list[list[str]]) -> None:
+def test_follow_a_session_that_moves_to_its_end(
+    system: System, programs: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("KOUXING_CONTROL", system.control.partition(" ")[0])
     with (
         Client(system.control) as client,
         client.open_session(encoding="f32le") as session,
         ExitStack() as stack,
     ):
-        address = system.control.partition(" ")[0]
         running = [
             stack.enter_context(
-                subprocess.Popen(
-                    [*program, session.name, address], stdout=subprocess.PIPE, text=True
-                )
+                subprocess.Popen([*program, session.name], stdout=subprocess.PIPE, text=True)
             )
             for program in programs
         ]
