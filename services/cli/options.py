@@ -74,7 +74,8 @@ Assignments = Annotated[
     typer.Option(
         "--set",
         metavar="[SERVICE.]KEY=VALUE",
-        help="Set one key; repeatable. The service can be left out if there is only one.",
+        help="Set one key, as listed by 'kouxing config'; repeatable. Commands of one service also"
+        " take KEY=VALUE.",
     ),
 ]
 

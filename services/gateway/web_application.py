@@ -15,6 +15,7 @@ from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.services.heads import HEAD_NAMES, page_file, page_heads_folder
 from kouxing.services.lip_models import lip_models
+from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.logs import LOG
 from kouxing.shared.phones.inventory import language_titles
@@ -135,7 +136,10 @@ def make_application(
     ``head`` is a built-in head or a GLB file, to serve as ``head.glb``.
     ``routes`` are private: sessions and uploads. Pages of ``frame_ancestors``, origins that are
     separated by spaces, may show the page in a frame.
+
+    Raises ``UserError`` if the page cannot show the head.
     """
+    _check_head(head)
     application = web.Application(
         middlewares=[access.middleware({route.path for route in routes})],
         client_max_size=MAX_BODY_BYTES,
@@ -168,6 +172,18 @@ def make_application(
             prefix = f"/modules/three/{folder}"
             application.router.add_static(prefix, path, chunk_size=CHUNK_BYTES)
     return application
+
+
+def _check_head(head: str) -> None:
+    if head in HEAD_NAMES:
+        return
+    if not Path(head).is_file():
+        raise UserError(f"gateway.head: {head}: no such file")
+    if Path(head).suffix.lower() != ".glb":
+        raise UserError(
+            "gateway.head: the page needs a GLB file; run:"
+            f" kouxing head export head.glb --head {head}"
+        )
 
 
 async def discard_body(request: web.Request) -> None:

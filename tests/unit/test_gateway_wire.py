@@ -3,12 +3,14 @@
 import asyncio
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from kouxing.services.gateway import browser_messages
+from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.browser_messages import parse_face_settings
 from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.services.gateway.sample_sentence import SampleSentence
@@ -20,7 +22,7 @@ from kouxing.services.gateway.viewer_queue import (
     MessageKind,
     ViewerQueue,
 )
-from kouxing.services.gateway.web_application import OpenWebSockets
+from kouxing.services.gateway.web_application import OpenWebSockets, make_application
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
@@ -169,6 +171,13 @@ def test_an_avatar_gets_the_weights_of_its_shapes(message_format: str) -> None:
     expected = [weights[shapes[mesh, shape]] for mesh, shape in targets]
     np.testing.assert_allclose(received, expected, atol=1e-4)
     assert max(expected) > 0.01
+
+
+@pytest.mark.parametrize(("name", "error"), [("a.glb", "no such file"), ("a.vrm", "GLB file; run")])
+def test_the_page_needs_a_glb_file_as_its_head(tmp_path: Path, name: str, error: str) -> None:
+    (tmp_path / "a.vrm").touch()
+    with pytest.raises(UserError, match=error):
+        make_application(head=str(tmp_path / name), routes=[], access=AccessPolicy())
 
 
 def drain(viewer_queue: ViewerQueue) -> list[str | bytes]:
