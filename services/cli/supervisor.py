@@ -75,10 +75,8 @@ class Supervisor:
         self._log_folder = log_folder
         self._console = console
         self._environment = {**os.environ, **(environment or {})}
-        more = more or {}
-        self._services = {
-            name: self._make_service(name, more.get(name, {})) for name in (*services, *more)
-        }
+        self._additions = {**{name: {} for name in services}, **(more or {})}
+        self._services: dict[str, _Service] = {}
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
         self._process_ended = threading.Event()
@@ -86,8 +84,7 @@ class Supervisor:
         path = log_folder
         try:
             log_folder.mkdir(parents=True, exist_ok=True)
-            for service in self._services.values():
-                path = service.log_path
+            for path in map(self._log_path, self._additions):
                 LogFile(path, self._warn).check()
         except OSError as error:
             raise UserError(
@@ -97,12 +94,12 @@ class Supervisor:
 
     def start(self) -> None:
         """Start every service."""
-        for service in self._services.values():
-            self._start(service)
+        for name, additions in self._additions.items():
+            self.start_service(name, additions)
 
-    def start_service(self, name: str, environment: Mapping[str, str]) -> None:
+    def start_service(self, name: str, additions: Mapping[str, str]) -> None:
         """Start a service, or start it again, with additions to the environment."""
-        service = self._services[name] = self._make_service(name, environment)
+        service = self._services[name] = _Service(name, self._log_path(name), additions)
         self._start(service)
 
     def wait_ready(self, control: str) -> None:
@@ -186,8 +183,8 @@ class Supervisor:
         for service in self._services.values():
             service.process = None
 
-    def _make_service(self, name: str, environment: Mapping[str, str]) -> _Service:
-        return _Service(name, self._log_folder / f"{name}.log", environment)
+    def _log_path(self, name: str) -> Path:
+        return self._log_folder / f"{name}.log"
 
     def _processes(self) -> list[ServiceProcess]:
         return [s.process for s in self._services.values() if s.process is not None]
