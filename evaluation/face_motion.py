@@ -34,7 +34,7 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
 from kouxing.shared.phones.events import Progress
 from kouxing.shared.terminal import CONSOLE
 
@@ -48,7 +48,6 @@ _MATCH_S = (0.1, 0.3)  # range of the time from a stressed vowel to the peak of 
 _NOD_DEG, _BROW_UNITS = 0.5, 15.0  # prominence of peaks
 _CLOSED_LID = 450.0  # FAP units, half of a closed lid
 _STILL_DEG, _STILL_UNITS = 0.01, 0.5
-_DEGREE = np.deg2rad(1.0) / RADIANS_PER_ANGLE_UNIT
 _BROW, _LID, _PITCH, _UPPER, _LOWER = (
     FAP_NUMBER[name] - 1
     for name in (
@@ -125,7 +124,7 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
     minutes = sum(end - start for session in sessions for start, end in session.spans) / 60
     frames = np.concatenate([session.faps for session in sessions])
     blinks_s = _blink_durations_s(frames, rate_hz)
-    nods_s = [_find_peaks(session, _PITCH, _NOD_DEG * _DEGREE, rate_hz) for session in sessions]
+    nods_s = [_find_peaks(session, _PITCH, _NOD_DEG * DEGREE, rate_hz) for session in sessions]
     brow_raises_s = [_find_peaks(session, _BROW, _BROW_UNITS, rate_hz) for session in sessions]
     all_times_s = [
         np.concatenate([np.arange(*span, 0.02) for span in session.spans]) for session in sessions
@@ -251,7 +250,7 @@ def _blink_durations_s(faps: Floats, rate_hz: float) -> Times:
 def _is_still(faps: Floats) -> NDArray[np.bool_]:
     """Return whether each frame, except the first, looks like the previous frame."""
     limits = np.full(faps.shape[1], _STILL_UNITS)
-    limits[_ANGLES] = _STILL_DEG * _DEGREE
+    limits[_ANGLES] = _STILL_DEG * DEGREE
     still: NDArray[np.bool_] = np.all(np.abs(np.diff(faps, axis=0)) <= limits, axis=1)
     return still
 

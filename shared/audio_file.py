@@ -307,10 +307,10 @@ def _make_source(
         for block in _blocks(sound.blocks, path, rate_hz, sound.num_channels, block_s):
             num_read += len(block)
             yield block
-        if not sound.warnings:
-            sound.warnings.extend(
-                _missing_audio_warnings(path, num_read / rate_hz, begin, num_bytes())
-            )
+        if not sound.warnings:  # the header may state more bytes than the file has
+            read_s = num_read / rate_hz
+            stated_s = read_s * (read_stated_size(begin) or 0) / num_bytes()
+            sound.warnings.extend(_cut_off_warnings(path, read_s, stated_s))
 
     return AudioSource(
         name=name,
@@ -387,12 +387,8 @@ def _resample(
         yield resampler.resample_chunk(end, last=True)
 
 
-def _missing_audio_warnings(path: str, read_s: float, begin: bytes, num_bytes: int) -> list[str]:
-    """Return a warning if a file is shorter than its header states."""
-    return _cut_off_warnings(path, read_s, read_s * (read_stated_size(begin) or 0) / num_bytes)
-
-
 def _cut_off_warnings(path: str, read_s: float, stated_s: float) -> list[str]:
+    """Return a warning if a file is shorter than its header states."""
     if stated_s - read_s < _MIN_MISSING_S:
         return []
     return [f"{path}: the file is cut off after {read_s:.1f} s of {stated_s:.1f} s"]

@@ -49,10 +49,6 @@ class Metrics:
         """Add to a counter."""
         self.counts[name] += amount
 
-    def set(self, name: str, value: float) -> None:
-        """Set a gauge."""
-        self.values[name] = value
-
     def observe(self, name: str, value_ms: float) -> None:
         """Add a value to a latency. Its name has the unit, for example ``chunk_ms``."""
         if name not in self.distributions:

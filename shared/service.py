@@ -314,8 +314,7 @@ class Service(MessageLoop):
         is_idle = not sessions or self.kind.role != "worker"
         self._heartbeat_due_s = now_s + (IDLE_HEARTBEAT_S if is_idle else HEARTBEAT_S)
         parent_process.send_pulse(is_idle=is_idle)
-        for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():
-            self.metrics.set(name, value)
+        self.metrics.values |= {"sessions": len(sessions), "load": load, **self.gauges()}
         if now_s >= self._snapshot_due_s:
             self._snapshot_due_s = now_s + SNAPSHOT_S
             self._snapshot = {**self.metrics.snapshot(now_s), "memory_mb": memory_mb()}

@@ -37,20 +37,7 @@ class Recognizer:
 
     def __init__(self, model: AcousticModel, rule: OutputRuleConfig | None = None) -> None:
         self.model = model
-        self._models = {model.inventory.language: model}
         self._rule = rule or OutputRuleConfig()
-
-    def model_of(self, language: str | None) -> AcousticModel:
-        """Return the model with the phones of a language; None is the recognizer's own language.
-
-        Other models are loaded at their first use. Raises ``UserError`` if no model has the
-        language.
-        """
-        if language is None:
-            return self.model
-        if language not in self._models:
-            self._models[language] = load_model_for_language(language)
-        return self._models[language]
 
     def create_stream(
         self,
@@ -67,12 +54,14 @@ class Recognizer:
         lip frames. Otherwise, they get the longest delay that is in time for a face with the delay
         ``face_delay_s``. ``speech_time`` is the media time, samples at 16 kHz, at which the current
         speech started at another recognizer. The networks' blocks then align with the other
-        recognizer's. ``language`` is as for :meth:`model_of`.
+        recognizer's. ``language`` is the language of the phones; None is the recognizer's own.
+        Other models are loaded at their first use.
 
         Raises ``UserError`` if no model has the language.
         """
+        is_other = language not in (None, self.model.inventory.language)
         return SpeechStream(
-            self.model_of(language),
+            load_model_for_language(language) if is_other else self.model,
             self._rule,
             sample_rate_hz=sample_rate_hz,
             lip_predictor=lip_predictor,

@@ -4,6 +4,7 @@ An array of FAPs has shape ``(68,)``; index ``i`` holds FAP ``i + 1`` in FAP uni
 is ``value * FAPU / 1024``, an angle ``value * 1e-5`` rad.
 """
 
+import math
 from dataclasses import dataclass
 
 from kouxing.shared.tsv_tables import read_table
@@ -11,6 +12,7 @@ from kouxing.shared.tsv_tables import read_table
 NUM_FAPS = 68
 FAP_UNITS_PER_FAPU = 1024.0
 RADIANS_PER_ANGLE_UNIT = 1e-5
+DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT  # FAP units of an angle
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,14 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.expression_motion import ExpressionMotion
-from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import DEGREE, FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.smoothing import smooth_step, smoothing_gain
 
 RESTING_RATE_HZ = 25.0
 STALL_S = 1.0  # after this time without new frames, a face fades to rest
 FADE_S = 0.3
 
-_DEGREE = math.pi / 180.0 / RADIANS_PER_ANGLE_UNIT
 
 _BLINK_MEDIAN_S = 3.0
 _BLINK_LOG_SD = 0.5
@@ -107,7 +106,7 @@ class IdleMotion:
         self._wave_phase = waves.uniform(0.0, 2.0 * np.pi, wave_hz.shape)
         size = wave_hz**-0.5
         size *= np.sqrt(2.0 / np.sum(size**2, axis=1, keepdims=True))
-        self._wave_size = size * np.array([_BREATH_SD_DEG, *_HEAD_SD_DEG])[:, None] * _DEGREE
+        self._wave_size = size * np.array([_BREATH_SD_DEG, *_HEAD_SD_DEG])[:, None] * DEGREE
         self._liveliness = 1.0
         self._time_s = 0.0
         self._state = ConversationState.LISTENING
@@ -189,7 +188,7 @@ class IdleMotion:
         if np.array_equal(target, self._gaze_to):
             return
         self._gaze_from, self._gaze_to = self._gaze_at(saccade_s), target
-        size_deg = float(np.linalg.norm(target - self._gaze_from)) / _DEGREE
+        size_deg = float(np.linalg.norm(target - self._gaze_from)) / DEGREE
         self._saccade_s, self._saccade_length_s = saccade_s, 0.021 + 0.0022 * size_deg
 
     def _target(self) -> NDArray[np.float64]:
@@ -198,7 +197,7 @@ class IdleMotion:
         probability = 1.0 if self.has_eye_contact else _ON_LISTENER[self._state]
         is_on_listener = rng.random() < probability
         sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
-        return np.clip(rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG) * _DEGREE
+        return np.clip(rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG) * DEGREE
 
 
 class RestingFace:

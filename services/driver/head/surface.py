@@ -48,9 +48,8 @@ class Geodesics:
         """
         to_moving, to_fixed = self.distance(moving), self.distance(fixed)
         reached = np.isfinite(to_moving)
-        fraction = np.where(np.isfinite(to_fixed), 1.0, 0.0)
-        both = reached & (fraction > 0)
-        fraction = np.where(reached, 1.0, 0.0)
+        fraction = reached.astype(float)
+        both = reached & np.isfinite(to_fixed)
         fraction[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
         weight: Float = 0.5 - 0.5 * np.cos(np.pi * fraction)
         return weight

@@ -7,21 +7,18 @@ action units 1, 2, 4, 5, 6, 12 and 15). Closures stay closed, as in
 :mod:`kouxing.services.synthesizer.modifiers.expressiveness`.
 """
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import DEGREE, FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _GAIN = 2.5  # usual voices differ from their mean by up to 0.4
 _FILTER_S = 0.4  # time constant of each filter pole
 _VISIBLE = 1e-3  # weaker feelings are not shown
 _SIZE = 0.25  # increase of the mouth's movements at full arousal
-_DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
 def _named_faps(**units: float) -> NDArray[np.float32]:
@@ -39,13 +36,13 @@ _AROUSED = _named_faps(
     raise_S_m_eyebrow=50.0,
     raise_S_o_eyebrow=45.0,
     close_t_S_eyelid=-110.0,
-    head_pitch=-1.5 * _DEGREE,
+    head_pitch=-1.5 * DEGREE,
 )
 _TIRED = _named_faps(
     raise_S_m_eyebrow=-15.0,
     raise_S_o_eyebrow=-25.0,
     close_t_S_eyelid=170.0,
-    head_pitch=2.0 * _DEGREE,
+    head_pitch=2.0 * DEGREE,
 )
 _PLEASANT = _named_faps(
     raise_S_cornerlip=110.0,

@@ -22,7 +22,7 @@ from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.services.synthesizer.modifiers.prosody import pop_until
 from kouxing.shared.face.expression_motion import EXPRESSION_FAPS
 from kouxing.shared.face.expressions import ExpressionName
-from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
 from kouxing.shared.face.high_level_faps import VISEME_NAMES, VISEMES
 
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
@@ -34,7 +34,6 @@ _LEAD_S = 0.06  # levels act this much earlier, if known, to compensate for the 
 _LAUGH_EASE_S = 0.045  # time constant of each filter pole; notes remain visible
 _LOUDNESS_DB, _FORGET_DB_S = 30.0, 6.0  # range of the loudness; decay of P per second
 _NOSTRILS = 60.0  # FAP units
-_DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 _OPEN_VOWEL = VISEMES[VISEME_NAMES.index("A:")]
 _HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
 
@@ -42,7 +41,7 @@ _HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
 def _open_mouth(amount: float, pitch_deg: float) -> NDArray[np.float32]:
     """Return FAPs (68,) of an open mouth and a lifted head."""
     faps: NDArray[np.float32] = np.float32(amount) * _OPEN_VOWEL
-    faps[_HEAD_PITCH] = pitch_deg * _DEGREE
+    faps[_HEAD_PITCH] = pitch_deg * DEGREE
     return faps
 
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.services.synthesizer.modifiers.prosody import Prosody, ProsodyTracker
-from kouxing.shared.face.faps import RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import DEGREE
 from kouxing.shared.face.idle_motion import (
     EYES_PITCH,
     EYES_YAW,
@@ -65,7 +65,6 @@ _TURN_S = 0.5  # start times in the same interval of this length have the same d
 _BROWS = fap_slice("raise_l_i_eyebrow", "raise_r_o_eyebrow")
 _BROW_UNITS = np.array([*_BROW.values()], np.float32)
 _HEAD = fap_slice("head_pitch", "head_roll")
-_DEGREE = math.radians(1.0) / RADIANS_PER_ANGLE_UNIT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,10 +124,10 @@ class SpeechMotionModifier:
         pitch = self._nod.at(now_s, step_s) - _LIFT_DEG * lift
         yaw, roll = self._turn.at(now_s, step_s), self._tilt.at(now_s, step_s)
         if pitch or yaw or roll:
-            faps[_HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(_DEGREE)
+            faps[_HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(DEGREE)
             # the gaze target stays in place
-            faps[EYES_PITCH] -= np.float32(pitch * _DEGREE)
-            faps[EYES_YAW] -= np.float32(yaw * _DEGREE)
+            faps[EYES_PITCH] -= np.float32(pitch * DEGREE)
+            faps[EYES_YAW] -= np.float32(yaw * DEGREE)
 
     def _start_movements(self, prosody: Prosody, now_s: float, *, starts: bool) -> None:
         may_nod = now_s - self._nod_s > _MIN_NOD_INTERVAL_S
