@@ -41,22 +41,16 @@ class FaceSettings(Struct, frozen=True, kw_only=True):
 
     def merged_with(self, change: FaceSettings) -> FaceSettings:
         """Return these settings after a change."""
-        shapes = dict.fromkeys([*(self.shapes or ()), *(change.shapes or ())])
-        expressed = self if change.expressions is None else change
         changed = {
             name: value
             for name in change.__struct_fields__
             if (value := getattr(change, name)) is not None
         }
-        return replace(
-            self,
-            **changed
-            | {
-                "expressions": expressed.expressions,
-                "hold_s": expressed.hold_s,
-                "shapes": list(shapes) or None,
-            },
-        )
+        if change.expressions is None:
+            del changed["hold_s"]  # it belongs to the expressions
+        shapes = dict.fromkeys([*(self.shapes or ()), *(change.shapes or ())])
+        changed["shapes"] = list(shapes) or None
+        return replace(self, **changed)
 
     def after(self, elapsed_s: float) -> FaceSettings:
         """Return these settings some time later; expressions that began to fade are left out."""
