@@ -1,7 +1,6 @@
 """The tables of lips: agreement with tracked lips, closures, look-ahead and motion."""
 
-from collections.abc import Iterator, Mapping
-from string import ascii_uppercase
+from collections.abc import Mapping
 from typing import Any
 
 from kouxing.evaluation.lips.lip_scores import ALL, MOCAP, REAL
@@ -13,18 +12,18 @@ _GROUPS = {"zh": "Mandarin", "zh new": "Mandarin, new", "en": "English", "en new
 _COMPARED_GROUPS = {"zh": "Mandarin", "en": "English", ALL: "all clips"}
 _OUR_LIP_MODEL = "learned"
 _FRAME_MS, _TICK_MS = 20, 17  # frame of the face; tick of a display at 60 Hz
-_COMPARED = {  # compared measures, and whether higher is better
-    "r_opening": ("correlation of the opening", True),
-    "r_width": ("correlation of the width", True),
-    "r_jaw": ("correlation of the jaw", True),
-    "closure_f1": ("F1 of closures", True),
-    "closure_precision": ("precision of closures", True),
-    "closure_recall": ("recall of closures", True),
-    "precision_bpm": ("precision of closures at b p m", True),
-    "precision_aei": ("precision of closures at a e i", True),
-    "precision_uo": ("precision of closures at u o", True),
-    "precision_pause": ("precision of closures in pauses", True),
-    "mtm_ms": ("MTM", False),
+_COMPARED = {  # measures that are best when they are high, except MTM
+    "r_opening": "correlation of the opening",
+    "r_width": "correlation of the width",
+    "r_jaw": "correlation of the jaw",
+    "closure_f1": "F1 of closures",
+    "closure_precision": "precision of closures",
+    "closure_recall": "recall of closures",
+    "precision_bpm": "precision of closures at b p m",
+    "precision_aei": "precision of closures at a e i",
+    "precision_uo": "precision of closures at u o",
+    "precision_pause": "precision of closures in pauses",
+    "mtm_ms": "MTM",
 }
 _REALISM_MEASURES = {  # measures that are best when they equal the value of real lips
     "slcc": "SLCC",
@@ -77,7 +76,6 @@ _FORMATS = {  # of measures; not of correlations
     **dict.fromkeys(_WHOLE_MEASURES, ".0f"),
     "turns_per_s": ".1f",
 }
-_MEASURE_NAMES = {name: title for name, (title, _) in _COMPARED.items()} | _REALISM_MEASURES
 _PROGRAM_TITLES = {
     "headaudio": "HeadAudio 0.1.0",
     "wlipsync": "wLipSync 1.3.1",
@@ -99,31 +97,20 @@ def title_of(face: str) -> str:
 
 def scores_table(faces: Figures) -> Table:
     """Return one table that fits a screen: the real lips and each face, by group of clips."""
-    titles = [title for title in faces if title != REAL]
-    is_single = len(titles) == 1  # a single face needs no letter
-    letters = {titles[0]: ""} if is_single else dict(zip(titles, _letters(), strict=False))
-    legend = ", ".join(
-        f"{letter}: {title}" if letter else title for title, letter in letters.items()
-    )
+    titles = [title for title in faces if title != REAL]  # too long for a column
     real = faces[REAL][CLEAN]
     rows = []
     for group in _main_groups(real):
         rows.append([group, *_console_cells(real[group])])
-        for title, letter in letters.items():
+        for number, title in enumerate(titles, 1):
             for condition, scores in faces[title].items():
                 if condition == CLEAN or group == ALL:
-                    label = f"  {letter}{_MARKS[condition]}"
+                    label = f"  {number}{_MARKS[condition]}"
                     rows.append([label, *_console_cells(scores[group])])
     counts = ", ".join(f"{group} {real[group]['clips']}" for group in _main_groups(real))
-    title = f"{legend}\nclips: {counts}\n{_LEGEND}"
-    return Table(("clips", *_CONSOLE_COLUMNS), rows, title)
-
-
-def _letters() -> Iterator[str]:
-    """Yield A to Z, AA to AZ, and so on: titles of faces are too long for a column."""
-    for first in ("", *ascii_uppercase):
-        for last in ascii_uppercase:
-            yield first + last
+    legend = ", ".join(f"{number}: {title}" for number, title in enumerate(titles, 1))
+    heading = f"{legend}\nclips: {counts}\n{_LEGEND}"
+    return Table(("clips", *_CONSOLE_COLUMNS), rows, heading)
 
 
 def _main_groups(real: Figures) -> list[str]:
@@ -198,7 +185,7 @@ def better_programs(faces: Figures) -> list[list[str]]:
     for group, group_title in _COMPARED_GROUPS.items():
         real = faces[REAL][CLEAN].get(group, {})
         of_group = {face: scores[face].get(group, {}) for face in (own, *others)}
-        for measure, name in _MEASURE_NAMES.items():
+        for measure, name in (_COMPARED | _REALISM_MEASURES).items():
             is_realism = measure in _REALISM_MEASURES
             if is_realism and (group != ALL or real.get(measure) is None):
                 continue
@@ -220,7 +207,7 @@ def _loss(measure: str, value: float, real: float | None) -> float:
     """Return a figure's loss; lower is better."""
     if measure in _REALISM_MEASURES:
         return abs(value - (real or 0.0))
-    return -value if _COMPARED[measure][1] else value
+    return value if measure == "mtm_ms" else -value
 
 
 def _describe(measure: str, scores: Figures) -> str:

@@ -113,13 +113,13 @@ def _browser_rows(browser: Figures, sizes: Figures) -> Iterator[list[str]]:
     )
     models = sizes.get("model_bytes", {})
     weights_mb = sum(models.get(name, 0) for name in _WEB_MODELS) / 1e6
-    floors = [(f"{weights_mb:.1f} / -", "weights of its models")] if weights_mb else []
+    our_floor = (f"{weights_mb:.1f} / -", "weights of its models") if weights_mb else ()
     for package in (browser, *browser["others"]):
         download_mb = f"{package['download_bytes'] / 1e6:.1f}"
         yield _row(
             f"{package['name']} in the browser: download, MB / share of a core, %",
             join_values([download_mb, percent(package["processor_share"], ".0f")]),
-            *(floors[0] if floors and package is browser else ()),
+            *(our_floor if package is browser else ()),
         )
         if package["num_clips"]:
             scores = (package["opening_correlation"], package["closure_f1"])

@@ -212,9 +212,9 @@ def measure(
             with tempfile.TemporaryDirectory() as temporary:
                 folder = Path(temporary) if logs is None else logs / f"{name}-{at_s:g}-s"
                 folder.mkdir(parents=True, exist_ok=True)
-                timing = replace(timing, fault_at_s=at_s)
+                times = replace(timing, fault_at_s=at_s)
                 try:
-                    outcome = _measure_fault(name, folder, sentence, undisturbed, timing, console)
+                    outcome = _measure_fault(name, folder, sentence, undisturbed, times, console)
                 except UserError as error:
                     outcome = FaultOutcome(fault=name, failure=str(error), load=os.getloadavg()[0])
             outcomes.append(outcome)

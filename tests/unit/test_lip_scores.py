@@ -51,7 +51,7 @@ def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
         assert {*results[title][MUSIC]} == groups
         assert {*results[title][CLEAN]["all"]} == {"clips", *MEASURES}
     assert results["learned, 0 ms"][CLEAN]["all"] != results["learned, 60 ms"][CLEAN]["all"]
-    assert "A: learned, 0 ms, B: learned, 60 ms" in result.output
+    assert "1: learned, 0 ms, 2: learned, 60 ms" in result.output
 
 
 def test_omitted_clips_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
