@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.scoring import align_symbols
 from kouxing.evaluation.lips.agreement import Agreement, MouthPair, agreement_of
 from kouxing.evaluation.lips.curves import rms_jerk
@@ -30,7 +31,7 @@ from kouxing.evaluation.lips.four_schemes import (
     make_frames,
 )
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import clip_mouth, predicted_mouth, real_mouth
+from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth, real_mouth
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.alignment import drop_pauses
@@ -79,43 +80,14 @@ def score_schemes(
         condition: [_mouth_frames(condition, sentence) for sentence in sentences]
         for condition in conditions
     }
-    inventory = recognizers[0].model.inventory
-    return SchemeComparison(
-        sentences=[sentence.sentence.clip.name for sentence in sentences],
-        scores=[
-            _condition_score(
-                condition,
-                [faps for faps in frames[condition] if faps is not None],
-                [d for s in sentences for d in phone_delays_s(condition, s, inventory)],
-                _pairs_with_aligned(
-                    frames[condition], frames[Condition(ALIGNED, condition.lips, "")]
-                ),
-                _pairs_with_tracked(frames[condition], sentences),
-            )
-            for condition in conditions
-        ],
-    )
-
-
-def _pairs_with_aligned(
-    frames: Sequence[Array | None], aligned: Sequence[Array | None]
-) -> list[MouthPair]:
-    return [
-        (predicted_mouth(faps), real_mouth(np.arange(len(reference)) / FRAME_RATE_HZ, reference))
-        for faps, reference in zip(frames, aligned, strict=True)
-        if faps is not None and reference is not None
-    ]
-
-
-def _pairs_with_tracked(
-    frames: Sequence[Array | None], sentences: Sequence[RecognizedSentence]
-) -> list[MouthPair]:
     clips = [sentence.sentence.clip for sentence in sentences]
-    return [
-        (predicted_mouth(faps), clip_mouth(clip))
-        for faps, clip in zip(frames, clips, strict=True)
-        if faps is not None and len(clip.time_s)
-    ]
+    inventory = recognizers[0].model.inventory
+    scores = []
+    for condition in conditions:
+        aligned = frames[Condition(ALIGNED, condition.lips, "")]
+        delays_s = [d for s in sentences for d in phone_delays_s(condition, s, inventory)]
+        scores.append(_score_condition(condition, frames[condition], aligned, clips, delays_s))
+    return SchemeComparison(sentences=[clip.name for clip in clips], scores=scores)
 
 
 def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array | None:
@@ -126,26 +98,40 @@ def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array |
     return None if frames is None else np.array([faps for _, faps in frames], dtype=float)
 
 
-def _condition_score(
+def _score_condition(
     condition: Condition,
-    frames: Sequence[Array],
+    frames: Sequence[Array | None],
+    aligned: Sequence[Array | None],
+    clips: Sequence[LipClip],
     delays_s: Sequence[float],
-    like_aligned: Sequence[MouthPair],
-    like_real: Sequence[MouthPair],
 ) -> ConditionScore:
-    delay_ms = percentiles(1e3 * np.array(delays_s))
+    """Compare frames with those of scheme 1, and with tracked lips, sentence by sentence."""
+    mouths: list[Mouth] = []
+    with_aligned: list[MouthPair] = []
+    with_tracked: list[MouthPair] = []
+    for faps, reference, clip in zip(frames, aligned, clips, strict=True):
+        if faps is None:
+            continue
+        mouth = predicted_mouth(faps)
+        mouths.append(mouth)
+        if reference is not None:
+            time_s = np.arange(len(reference)) / FRAME_RATE_HZ
+            with_aligned.append((mouth, real_mouth(time_s, reference)))
+        if len(clip.time_s):
+            with_tracked.append((mouth, clip_mouth(clip)))
     is_live = condition.scheme > RECOGNIZED
+    delay_ms = percentiles(1e3 * np.array(delays_s))
     return ConditionScore(
         scheme=condition.scheme,
         lips=condition.lips,
         recognizer=condition.recognizer,
-        num_sentences=len(frames),
+        num_sentences=len(mouths),
         face_delay_ms=lip_model_info(condition.lips).delay_ms if is_live else None,
         phone_delay_p50_ms=delay_ms.get("p50"),
         phone_delay_p95_ms=delay_ms.get("p95"),
-        jerk=rms_jerk([predicted_mouth(faps).opening for faps in frames], FRAME_RATE_HZ),
-        like_scheme_1=agreement_of(like_aligned) if like_aligned else None,
-        like_real_lips=agreement_of(like_real) if like_real else None,
+        jerk=rms_jerk([mouth.opening for mouth in mouths], FRAME_RATE_HZ),
+        like_scheme_1=agreement_of(with_aligned) if with_aligned else None,
+        like_real_lips=agreement_of(with_tracked) if with_tracked else None,
     )
 
 
