@@ -91,27 +91,18 @@ def _signal_service(service: str, number: int) -> Actions:
     """Return a fault that signals the process that serves the session."""
 
     def actions(system: System, session: str, timing: Timing) -> list[Action]:
-        process_id = system.process_of(session, service)
-        if number == signal.SIGSTOP:
-            return _stop_and_continue(process_id, timing.fault_at_s, timing.frozen_s)
-        return [_send_signal(process_id, number, timing.fault_at_s)]
+        send = functools.partial(_send_signal, system.process_of(session, service))
+        fault: Action = timing.fault_at_s, functools.partial(send, number)
+        until_s = timing.fault_at_s + timing.frozen_s
+        end: Action = until_s, functools.partial(send, signal.SIGCONT)
+        return [fault, end] if number == signal.SIGSTOP else [fault]
 
     return actions
 
 
-def _send_signal(process_id: int, number: int, at_s: float) -> Action:
-    def send() -> None:
-        with contextlib.suppress(ProcessLookupError):  # the supervisor has ended it
-            os.kill(process_id, number)
-
-    return at_s, send
-
-
-def _stop_and_continue(process_id: int, at_s: float, for_s: float) -> list[Action]:
-    return [
-        _send_signal(process_id, signal.SIGSTOP, at_s),
-        _send_signal(process_id, signal.SIGCONT, at_s + for_s),
-    ]
+def _send_signal(process_id: int, number: int) -> None:
+    with contextlib.suppress(ProcessLookupError):  # the supervisor has ended it
+        os.kill(process_id, number)
 
 
 def _load_processor(_system: System, _session: str, timing: Timing) -> list[Action]:
