@@ -15,7 +15,7 @@ import pytest
 
 from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.shared.errors import UserError
-from tests.system import ROOT
+from tests.system import CODE_PATH, ROOT
 
 USER_ID = 10001
 READ_CAP = "+dac_read_search"
@@ -108,7 +108,7 @@ class Containers:
         enter += ["sh", str(folder), str(self._hosts), target]
         own = {
             "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
-            "PYTHONPATH": f"{ROOT}:{ROOT / 'clients' / 'python'}",
+            "PYTHONPATH": CODE_PATH,
         }
         with self.log(host).open("ab") as log:
             return subprocess.Popen(

@@ -30,7 +30,8 @@ VOWELS_FILE = ROOT / "tests" / "sounds" / "vowels-male.wav"  # a o e i u ü, wit
 CHAIN = ("control", "recognizer", "synthesizer")
 SERVICE = ("-m", "kouxing.services.process")
 NODE = Path(sys.executable).with_name("node")
-LIMIT_S = 60.0  # for anything that takes no time on an idle machine
+CODE_PATH = os.pathsep.join([str(ROOT), str(ROOT / "clients" / "python")])  # for PYTHONPATH
+LIMIT_S = 120.0  # for anything that takes seconds on an idle machine
 SKIP_NO_AUDIO = {  # on a busy machine
     "KOUXING_MAX_LAG_S": "3600",
 }
@@ -88,12 +89,16 @@ def _reserve_port(host: str, port: int) -> int:
     return int(reserved.getsockname()[1])
 
 
+def child_environment() -> dict[str, str]:
+    """Return an environment in which programs use the code of this checkout."""
+    return {**os.environ, **ONE_THREAD, "PYTHONPATH": CODE_PATH}
+
+
 def own_environment(folder: Path) -> dict[str, str]:
     """Return an environment in which ``kouxing run`` uses free ports and has no window."""
     own = {"XDG_RUNTIME_DIR": str(folder), **SKIP_NO_AUDIO}  # commands find the system there
     return {
-        **os.environ,
-        **ONE_THREAD,
+        **child_environment(),
         **headless_settings(folder),
         **ADMIT_ANY_LOAD,
         **own_addresses(),
@@ -131,7 +136,7 @@ def kouxing(
     stdin: bytes | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end; no input may cause a traceback."""
-    environment = {**os.environ, **ONE_THREAD, "COLUMNS": "200", **(environment or {})}
+    environment = {**child_environment(), "COLUMNS": "200", **(environment or {})}
     if control:
         environment["KOUXING_CONTROL"] = control.partition(" ")[0]
     result = subprocess.run(
@@ -156,7 +161,7 @@ def start_python(
         environment["KOUXING_CONTROL"] = control.partition(" ")[0]
     return subprocess.Popen(
         [sys.executable, *map(str, arguments)],
-        env={**os.environ, **ONE_THREAD, **environment},
+        env={**child_environment(), **environment},
         cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,

@@ -37,7 +37,6 @@ def workers(report: Status) -> dict[str, str]:
     return {state.instance: state.service for state in report.services if state.service in kinds}
 
 
-@pytest.mark.timeout(400)  # on a busy machine
 def test_workers_are_placed_restarted_elsewhere_and_stopped(
     nodes: Cluster, control: System
 ) -> None:

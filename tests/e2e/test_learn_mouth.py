@@ -101,7 +101,6 @@ def lengthen(recording: bytes) -> bytes:
     return landmark_file(time_s, frames, sound, sample_rate_hz=rate_hz)
 
 
-@pytest.mark.timeout(400)  # on a busy machine
 def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
     control: FakeControl, browser: Browser
 ) -> None:
@@ -175,7 +174,6 @@ def test_a_slow_start_is_explained_from_the_first_moment(browser: Browser) -> No
     browser.evaluate("delete document.body.append")
 
 
-@pytest.mark.timeout(400)  # on a busy machine
 def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
     browser.evaluate(
         "import('/face-tracker.js').then(({ FaceTracker: { prototype } }) => {"

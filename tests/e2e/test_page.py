@@ -18,8 +18,6 @@ from tests.e2e.page_actions import A_FACE, B_FACE, NOTICE, STATE, choose, colorf
 from tests.e2e.page_control import LOOK_AHEAD_MS, PageControl
 from tests.system import Gateway, wait_until
 
-pytestmark = pytest.mark.timeout(400)
-
 IS_BEHIND = "document.getElementById('status').dataset.state === 'behind'"
 IS_BACK = f"!{STATE}.microphone && {STATE}.session === 'seen'"  # the microphone is off
 

@@ -15,8 +15,6 @@ from tests.e2e.page_actions import A_FACE, NOTICE, STATE, choose, colorfulness, 
 from tests.e2e.page_control import PageControl
 from tests.system import wait_until
 
-pytestmark = pytest.mark.timeout(400)
-
 
 def choose_file(page: Browser, path: Path) -> None:
     document = page.command("DOM.getDocument")["root"]["nodeId"]

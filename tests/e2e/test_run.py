@@ -1,7 +1,6 @@
 """``kouxing run``, as ``make demo`` and ``make run`` start it, and Ctrl-C at several stages."""
 
 import contextlib
-import os
 import re
 import shutil
 import signal
@@ -19,10 +18,10 @@ from tests.system import (
     CTRL_C_COMMAND,
     LIGHT_MODEL,
     LIMIT_S,
-    ONE_THREAD,
-    ROOT,
     VOWELS_FILE,
+    child_environment,
     kouxing,
+    own_addresses,
     own_environment,
     start_python,
     wait_until,
@@ -126,15 +125,15 @@ def test_names_the_option_of_a_port_that_is_taken(tmp_path: Path) -> None:
 
 def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
     environment = {
-        **ONE_THREAD,
+        **child_environment(),
         **LIGHT_MODEL,
-        "PYTHONPATH": str(ROOT),
+        **own_addresses(),
         "XDG_RUNTIME_DIR": str(tmp_path),
     }
     control = tmp_path / "out" / "logs" / "control.log"
     with subprocess.Popen(
-        [sys.executable, "-c", CTRL_C_COMMAND, "run", "--no-browser", "--port", "0"],
-        env=os.environ | environment,
+        [sys.executable, "-c", CTRL_C_COMMAND, "run", "--no-browser"],
+        env=environment,
         cwd=tmp_path,
         stderr=subprocess.PIPE,
         text=True,
@@ -154,7 +153,7 @@ def test_an_interrupted_render_leaves_no_file(tmp_path: Path) -> None:
     program = CTRL_C_AT_FIRST_IMAGE + CTRL_C_COMMAND
     result = subprocess.run(
         [sys.executable, "-c", program, "render", SENTENCE, "face.mp4"],
-        env=os.environ | ONE_THREAD | {"PYTHONPATH": str(ROOT)},
+        env=child_environment(),
         cwd=tmp_path,
         capture_output=True,
         check=False,

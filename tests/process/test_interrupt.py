@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system import CTRL_C_COMMAND, LIMIT_S, ROOT, VOWELS_FILE, start_python
+from tests.system import CODE_PATH, CTRL_C_COMMAND, LIMIT_S, VOWELS_FILE, start_python
 
 INSTALL = """
 import signal
@@ -129,13 +129,13 @@ RECIPES = (
     ],
 )
 def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) -> None:
-    process = start_python("-c", INSTALL + program, PYTHONPATH=str(ROOT))
+    process = start_python("-c", INSTALL + program)
     assert process.communicate(timeout=LIMIT_S) == (printed, "")
 
 
 @pytest.mark.parametrize("place", ["FFmpeg", "import", "shutdown", "options"])
 def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) -> None:
-    program, path = CTRL_C_COMMAND, str(ROOT)
+    program, path = CTRL_C_COMMAND, CODE_PATH
     if place == "FFmpeg":
         program = INTERRUPT_IN_FFMPEG + CTRL_C_COMMAND
     elif place == "shutdown":
@@ -144,7 +144,7 @@ def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) 
         program = INTERRUPT_IN_OPTIONS + CTRL_C_COMMAND
     else:
         (tmp_path / "onnxruntime.py").write_text(INTERRUPT_IN_IMPORT)
-        path = f"{tmp_path}{os.pathsep}{ROOT}"
+        path = f"{tmp_path}{os.pathsep}{CODE_PATH}"
     process = start_python("-c", program, "phones", str(VOWELS_FILE), PYTHONPATH=path)
     printed, log = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, printed) == (130, "")
@@ -159,7 +159,7 @@ def test_ctrl_c_ends_every_recipe_and_leaves_no_output(tmp_path: Path) -> None:
     for name in ("manifest.tsv", "model.bin", "a.flac", "a.csv", "a.json"):
         (data / name).touch()
     lines = [line.format(data=data, out=out) for line in RECIPES]
-    process = start_python("-c", INTERRUPT_EACH_COMMAND, *lines, PYTHONPATH=str(ROOT))
+    process = start_python("-c", INTERRUPT_EACH_COMMAND, *lines)
     printed, log = process.communicate(timeout=4 * LIMIT_S)
     assert json.loads(printed) == dict.fromkeys(lines, 130), log
     assert log == ""
@@ -169,6 +169,6 @@ def test_ctrl_c_ends_every_recipe_and_leaves_no_output(tmp_path: Path) -> None:
 def test_onnxruntime_stores_no_usage_data(tmp_path: Path) -> None:
     program = "import kouxing.services.recognizer.onnx_session"
     without_ci = {"CI": "", "ORT_DISABLE_TELEMETRY": ""}
-    process = start_python("-c", program, PYTHONPATH=str(ROOT), HOME=str(tmp_path), **without_ci)
+    process = start_python("-c", program, HOME=str(tmp_path), **without_ci)
     assert process.communicate(timeout=LIMIT_S) == ("", "")
     assert [*tmp_path.iterdir()] == []

@@ -8,7 +8,7 @@ import pytest
 
 from kouxing.corpora import parallel
 from kouxing.corpora.parallel import process_in_order
-from tests.system import LIMIT_S, ROOT, start_python
+from tests.system import LIMIT_S, start_python
 
 # Ctrl-C reaches all processes, or only the first, while one of them works on an endless item.
 INTERRUPT_PROCESSES = """
@@ -66,6 +66,6 @@ def test_an_error_ends_no_other_process(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.parametrize("receivers", ["all", "first"])
 def test_ctrl_c_ends_all_processes_without_a_traceback(receivers: str) -> None:
-    process = start_python("-c", INTERRUPT_PROCESSES, receivers, PYTHONPATH=str(ROOT))
+    process = start_python("-c", INTERRUPT_PROCESSES, receivers)
     assert process.communicate(timeout=LIMIT_S) == ("", "")  # no process holds the pipes open
     assert process.returncode == 130

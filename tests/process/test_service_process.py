@@ -10,8 +10,8 @@ import pytest
 
 from kouxing.shared.config import variable_name
 from tests.system import (
+    CODE_PATH,
     LIMIT_S,
-    ROOT,
     SERVICE,
     can_connect,
     own_addresses,
@@ -47,7 +47,7 @@ def test_ctrl_c_in_imports_prints_nothing(
 ) -> None:
     ctrl_c = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / f"{slow_import}.py").write_text(ctrl_c)
-    path = f"{tmp_path}{os.pathsep}{ROOT}"
+    path = f"{tmp_path}{os.pathsep}{CODE_PATH}"
     assert run_to_end(*arguments, PYTHONPATH=path) == (-signal.SIGINT, "")
 
 
