@@ -36,17 +36,15 @@ _LOOK_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "VRM")
 Float64 = NDArray[np.float64]
 
 
-class BadGlbError(Exception):
-    """Raised if an undamaged file cannot be used; the text names the problem and the remedy."""
-
-
 @contextlib.contextmanager
 def check_glb(path: Path) -> Iterator[None]:
     """Raise ``UserError`` with the path of the GLB for every error of the enclosed code."""
     with check_content(path, "a GLB file; export it again"):
         try:
             yield
-        except BadGlbError as error:
+        except UserError as error:
+            if str(path) in str(error):  # from reading the file
+                raise
             raise UserError(f"{path}: {error}") from error
 
 
@@ -56,9 +54,9 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
         raise ValueError("it is not a binary glTF file")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise BadGlbError(f"it has version {version} of glTF; export it as glTF 2.0")
+        raise UserError(f"it has version {version} of glTF; export it as glTF 2.0")
     if length > len(data):
-        raise BadGlbError(f"it is cut off after {len(data)} of {length} bytes; copy it again")
+        raise UserError(f"it is cut off after {len(data)} of {length} bytes; copy it again")
     chunks: dict[bytes, bytes] = {}
     offset = 12
     while offset + 8 <= length:
@@ -73,8 +71,8 @@ def _chunks(data: bytes) -> dict[bytes, bytes]:
 class GlbFile:
     """A glTF file with its buffers.
 
-    Raises ``UserError`` if the file cannot be read, ``BadGlbError`` if it requires an unsupported
-    extension, and any exception if it is damaged (``check_glb``).
+    Raises ``UserError`` if the file cannot be read or requires an unsupported extension, and any
+    exception if it is damaged (``check_glb``).
     """
 
     def __init__(self, path: Path) -> None:
@@ -90,7 +88,7 @@ class GlbFile:
         unknown = {name for name in needed - _SUPPORTED if not name.startswith(_LOOK_EXTENSIONS)}
         if unknown:
             names = ", ".join(sorted(unknown))
-            raise BadGlbError(
+            raise UserError(
                 f"it needs {names}, which kouxing does not support; export it without them"
             )
         self._buffer = cache(self._load_buffer)
@@ -99,7 +97,7 @@ class GlbFile:
     def _allow(self, num_bytes: int) -> None:
         self._num_bytes += num_bytes
         if self._num_bytes > MAX_BYTES:
-            raise BadGlbError(f"it is larger than {MAX_BYTES // 2**20} MiB; reduce it")
+            raise UserError(f"it is larger than {MAX_BYTES // 2**20} MiB; reduce it")
 
     def _read(self, path: Path) -> bytes:
         content = read_file(path, MAX_BYTES)
@@ -116,11 +114,9 @@ class GlbFile:
                 return b""
         path = Path(urllib.parse.unquote(uri))
         if path.is_absolute() or ".." in path.parts or ":" in uri or "\\" in uri:
-            raise BadGlbError(
-                f"it refers to {uri!r}, which is not in its folder; export it as .glb"
-            )
+            raise UserError(f"it refers to {uri!r}, which is not in its folder; export it as .glb")
         if not (self._folder / path).exists():
-            raise BadGlbError(f"its file {uri!r} is missing; copy it too, or export as .glb")
+            raise UserError(f"its file {uri!r} is missing; copy it too, or export as .glb")
         return self._read(self._folder / path)
 
     def _load_buffer(self, index: int) -> bytes:

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kouxing.services.driver.head.glb_file import BadGlbError, Float64, GlbFile, check_glb
+from kouxing.services.driver.head.glb_file import Float64, GlbFile, check_glb
 from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
 from kouxing.services.driver.head.head import Head, assemble_head
 from kouxing.services.driver.head.mesh_pieces import FapFields, MeshPiece, pack_head, part_names
@@ -80,7 +80,7 @@ def read_glb(path: Path) -> Head:
 def _select_known_shapes(pieces: list[MeshPiece]) -> ShapeFaps:
     """Keep only known shapes in the pieces, under their standard names; return the shapes' FAPs.
 
-    Raises ``BadGlbError`` if the shapes cannot express speech.
+    Raises ``UserError`` if the shapes cannot express speech.
     """
     names = dict.fromkeys(
         name for piece in pieces for name, shift in piece.shapes.items() if shift.any()
@@ -92,10 +92,7 @@ def _select_known_shapes(pieces: list[MeshPiece]) -> ShapeFaps:
             table[fap.name] = np.zeros(NUM_FAPS)
             table[fap.name][fap.number - 1] = units_per_weight(fap.fapu)
     else:
-        try:
-            set_name = choose_set(names)
-        except UserError as error:
-            raise BadGlbError(str(error)) from error
+        set_name = choose_set(names)
         for kind, standard in _SETS.items():
             for name, row in zip(standard.names, standard.basis, strict=True):
                 is_wanted = set_name != "arkit" and _NOT_MOUTH.search(name)
@@ -141,7 +138,7 @@ def _head(name: str, glb: GlbFile, pieces: list[MeshPiece], known: ShapeFaps) ->
     eyes = _find_eye_centers(glb, pieces, names)
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
-        raise BadGlbError("both eyes, found by shapes or names, are in the same place")
+        raise UserError("both eyes, found by shapes or names, are in the same place")
     mouth = [name for name in known if not _NOT_MOUTH.search(name)]
     is_mirrored = any(piece.is_mirrored for piece in pieces if piece.shapes.keys() & mouth)
     turn = _upright_rotation(eyes, _moved_center(pieces, mouth), is_mirrored=is_mirrored)
@@ -187,7 +184,7 @@ def head_weight_at(height: Float64) -> Float64:
 
 
 def _check_single_face(pieces: list[MeshPiece], known: ShapeFaps) -> None:
-    """Raise ``BadGlbError`` if two meshes far from each other have a mouth."""
+    """Raise ``UserError`` if two meshes far from each other have a mouth."""
     opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in known)
     centers: list[Float64] = []
     size = 0.0
@@ -198,7 +195,7 @@ def _check_single_face(pieces: list[MeshPiece], known: ShapeFaps) -> None:
             centers.append(shown.mean(axis=0))
             size = max(size, float(np.linalg.norm(np.ptp(shown, axis=0))))
     if centers and np.linalg.norm(np.ptp(centers, axis=0)) > _MAX_FACES_APART * size > 0:
-        raise BadGlbError("it has several faces; export only one avatar")
+        raise UserError("it has several faces; export only one avatar")
 
 
 def _upright_rotation(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Float64:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import BadGlbError, Float64, GlbFile
+from kouxing.services.driver.head.glb_file import Float64, GlbFile
 from kouxing.services.driver.head.mesh_pieces import MeshPiece
 from kouxing.shared.errors import UserError
 
@@ -54,14 +54,14 @@ def read_pieces(glb: GlbFile) -> list[MeshPiece]:
                 (MAX_PIECES, len(pieces) + 1, "meshes; join them"),
             ):
                 if count_so_far > limit:
-                    raise BadGlbError(f"it has more than {limit} {what}")
+                    raise UserError(f"it has more than {limit} {what}")
             piece = _piece(glb, node, mesh, primitive, matrices, matrix, turn_fractions, binds)
             if piece.head_weight is None and turn_fractions:
                 piece.head_weight = np.full(len(piece.vertices), turn_fractions.get(number, 0.0))
             pieces.append(piece)
             num_triangles += len(piece.triangles)
     if not any(len(piece.triangles) for piece in pieces):
-        raise BadGlbError("it has no triangles; export it with its mesh")
+        raise UserError("it has no triangles; export it with its mesh")
     _check_textures(pieces)
     return pieces
 
@@ -72,13 +72,10 @@ def _check_textures(pieces: list[MeshPiece]) -> None:
     num_pixels = 0
     for piece in pieces:
         if piece.texture not in known:
-            try:
-                pixels = picture.decode(piece.texture, piece.name)
-            except UserError as error:
-                raise BadGlbError(str(error)) from error
+            pixels = picture.decode(piece.texture, piece.name)
             num_pixels += pixels.shape[0] * pixels.shape[1]
             if num_pixels > MAX_TEXTURE_PIXELS:
-                raise BadGlbError(
+                raise UserError(
                     f"its textures have more than {MAX_TEXTURE_PIXELS} pixels; reduce them"
                 )
             standard = piece.texture.startswith((b"\x89PNG", b"\xff\xd8"))
