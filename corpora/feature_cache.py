@@ -59,7 +59,6 @@ def log_mel_of(
 
     None for audio that cannot be read, which is reported in ``errors``.
     """
-    out: list[NDArray[np.float16] | None] = []
     empty = np.empty((0, 1 + NUM_BANDS), dtype=np.float16)
     blocks = _cached(
         utterances,
@@ -70,8 +69,7 @@ def log_mel_of(
     for utterance, block in zip(utterances, blocks, strict=True):
         if len(block) == 0:
             errors.add(utterance.utterance_id, f"no audio in {utterance.path}")
-        out.append(block if len(block) else None)
-    return out
+    return [block if len(block) else None for block in blocks]
 
 
 def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:

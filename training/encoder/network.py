@@ -115,11 +115,8 @@ class AudioEncoder(nn.Module):
         rows = self(inputs).float()
         now = self.split(rows)
         late, before = self.split(rows[:, LOOK_AHEAD:]), targets[:, :-LOOK_AHEAD]
-        phones, pitch, voice = (
-            before[..., self.columns.phones],
-            before[..., PITCH],
-            before[..., VOICE],
-        )
+        phones = before[..., self.columns.phones]
+        pitch, voice = before[..., PITCH], before[..., VOICE]
         entropy = -(log_softmax(late.phones, dim=-1) * phones.nan_to_num()).sum(dim=-1)
         has_phones = ~phones[..., 0].isnan()  # unlike pauses, which were inserted
         is_voiced = ~pitch.isnan()

@@ -207,7 +207,8 @@ class TargetStore:
                 np.save(self._file(chunk, name), rows)
         ends = self._file(chunk, "ends")
         rows = np.array([(len(piece.targets), piece.weight) for piece in pieces]).reshape(-1, 2)
-        np.save(unfinished := ends.with_suffix(".part.npy"), rows)
+        unfinished = ends.with_suffix(".part.npy")
+        np.save(unfinished, rows)
         unfinished.replace(ends)  # it marks the chunk as complete
         return errors
 

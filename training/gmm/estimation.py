@@ -283,11 +283,9 @@ def split(hmm: HmmParameters, frames: FrameSet, num_mixtures: int) -> HmmParamet
     weights = np.zeros((num_states, num_mixtures), np.float32)
     means = np.zeros((num_states, num_mixtures, NUM_FEATURES), np.float32)
     covars = np.ones((num_states, num_mixtures, NUM_FEATURES), np.float32)
-    weights[:, :num_before], means[:, :num_before], covars[:, :num_before] = (
-        mixtures.weights,
-        mixtures.means,
-        mixtures.covars,
-    )
+    weights[:, :num_before] = mixtures.weights
+    means[:, :num_before] = mixtures.means
+    covars[:, :num_before] = mixtures.covars
     counts = np.array([frames.weights[n].sum() for n in frames.by_state(num_states)])
     for state in range(num_states):
         _drop_light(weights[state], counts[state])

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import zipfile
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,7 @@ class MakeHuman:
         """Read an ARKit face unit as displacements (19158, 3) in dm."""
         return _displacements(self._archive.read(f"{_FACE_UNITS}{name}.target").decode())
 
+    @cached_property
     def _rig(self) -> dict[str, list[list[float]]]:
         text = self._archive.read(_DATA + "rigs/standard/weights.default.json")
         weights: dict[str, list[list[float]]] = json.loads(text)["weights"]
@@ -111,12 +113,12 @@ class MakeHuman:
 
     def bones(self) -> list[str]:
         """Return the names of the default rig's bones."""
-        return list(self._rig())
+        return list(self._rig)
 
     def bone_weights(self, bone: str) -> Float:
         """Read the skin weights (19158,) of a bone of the default rig."""
         weights = np.zeros(19158)
-        for vertex, weight in self._rig()[bone]:
+        for vertex, weight in self._rig[bone]:
             weights[int(vertex)] = weight
         return weights
 

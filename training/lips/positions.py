@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
 
 from kouxing.corpora.feature_cache import cache_folder, load_or_compute
 from kouxing.corpora.lip_clips import LipClip
@@ -37,22 +38,20 @@ class SpeechStretch:
     speed: float  # speed of the copy; above 1 is faster than the clip
 
 
-def speech_of(clips: Iterable[LipClip], copy: int = 0) -> Iterator[list[SpeechStretch]]:
+def speech_of(clips: Sequence[LipClip], copy: int = 0) -> Iterator[SpeechStretch]:
     """Yield the speech of each clip (copy 0) or of one of its augmented copies.
 
     A copy is always augmented in the same way.
     """
     of_encoder = hashlib.sha256(_FORMAT.encode())
     of_encoder.update(ENCODER_PATH.read_bytes())
-    for clip in clips:
+    for clip in track(clips, "augmented copies" if copy else "clips"):
         samples, speed = _sound_of(clip, copy)
         positions = _positions(of_encoder, samples)
         parts = [np.split(positions[name], positions["starts"]) for name in ("features", "known_s")]
-        yield [
-            SpeechStretch(clip=clip, features=features, known_s=known_s, speed=speed)
-            for features, known_s in zip(*parts, strict=True)
-            if len(known_s)
-        ]
+        for features, known_s in zip(*parts, strict=True):
+            if len(known_s):
+                yield SpeechStretch(clip=clip, features=features, known_s=known_s, speed=speed)
 
 
 def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:

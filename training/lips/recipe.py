@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from kouxing.corpora.lip_clips import (
     LipClip,
@@ -95,19 +94,12 @@ def train_lips(folder: Path, output: Path, *, any_license: bool) -> None:
     used = training_clips(clips, any_license=any_license)
     if not used:
         raise no_clip_error(folder)
-    plain = track(speech_of(used), description="clips", total=len(used))
-    trained_on = [stretch for stretches in plain for stretch in stretches]
-    if not trained_on:
+    unchanged = list(speech_of(used))
+    if not unchanged:
         raise UserError(f"the clips in {folder} contain no speech")
-    augmented = speech_of(used, copy=1)
-    copies = [
-        stretch
-        for stretches in track(augmented, description="augmented copies", total=len(used))
-        for stretch in stretches
-    ]
-    filmed = [*trained_on, *copies]
+    filmed = [*unchanged, *speech_of(used, copy=1)]
     targets = _targets(load_model(), filmed, closed_below(clips))
-    basis = basis_of(trained_on, targets)
+    basis = basis_of(unchanged, targets)
     repeats = repeats_by_source(used)
     counts = [repeats[stretch.clip.source] for stretch in filmed]
     examples = [

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,17 +66,16 @@ def sampling_probs(recordings: Sequence[LabeledRecording]) -> NDArray[np.float64
 
 
 def padded_batch(group: Sequence[Sample]) -> Batch:
-    """Make a batch; short samples repeat their last row, without targets."""
+    """Make a batch; short samples repeat their last row, without targets.
+
+    All targets have equally many states a frame.
+    """
     num_rows = max(len(rows) for rows, _ in group)
-    inputs = np.empty((len(group), num_rows, group[0][0].shape[1]), dtype=np.float32)
-    num_frames = max(len(targets) for _, targets in group)
-    num_states = max(targets.states.shape[1] for _, targets in group)
-    states = np.zeros((len(group), num_frames, num_states), dtype=np.int64)
-    probs = np.zeros(states.shape, dtype=np.float32)
-    for number, (rows, targets) in enumerate(group):
-        inputs[number, : len(rows)] = rows
-        inputs[number, len(rows) :] = rows[-1]
-        region = number, slice(len(targets)), slice(targets.states.shape[1])
-        states[region] = targets.states
-        probs[region] = targets.probs
-    return torch.from_numpy(inputs), torch.from_numpy(states), torch.from_numpy(probs)
+    inputs = [np.pad(rows, ((0, num_rows - len(rows)), (0, 0)), "edge") for rows, _ in group]
+    states = [torch.from_numpy(targets.states.astype(np.int64)) for _, targets in group]
+    probs = [torch.from_numpy(targets.probs.astype(np.float32)) for _, targets in group]
+    return (
+        torch.from_numpy(np.stack(inputs).astype(np.float32)),
+        pad_sequence(states, batch_first=True),
+        pad_sequence(probs, batch_first=True),
+    )

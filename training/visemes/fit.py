@@ -288,16 +288,13 @@ def fit_parameters(frames: FrameTable) -> VisemeParameters:
         for column in range(NUM_MOUTH_FAPS)
         if not np.isnan(frames.faps[:, column]).all() and MOUTH_FAPS[column] not in MIRROR
     ]
-
-    informative = [column for column in fap_columns((3, 5, 6)) if column in measured] or measured[
-        :1
-    ]
+    informative = [column for column in fap_columns((3, 5, 6)) if column in measured]
 
     def first_stage_loss(c: float) -> float:
         start = initial_parameters(c)
         return sum(
             _FapFit(start, frames, column).descend(_VOWEL_ROWS, with_silences=True)
-            for column in informative
+            for column in informative or measured[:1]
         )
 
     c = min(_EXPONENTS, key=first_stage_loss)

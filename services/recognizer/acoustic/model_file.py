@@ -1,4 +1,4 @@
-"""Model files: npz archives of plain arrays, without pickle. Every size is checked."""
+"""Reads model files: npz archives of plain arrays, without pickle. Every size is checked."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
