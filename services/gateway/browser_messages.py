@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+from kouxing_client.field_types import SessionName
 from kouxing_client.options import MAX_RATE_HZ
 from msgspec import Meta, Struct
 
@@ -37,6 +38,8 @@ MAX_SHOWN = 40  # characters of a client's text in an error
 FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
 _FORMAT_FIELDS = PcmFormat.__struct_fields__
 COMMANDS = ("skip", "flush", "last", *FACE_SETTINGS)  # of a microphone
+VIEWER_COMMANDS = ("follow", "play", "avatar", "format", *FACE_SETTINGS)
+FORMATS = ("binary", "json", "msgpack")  # of blendshapes
 # names in version 0.1.0, which are still accepted
 _OLD_NAMES = {"lips": "lip_model", "express": "expressions", "eof": "last"}
 
@@ -102,6 +105,28 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
     settings = parse_face_settings(fields)
     face = {name: getattr(settings, name) for name in FACE_SETTINGS} if settings else {}
     return _convert({**fields, "face": face, "problem": problem}, MicrophoneCommand)
+
+
+class ViewerCommand(Struct, frozen=True, kw_only=True):
+    """A command of a viewer."""
+
+    follow: SessionName | None = None  # session to show; empty: the newest
+    play: Annotated[str, Meta(pattern="^(sample)$")] | None = None
+    avatar: list[list[Annotated[str, Meta(max_length=128)]]] | None = None  # shapes of each mesh
+    format: Annotated[str, Meta(pattern=f"^({'|'.join(FORMATS)})$")] = FORMATS[0]  # of its weights
+    face: FaceSettings | None = None  # settings to change
+    problem: str = ""  # error about unknown fields, which are ignored
+
+
+def parse_viewer_command(message: str) -> ViewerCommand:
+    """Parse a command of a viewer.
+
+    Raises ``UserError`` if the message is not a JSON object, or a field is invalid.
+    """
+    fields = parse_command_fields(message)
+    face = parse_face_settings(fields)
+    problem = find_unknown(fields, VIEWER_COMMANDS)
+    return _convert({**fields, "face": face, "problem": problem}, ViewerCommand)
 
 
 def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:

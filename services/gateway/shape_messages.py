@@ -1,22 +1,20 @@
 """Encodes a frame's blendshape weights, in the shape set and format that a viewer requested."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import msgspec
 import numpy as np
 from aiohttp import web
 
 from kouxing.services.gateway import browser_messages
+from kouxing.services.gateway.browser_messages import FORMATS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS
 
-FORMATS = ("binary", "json", "msgpack")
 MAX_AVATAR_SHAPES = 1024
-_MeshShapes = list[Annotated[str, msgspec.Meta(max_length=128)]]  # names of the shapes of one mesh
 _BINARY_TYPES = {"weights": browser_messages.SHAPES_TYPE, "rest": browser_messages.REST_SHAPES_TYPE}
 
 
@@ -74,25 +72,18 @@ def parse_shape_query(query: Mapping[str, str]) -> ShapeEncoder | None:
     return ShapeEncoder(shape_set, message_format) if shape_set else None
 
 
-def parse_avatar(command: Mapping[str, object]) -> ShapeEncoder:
-    """Return the encoder for an avatar; the command lists the shape names of its meshes.
+def make_avatar_encoder(meshes: Sequence[Sequence[str]], message_format: str) -> ShapeEncoder:
+    """Return the encoder for an avatar with these names of shapes in each of its meshes.
 
-    Raises ``UserError`` if the command is malformed, or the avatar cannot speak.
+    Raises ``UserError`` if the avatar cannot speak, or has too many shapes.
     """
-    try:
-        meshes = msgspec.convert(command["avatar"], list[_MeshShapes])
-    except msgspec.ValidationError as error:
-        raise UserError(f"avatar must list the shape names of each mesh: {error}") from None
     names = [name for mesh in meshes for name in mesh]
     if len(names) > MAX_AVATAR_SHAPES:
         raise UserError(f"the avatar has more than {MAX_AVATAR_SHAPES} shapes; send fewer")
-    message_format = command.get("format", FORMATS[0])
-    if message_format not in FORMATS:
-        raise UserError(f"format must be one of {', '.join(FORMATS)}")
     shape_set = choose_set(names)
     indices = {
         (number, mesh.index(name)): SHAPE_SETS[shape_set].names.index(shape)
         for number, mesh in enumerate(meshes)
         for name, shape in find_shapes(shape_set, mesh).items()
     }
-    return ShapeEncoder(shape_set, str(message_format), tuple(indices), tuple(indices.values()))
+    return ShapeEncoder(shape_set, message_format, tuple(indices), tuple(indices.values()))

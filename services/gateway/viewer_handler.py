@@ -10,9 +10,14 @@ from dataclasses import dataclass, field
 from aiohttp import WSMsgType, web
 
 from kouxing.services.gateway import browser_messages
+from kouxing.services.gateway.browser_messages import VIEWER_COMMANDS, ViewerCommand
 from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.services.gateway.sample_sentence import SampleSentence
-from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_avatar, parse_shape_query
+from kouxing.services.gateway.shape_messages import (
+    ShapeEncoder,
+    make_avatar_encoder,
+    parse_shape_query,
+)
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
@@ -25,7 +30,6 @@ from kouxing.shared.wire.speech import AcousticModelName
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
 SEND_BUFFER_BYTES = 32 * 1024  # in the kernel; about half a second for a slow viewer
-COMMANDS = ("follow", "play", "avatar", "format", *browser_messages.FACE_SETTINGS)
 PAUSE_S = 0.2  # after this time without a frame, a viewer receives the face at rest
 
 
@@ -205,37 +209,34 @@ class ViewerHandler:
     def handle_command(self, viewer: Viewer, message: str) -> None:
         """Execute a viewer's command, or send the viewer an error."""
         try:
-            command = browser_messages.parse_command_fields(message)
-            if problem := browser_messages.find_unknown(command, COMMANDS):
-                self._put(viewer, MessageKind.TEXT, browser_messages.error_text(problem))
-            session = command.get("follow")
-            settings = browser_messages.parse_face_settings(command)
-            lip_model = settings.lip_model if settings is not None else None
-            if command.get("play") == "sample":
-                self._sample.play(lip_model or "", self._on_sample_end)
-                viewer.chosen_session = self._sample.session
-            elif lip_model:
-                if not self._sample.session or viewer.chosen_session != self._sample.session:
-                    raise UserError("a viewer can set lip_model only for the sample sentence")
-                self._sample.lip_model = lip_model
-            elif settings is not None:
-                if viewer.shown_session is None and settings.expressions is None:
-                    raise UserError("no session is shown; start a microphone or the sample first")
-                self._set_face(viewer.shown_session[0] if viewer.shown_session else "", settings)
-            elif isinstance(session, str) and (not session or is_name(session)):
-                viewer.chosen_session = session
-            elif "avatar" in command:
-                viewer.shape_encoder = parse_avatar(command)
-                self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.header_message())
-            elif "follow" in command:
-                raise UserError(f'follow must be the name of a session, or ""; {NAME_RULE}')
-            elif "play" in command:
-                raise UserError('play must be "sample"')
-            elif not problem:
-                raise UserError(f"the message changes nothing; use {', '.join(COMMANDS)}")
+            command = browser_messages.parse_viewer_command(message)
+            if command.problem:
+                self._put_error(viewer, command.problem)
+            self._execute(viewer, command)
         except UserError as error:
-            self._put(viewer, MessageKind.TEXT, browser_messages.error_text(str(error)))
+            self._put_error(viewer, str(error))
         self._notify_viewer(viewer)
+
+    def _execute(self, viewer: Viewer, command: ViewerCommand) -> None:
+        lip_model = command.face.lip_model if command.face is not None else None
+        if command.play is not None:
+            self._sample.play(lip_model or "", self._on_sample_end)
+            viewer.chosen_session = self._sample.session
+        elif lip_model:
+            if not self._sample.session or viewer.chosen_session != self._sample.session:
+                raise UserError("a viewer can set lip_model only for the sample sentence")
+            self._sample.lip_model = lip_model
+        elif command.face is not None:
+            if viewer.shown_session is None and command.face.expressions is None:
+                raise UserError("no session is shown; start a microphone or the sample first")
+            self._set_face(viewer.shown_session[0] if viewer.shown_session else "", command.face)
+        elif command.follow is not None:
+            viewer.chosen_session = command.follow
+        elif command.avatar is not None:
+            viewer.shape_encoder = make_avatar_encoder(command.avatar, command.format)
+            self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.header_message())
+        elif not command.problem:
+            raise UserError(f"the message changes nothing; use {', '.join(VIEWER_COMMANDS)}")
 
     def _on_sample_end(self, session: str, error: str) -> None:
         """Show the newest session again to viewers of the sample sentence, with the error."""
@@ -295,6 +296,9 @@ class ViewerHandler:
         num_dropped = viewer.queue.put(kind, message)
         if num_dropped:
             self._metrics.count("dropped_slow_viewer", num_dropped)
+
+    def _put_error(self, viewer: Viewer, text: str) -> None:
+        self._put(viewer, MessageKind.TEXT, browser_messages.error_text(text))
 
     def _status(self) -> str:
         return browser_messages.text("status", missing=self._missing)

@@ -14,7 +14,7 @@ from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.browser_messages import parse_face_settings
 from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.services.gateway.sample_sentence import SampleSentence
-from kouxing.services.gateway.shape_messages import parse_avatar
+from kouxing.services.gateway.shape_messages import make_avatar_encoder
 from kouxing.services.gateway.viewer_handler import PAUSE_S, Viewer, ViewerHandler
 from kouxing.services.gateway.viewer_queue import (
     MAX_QUEUED,
@@ -102,6 +102,14 @@ def parse_command(fields: object) -> object:
     return browser_messages.parse_command(json.dumps(fields))
 
 
+def parse_viewer(fields: object) -> object:
+    return browser_messages.parse_viewer_command(json.dumps(fields))
+
+
+def parse_avatar(meshes: list[list[str]]) -> object:
+    return make_avatar_encoder(meshes, "binary")
+
+
 AT_16_KHZ = {"sample_rate_hz": 16000}
 
 
@@ -130,11 +138,11 @@ AT_16_KHZ = {"sample_rate_hz": 16000}
         (parse_face_settings, {"lip_model": "lerned"}, "it must be dynamic-visemes or .*learned"),
         (parse_face_settings, {"lip_model": ["a"] * 9999}, r'\["a", .*, "a"…; it must be dynamic-'),
         (parse_face_settings, {"hold_s": 3}, "hold_s is how long expressions last; send it with"),
-        (parse_avatar, {"avatar": "jawOpen"}, "list the shape names of each mesh"),
-        (parse_avatar, {"avatar": [["x" * 129]]}, "list the shape names of each mesh"),
-        (parse_avatar, {"avatar": [["jawOpen"] * 600] * 2}, "more than 1024 shapes"),
-        (parse_avatar, {"avatar": [["jawOpen"]], "format": "xml"}, "format must be one of"),
-        (parse_avatar, {"avatar": [["Basis"], []]}, "the avatar cannot speak"),
+        (parse_viewer, {"avatar": "jawOpen"}, "avatar must be a list, not a string"),
+        (parse_viewer, {"avatar": [["x" * 129]]}, "must be a string of at most 128 characters"),
+        (parse_viewer, {"avatar": [["jawOpen"]], "format": "xml"}, "format must be binary or "),
+        (parse_avatar, [["jawOpen"] * 600] * 2, "more than 1024 shapes"),
+        (parse_avatar, [["Basis"], []], "the avatar cannot speak"),
     ],
 )
 def test_a_message_that_cannot_be_used_is_rejected_with_its_fault(
@@ -156,7 +164,7 @@ UNUSED: Any = lambda *_: None  # noqa: E731 - calls that these tests do not need
 @pytest.mark.parametrize("message_format", ["binary", "json"])
 def test_an_avatar_gets_the_weights_of_its_shapes(message_format: str) -> None:
     meshes = [["Basis", "Fcl_MTH_A"], ["Blink", "A", "Fcl_MTH_U"]]
-    encoder = parse_avatar({"avatar": meshes, "format": message_format})
+    encoder = make_avatar_encoder(meshes, message_format)
     targets = json.loads(encoder.header_message())["targets"]
     assert sorted(targets) == [[0, 1], [1, 0], [1, 1], [1, 2]]
     faps = np.arange(68).astype("<f4")
@@ -221,8 +229,8 @@ def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
     ("command", "error"),
     [
         ({"stop": True}, "unknown field stop; use follow, play, avatar, "),
-        ({"follow": "a b"}, 'follow must be the name of a session, or ""'),
-        ({"play": "song"}, 'play must be "sample"'),
+        ({"follow": "a b"}, "follow is not a valid name; use "),
+        ({"play": "song"}, "play must be sample"),
         ({"lip_model": ""}, "the message changes nothing; use follow, play, avatar, "),
         ({}, "the message changes nothing; use follow, play, avatar, "),
     ],
