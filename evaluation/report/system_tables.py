@@ -211,7 +211,8 @@ def faults_table(outcomes: Sequence[Figures]) -> Table:
 
 def attacks_table(results: Sequence[Figures]) -> Table:
     """Return the effects of attacks, with the memory of the service that grew most."""
-    columns = ("attack", "target", "key", "service", "growth MB", "kept MB", "p95 ms by phase")
+    phases = "p95 ms before / during / after"
+    columns = ("attack", "target", "key", "service", "growth MB", "kept MB", phases)
     rows = []
     for result in results:
         worst = max(result["growth_mb"], key=result["growth_mb"].__getitem__)
