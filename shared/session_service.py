@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 from kouxing_client.messages import Message
 
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
@@ -18,7 +18,10 @@ class SessionService(Service):
     """Base class of services with sessions. A subclass overrides the first methods below."""
 
     def start_session(self, start: StartSession) -> bool:
-        """Serve a session. Return False if ``session_started`` is called later."""
+        """Serve a session. Return False if ``session_started`` is called later.
+
+        Raises ``Rejected`` if this service cannot serve the session; control then rejects it.
+        """
         return True
 
     def stop_session(self, session: str) -> None:
@@ -53,21 +56,6 @@ class SessionService(Service):
             SessionStarted(session=start.session, request=start.request, final_until=final_until)
         )
 
-    def reject_session(
-        self, start: StartSession, code: str, reason: str, retry_after_s: float | None = None
-    ) -> None:
-        """Ask control to reject a session that this service cannot serve."""
-        LOG.info(reason, extra={"session": start.session})
-        self.send_to_control(
-            Error(
-                session=start.session,
-                request=start.request,
-                code=code,
-                text=reason,
-                retry_after_s=retry_after_s,
-            )
-        )
-
     def report_skipped(self, session: str, skipped_s: float) -> None:
         """Count and publish the duration of a live session's skipped audio, unless it is 0."""
         if skipped_s > 0.0:
@@ -82,6 +70,17 @@ class SessionService(Service):
             self._heartbeat_due_s = min(self._heartbeat_due_s, heartbeat_due_s)
             if self.start_session(start):
                 self.session_started(start)
+        except Rejected as rejection:
+            LOG.info(rejection.text, extra={"session": start.session})
+            self.send_to_control(
+                Error(
+                    session=start.session,
+                    request=start.request,
+                    code=rejection.code,
+                    text=rejection.text,
+                    retry_after_s=rejection.retry_after_s,
+                )
+            )
         except UserError as error:
             self.warn("start", str(error), start.session)
             self.publish_event(EventName.ERROR, start.session, f"{ErrorCode.TIMEOUT}: {error}")

@@ -22,6 +22,7 @@ from kouxing.services.driver.video.video_writer import remove_unfinished
 from kouxing.services.driver.view import View
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.clock import to_seconds
+from kouxing.shared.errors import Rejected
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
@@ -88,8 +89,7 @@ class DriverService(SessionService):
         if session is None:
             key = start.client_key or ""
             if start.opening.record and (reason := self.recorder.rejection_reason(key)):
-                self.reject_session(start, ErrorCode.BUSY, reason, RETRY_AFTER_S)
-                return False
+                raise Rejected(ErrorCode.BUSY, reason, RETRY_AFTER_S)
             handlers: dict[type[Message], Callable[[Any], None]] = {
                 FapFrame: self._on_frame,
                 EndOfFaps: self._on_end,

@@ -31,6 +31,7 @@ from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, Synthesiz
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
+from kouxing.shared.errors import Rejected
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
@@ -105,12 +106,8 @@ class SynthesizerService(SessionService):
         if session is None or session.start.token != start.token:
             lip_model = start.opening.face.lip_model
             if start.epoch == 1 and lip_model not in (None, *lip_model_names()):
-                self.reject_session(
-                    start,
-                    ErrorCode.BAD_FACE,
-                    f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}",
-                )
-                return False
+                text = f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}"
+                raise Rejected(ErrorCode.BAD_FACE, text)
             settings = self._known_settings(start.session, start.opening.face)
             face = self._new_face(start, settings)
             session = SynthesizerSession(
