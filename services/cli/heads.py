@@ -42,7 +42,7 @@ def export_head(
     if glb.is_dir():
         if head != DEFAULT_HEAD:
             raise UserError(f"{glb} is a folder for all heads; leave out --head, or name a file")
-        check_output(*(glb / file for file in _page_files().values()), force=force)
+        check_output(*(glb / page_file(name) for name in HEAD_NAMES), force=force)
         export_page_heads(glb)
         print_message(f"wrote the heads to {glb}")
         return
@@ -80,10 +80,11 @@ def export_page_heads(folder: Path) -> None:
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, file in _page_files().items():
-            unfinished = folder / f".{os.getpid()}-{file}"  # another process may export, too
+        for name in HEAD_NAMES:
+            file = folder / page_file(name)
+            unfinished = file.with_name(f".{os.getpid()}-{file.name}")  # another may export, too
             export_glb(load_head(name), unfinished)
-            unfinished.replace(folder / file)
+            unfinished.replace(file)
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror}") from None
 
@@ -99,14 +100,9 @@ def ensure_page_heads() -> None:
         print_message(f"the page has no heads: {error}")
 
 
-def _page_files() -> dict[str, str]:
-    """Return the name of each head's file."""
-    return {name: page_file(name) for name in HEAD_NAMES}
-
-
 def _has_current_heads(folder: Path) -> bool:
     """Return whether a folder has all heads, newer than what they are made from."""
-    files = [folder / file for file in _page_files().values()]
+    files = [folder / page_file(name) for name in HEAD_NAMES]
     if not all(file.is_file() for file in files):
         return False
     sources = [

@@ -24,20 +24,6 @@ class ConnectionQuota:
         self._max_per_address = math.ceil(address_share * capacity)
         self._num_open: Counter[str] = Counter()  # by address
 
-    def acquire(self, address: str) -> bool:
-        """Count a connection from an address; return False if a limit is reached."""
-        is_full = self._num_open.total() >= self._capacity
-        if is_full or self._num_open[address] >= self._max_per_address:
-            return False
-        self._num_open[address] += 1
-        return True
-
-    def release(self, address: str) -> None:
-        """Stop counting a connection from an address."""
-        self._num_open[address] -= 1
-        if not self._num_open[address]:
-            del self._num_open[address]
-
     @contextlib.contextmanager
     def hold(self, request: web.Request) -> Iterator[None]:
         """Count the connection of a request while the context is open.
@@ -45,17 +31,20 @@ class ConnectionQuota:
         Raises ``web.HTTPServiceUnavailable`` if a limit is reached.
         """
         address = request.remote or ""
-        if not self.acquire(address):
+        total, num_own = self._num_open.total(), self._num_open[address]
+        if total >= self._capacity or num_own >= self._max_per_address:
             text = (
-                f"too many {self._kind}: {self._num_open.total()} of {self._capacity} are "
-                f"connected, {self._num_open[address]} from your address (at most "
-                f"{self._max_per_address}); close one or try again later\n"
+                f"too many {self._kind}: {total} of {self._capacity} are connected, {num_own} from"
+                f" your address (at most {self._max_per_address}); close one or try again later\n"
             )
             raise web.HTTPServiceUnavailable(text=text)
+        self._num_open[address] += 1
         try:
             yield
         finally:
-            self.release(address)
+            self._num_open[address] -= 1
+            if not self._num_open[address]:
+                del self._num_open[address]
 
 
 class RealTimeLimit:
