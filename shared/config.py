@@ -445,17 +445,13 @@ def _hint(name: str, known: Iterable[str]) -> str:
 
 def _check_hosts(table: str, config: ServiceConfig) -> None:
     """Reject hosts that other machines can reach, unless connections to them are encrypted."""
+    if config.insecure or config.is_encrypted:
+        return
     for key, kind in bound_keys(type(config)).items():
         host = getattr(config, key)
-        if (
-            kind is not BindAddress.HOST
-            or is_loopback(host)
-            or config.insecure
-            or config.is_encrypted
-        ):
-            continue
-        raise UserError(
-            f"{table}.{key}: other machines can reach {host}, and nothing is encrypted; "
-            f"{config.safe_alternative}, or accept the risk on a trusted network with "
-            "insecure = true"
-        )
+        if kind is BindAddress.HOST and not is_loopback(host):
+            raise UserError(
+                f"{table}.{key}: other machines can reach {host}, and nothing is encrypted; "
+                f"{config.safe_alternative}, or accept the risk on a trusted network with "
+                "insecure = true"
+            )

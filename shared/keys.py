@@ -88,23 +88,10 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
         return read_key(credential)
     with _locked_folder() as folder:
         path, control_path = folder / f"{name}.key", folder / "control.key"
+        if not path.exists() and not control_path.exists():
+            _create_control_key(folder, path, roles, control)
         if not path.exists():
-            if not control_path.exists():
-                has_keys = any(folder.glob("*.key"))
-                if name == CONTROL and has_keys:
-                    raise UserError(
-                        f"{path} is missing, but other keys need it. Run this on control's machine."
-                        f" To run control here, first run: {_replace_hint(path)}"
-                    )
-                if has_keys or (control and not is_local(split_endpoint(control, CONTROL)[0])):
-                    raise UserError(
-                        f"{path} is missing, and a new key can be created only on control's"
-                        f" machine. Run there: {_add_key_hint(roles)} and try again"
-                    )
-                (folder / _ALLOWED).unlink(missing_ok=True)  # keys of another control
-                _write(control_path, _new_key())
-            if name != CONTROL:
-                _add_key(folder, path, name, roles)
+            _add_key(folder, path, name, roles)
         key = read_key(path)
         control_key = read_key(control_path) if control_path.exists() else None
         if control_key is not None and control_key.public != key.control:
@@ -118,6 +105,23 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
         return key
 
 
+def _create_control_key(folder: Path, path: Path, roles: Collection[str], control: str) -> None:
+    """Create control's key because ``path`` is missing; ``UserError`` if control runs elsewhere."""
+    has_keys = any(folder.glob("*.key"))
+    if path.stem == CONTROL and has_keys:
+        raise UserError(
+            f"{path} is missing, but other keys need it. Run this on control's machine."
+            f" To run control here, first run: {_replace_hint(path)}"
+        )
+    if has_keys or (control and not is_local(split_endpoint(control, CONTROL)[0])):
+        raise UserError(
+            f"{path} is missing, and a new key can be created only on control's"
+            f" machine. Run there: {_add_key_hint(roles)} and try again"
+        )
+    (folder / _ALLOWED).unlink(missing_ok=True)  # keys of another control
+    _write(folder / "control.key", _new_key())
+
+
 def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
     """Check that the keys of a system on this machine match, and create missing keys.
 
@@ -129,21 +133,17 @@ def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
     roles_of = {**kinds, CLIENT: CLIENT_ROLES}
     keys = {name: load_key(name, roles) for name, roles in roles_of.items()}
     grants = read_grants()  # also of keys that were just created
-    reasons: list[str] = []
-    replaced: list[Path] = []
+    problems: dict[Path, str] = {}  # by key file
     for name, key in keys.items():
         path, grant = key_folder() / f"{name}.key", grants.get(key.public, Grant("", ()))
         if _find_credential(path.name):
             continue
         if zmq.curve_public(key.secret.encode()) != key.public.encode():
-            reasons.append(f"{path}: the secret key does not belong to the public key")
+            problems[path] = f"{path}: the secret key does not belong to the public key"
         elif name != CONTROL and not {*roles_of[name]} <= {*grant.roles}:
-            reasons.append(f"{key_folder() / _ALLOWED} does not allow {path}")
-        else:
-            continue
-        replaced.append(path)
-    if reasons:
-        raise UserError(f"{reasons[0]}; run: {_replace_hint(*replaced)}")
+            problems[path] = f"{key_folder() / _ALLOWED} does not allow {path}"
+    if problems:
+        raise UserError(f"{next(iter(problems.values()))}; run: {_replace_hint(*problems)}")
 
 
 def _replace_hint(*paths: Path) -> str:
