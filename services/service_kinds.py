@@ -141,16 +141,15 @@ def available_port_environment(settings: Settings) -> dict[str, str]:
         for key in (key for key in bound if bound[key] is not BindAddress.HOST):
             setting = values[key]
             endpoint_host, _, port = str(setting.value).removeprefix("tcp://").rpartition(":")
-            if port not in ("0", "*"):
-                problem = _port_problem(endpoint_host or host, int(port))
-                if not problem:
-                    continue
-                if not setting.is_default:
-                    raise UserError(
-                        f"{kind.name}.{key}: {problem}; choose another port,"
-                        " or omit it to use a free one"
-                    )
-            environment[variable_name(kind.name, key)] = free[variable_name(kind.name, key)]
+            is_any = port in ("0", "*")
+            problem = "" if is_any else _port_problem(endpoint_host or host, int(port))
+            if problem and not setting.is_default:
+                raise UserError(
+                    f"{kind.name}.{key}: {problem}; choose another port, or omit it to use a free"
+                    " one"
+                )
+            if problem or is_any:
+                environment[variable_name(kind.name, key)] = free[variable_name(kind.name, key)]
     return environment
 
 

@@ -67,16 +67,10 @@ SpeechItem: TypeAlias = SpeechStart | SpeechEnd | SpeechFrames | LipPositions
 class SpeechSegmenter:
     """Divides the audio of one session into speech and pauses.
 
-    Parameters
-    ----------
-    front_end
-        Computes the feature frames.
-    lip_stream
-        Predicts lip frames during speech; None: no lip frames.
-    start_frame
-        Frame at which speech started, if another recognizer processed its start; negative before
-        the audio. The first speech then starts where the network's blocks align with the other
-        recognizer's.
+    ``front_end`` computes the feature frames. Without ``lip_stream``, there are no lip frames.
+    ``start_frame`` is the frame at which speech started at another recognizer, negative before the
+    audio. The first speech then starts where the network's blocks align with the other
+    recognizer's.
     """
 
     def __init__(

@@ -6,6 +6,7 @@ Source: the HTK book (Young et al. 2009), chapter 8; used in Li et al. 2011, sec
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TypeAlias
 
 import numba
@@ -51,7 +52,8 @@ def build_utterance_graph(
 ) -> UtteranceGraph:
     """Lay out the states of an utterance, with an optional pause at each syllable boundary.
 
-    ``syllables`` contain phone indices; ``first_state`` comes from ``Topology``.
+    ``phones`` are indices into the inventory's phones, and ``syllables`` the number of phones in
+    each syllable. ``first_state`` comes from ``Topology``.
     """
     states: list[int] = []
     skip_from: list[int] = []
@@ -68,12 +70,11 @@ def build_utterance_graph(
 
     add(silence, -1)
     before_pause = -1  # last node before a pause
-    position = 0
+    rest = iter(phones)
     for length in syllables:
-        for phone in phones[position : position + length]:
+        for phone in islice(rest, length):
             add(phone, before_pause)
             before_pause = -1
-        position += length
         before_pause = len(states) - 1
         add(silence, -1)
     return UtteranceGraph(
