@@ -72,29 +72,22 @@ class Load:
     delay_ms: float  # delay of the synthesizer
 
     @property
-    def best(self) -> Step | None:
-        """The step with the most sessions that the system served."""
-        served = [step for step in self.steps if step.is_served]
-        return max(served, key=lambda step: step.num_sessions, default=None)
-
-    @property
     def summary(self) -> dict[str, float]:
-        """The most sessions served, in total, per core and per used core."""
-        best = self.best
-        if best is None:
+        """The most sessions served, in total, per core and per used core, and their memory."""
+        served = [step for step in self.steps if step.is_served]
+        if not served:
             return {"sessions": 0.0}
-        used = sum(best.cpu_cores.values())
-        slope_mb = {
-            service: (memory_mb - self.steps[0].memory_mb[service])
-            / max(1, best.num_sessions - self.steps[0].num_sessions)
-            for service, memory_mb in best.memory_mb.items()
-        }
+        first, best = self.steps[0], max(served, key=lambda step: step.num_sessions)
+        num_more = max(1, best.num_sessions - first.num_sessions)
         return {
             "sessions": float(best.num_sessions),
             "sessions_per_core": best.num_sessions / self.cores,
-            "sessions_per_busy_core": best.num_sessions / max(used, 1e-3),
-            "recognizer_mb_per_session": slope_mb.get("recognizer", 0.0),
-            "synthesizer_mb_per_session": slope_mb.get("synthesizer", 0.0),
+            "sessions_per_busy_core": best.num_sessions / max(sum(best.cpu_cores.values()), 1e-3),
+            **{
+                f"{service}_mb_per_session": (best.memory_mb[service] - first.memory_mb[service])
+                / num_more
+                for service in ("recognizer", "synthesizer")
+            },
         }
 
 
