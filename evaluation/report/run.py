@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -50,29 +50,32 @@ def run_steps(
     for name in names:
         step, path = STEPS[name], results / f"{name}.json"
         commands = step.commands if step.quick is None or not is_quick else step.quick
-        missing = [
-            key for key, folder in folders.items() if not folder and f"{{{key}}}" in str(commands)
-        ]
+        if reason := _reason_to_skip(commands, folders):
+            print_message(f"{name}: skipped ({reason})")
+            continue
         command_lines = [f"kouxing {_without_braces(command)}" for command in commands]
         code = code_hash(step.code)
-        if not commands or missing:
-            reason = (
-                f"add {FOLDER_OPTIONS[missing[0]]}"
-                if missing
-                else "it is not part of a quick report"
-            )
-            print_message(f"{name}: skipped ({reason})")
-        elif not is_fresh and _is_up_to_date(path, command_lines, code):
+        if not is_fresh and _is_up_to_date(path, command_lines, code):
             print_message(f"{name}: up to date")
+            continue
+        print_message(f"{name}: {command_lines[-1]}")
+        measured = describe_run()
+        figures = _run(commands, folders)
+        if figures is None:
+            failed.append(name)
         else:
-            print_message(f"{name}: {command_lines[-1]}")
-            measured = describe_run()
-            figures = _run(commands, folders)
-            if figures is None:
-                failed.append(name)
-            else:
-                write_result(path, {"commands": command_lines, **measured, "code": code, **figures})
+            write_result(path, {"commands": command_lines, **measured, "code": code, **figures})
     return failed
+
+
+def _reason_to_skip(commands: Sequence[str], folders: Mapping[str, Path | None]) -> str:
+    """Return why a step cannot run; empty if it can."""
+    if not commands:
+        return "it is not part of a quick report"
+    for key, folder in folders.items():
+        if folder is None and f"{{{key}}}" in str(commands):
+            return f"add {FOLDER_OPTIONS[key]}"
+    return ""
 
 
 def _is_up_to_date(path: Path, commands: list[str], code: str) -> bool:
