@@ -431,13 +431,13 @@ def visemes(
 
     check_output(picture, json_file, force=force)
     fitted = fit_folder(clips)
-    if picture is not None:
-        save_figure(fit_figure(fitted), picture)
     results = {
         "clips": [clip.clip.name for clip in fitted],
         "errors": [asdict(error) for error in viseme_errors(fitted)],
     }
     show_results(json_file, results, viseme_fit_table(results))
+    if picture is not None:
+        save_figure(fit_figure(fitted), picture)
 
 
 app.command(rich_help_panel=_SYSTEM)(attacks)

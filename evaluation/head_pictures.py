@@ -1,6 +1,6 @@
 """Draws every head: small pictures for the page, and sheets for the docs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def sheet_renderers(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
 def thumbnail_renderers(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
     """Return the functions that draw the files for the page, ``head-NAME.webp``."""
     return {
-        folder / f"head-{name}.webp": partial(_render, name, _REST, _THUMBNAIL_PX)
+        folder / f"head-{name}.webp": partial(_draw, "", name, _REST, _THUMBNAIL_PX)
         for name in _head_names()
     }
 
@@ -67,38 +67,33 @@ def save(path: Path, image: Image.Image) -> None:
 
 def _draw_heads() -> Image.Image:
     return _arrange_in_rows(
-        [
-            [_add_label(_render(name, _REST, _HEAD_PX, turn), name) for name in _head_names()]
-            for turn in _YAWS_DEG
-        ]
+        [_draw(name, name, _REST, _HEAD_PX, yaw_deg) for name in _head_names()]
+        for yaw_deg in _YAWS_DEG
     )
 
 
 def _draw_visemes() -> Image.Image:
     visemes = list(VISEME_INDEX)
-    rows = [
+    return _arrange_in_rows(
         [
-            _add_label(_render(DEFAULT_HEAD, _viseme_faps(viseme), _VISEME_PX, turn), viseme)
+            _draw(viseme, DEFAULT_HEAD, _viseme_faps(viseme), _VISEME_PX, yaw_deg)
             for viseme in visemes[start : start + _VISEMES_PER_ROW]
         ]
         for start in range(0, len(visemes), _VISEMES_PER_ROW)
-        for turn in _YAWS_DEG
-    ]
-    return _arrange_in_rows(rows)
+        for yaw_deg in _YAWS_DEG
+    )
 
 
 def _draw_mouths() -> Image.Image:
     poses = {"rest": _REST} | {viseme: _viseme_faps(viseme) for viseme in _MOUTH_VISEMES}
-    views = [(name, turn) for name in _head_names() for turn in _YAWS_DEG]
+    views = [(name, yaw_deg) for name in _head_names() for yaw_deg in _YAWS_DEG]
     views.insert(len(_YAWS_DEG), (DEFAULT_HEAD, _PROFILE_DEG))
     return _arrange_in_rows(
         [
-            [
-                _add_label(_render(name, faps, _MOUTH_PX, turn, Framing.MOUTH), label)
-                for label, faps in poses.items()
-            ]
-            for name, turn in views
+            _draw(label, name, faps, _MOUTH_PX, yaw_deg, Framing.MOUTH)
+            for label, faps in poses.items()
         ]
+        for name, yaw_deg in views
     )
 
 
@@ -107,25 +102,18 @@ def _draw_expressions() -> Image.Image:
         name: EXPRESSIONS[EXPRESSION_NAMES.index(name)] for name in _EXPRESSIONS
     }
     return _arrange_in_rows(
-        [
-            [_add_label(_render(name, faps, _FACE_PX), label) for label, faps in poses.items()]
-            for name in _head_names()
-        ]
+        [_draw(label, name, faps, _FACE_PX) for label, faps in poses.items()]
+        for name in _head_names()
     )
 
 
 def _draw_expressiveness() -> Image.Image:
     return _arrange_in_rows(
         [
-            [
-                _add_label(
-                    _render(DEFAULT_HEAD, _viseme_faps(viseme, amount), _FACE_PX),
-                    f"{viseme} {amount:g}",
-                )
-                for viseme in _MOUTH_VISEMES[:6]
-            ]
-            for amount in _EXPRESSIVENESS
+            _draw(f"{viseme} {amount:g}", DEFAULT_HEAD, _viseme_faps(viseme, amount), _FACE_PX)
+            for viseme in _MOUTH_VISEMES[:6]
         ]
+        for amount in _EXPRESSIVENESS
     )
 
 
@@ -139,27 +127,26 @@ def _viseme_faps(
     return faps
 
 
-def _render(
+def _draw(
+    label: str,
     name: str,
     faps: Float32,
     size: tuple[int, int],
     yaw_deg: float = 0.0,
     framing: Framing = Framing.FACE,
 ) -> Image.Image:
+    """Draw a head, with a label if it is not empty."""
     head = Head.load(name)
     view = place_camera(head, framing, yaw_deg)
     renderer = Renderer(head, _SCALE * size[0], _SCALE * size[1], camera=view)
-    image = Image.fromarray(renderer.draw(faps))
+    image = Image.fromarray(renderer.draw(faps)).resize(size, Image.Resampling.LANCZOS)
     renderer.close()
-    return image.resize(size, Image.Resampling.LANCZOS)
-
-
-def _add_label(image: Image.Image, label: str) -> Image.Image:
     ImageDraw.Draw(image).text((5, 2), label, fill="white", font=ImageFont.load_default(13))
     return image
 
 
-def _arrange_in_rows(rows: list[list[Image.Image]]) -> Image.Image:
+def _arrange_in_rows(drawn: Iterable[list[Image.Image]]) -> Image.Image:
+    rows = list(drawn)
     width, height = rows[0][0].size
     sheet = Image.new("RGB", (width * max(map(len, rows)), height * len(rows)), "#5c6e80")
     for row, images in enumerate(rows):

@@ -122,8 +122,6 @@ def load(
     check_output(picture, json_file, force=force)
     paths = audio or sorted(SAMPLE.parent.glob("*.wav"))
     figures = measure(paths, sessions, seconds, CONSOLE, language)
-    if picture is not None:
-        save_figure(draw(figures), picture)
     results = {**asdict(figures), "summary": figures.summary}
     steps = {str(step["num_asked"]): step for step in results["steps"]}
     summary = {"value": {"machine_load": figures.machine_load, **figures.summary}}
@@ -134,6 +132,8 @@ def load(
         system_table(load=results),
         figures_table(summary),
     )
+    if picture is not None:
+        save_figure(draw(figures), picture)
 
 
 @app.command()
