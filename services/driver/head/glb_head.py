@@ -246,10 +246,12 @@ def _find_eye_centers(glb: GlbFile, pieces: list[MeshPiece], names: list[str]) -
         return np.array(centers)
     mouth = _moved_center(pieces, [name for piece in pieces for name in piece.shapes])
     skin = max((piece for piece in pieces if piece.shapes), key=lambda piece: len(piece.vertices))
-    near = np.abs(skin.vertices[:, 1] - (mouth if mouth is not None else skin.vertices.mean(0))[1])
+    if mouth is None:
+        mouth = skin.vertices.mean(axis=0)
+    near = np.abs(skin.vertices[:, 1] - mouth[1])
     width = np.ptp(skin.vertices[near < np.quantile(near, 0.5), 0])
     unit = width / _HEAD_WIDTH
-    middle = (mouth if mouth is not None else skin.vertices.mean(axis=0)) - MOUTH_OFFSET * unit
+    middle = mouth - MOUTH_OFFSET * unit
     half = np.array([unit / 2, 0, 0])
     if "VRM" in glb.json.get("extensions", {}):  # version 0 looks along -z
         half = -half
