@@ -19,7 +19,6 @@ from kouxing.services.cli.curve_exporters import (
 from kouxing.services.cli.options import SPEECH_FORMATS, CurveFormat, ExportOptions, ListenFormat
 from kouxing.services.cli.streaming import missed_warning
 from kouxing.shared.client_connection import connect_client
-from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
 from kouxing.shared.face.mouth_shapes import mouth_cues
@@ -60,7 +59,7 @@ def follow(
         arriving = _iter_until_interrupt(results, followed.name)
         if is_speech:
             inventory = load_inventory(followed.info["facts"]["language"] or DEFAULT_LANGUAGE)
-            phones = map(_to_event, arriving)
+            phones = map(events.Phone.from_message, arriving)
             if form is ListenFormat.SYLLABLES:
                 count = _print(_syllable_lines(phones, inventory))
             else:
@@ -112,17 +111,6 @@ def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
     print_message(f"following session {session}")
     with catch_interrupt():
         yield from results
-
-
-def _to_event(phone: Phone) -> events.Phone:
-    return events.Phone(
-        index=phone.index,
-        symbol=phone.symbol,
-        onset_s=phone.time_s,
-        duration_s=to_seconds(phone.duration),
-        confidence=phone.confidence,
-        final=phone.final,
-    )
 
 
 def _phone_lines(phones: Iterable[events.Phone]) -> Iterator[str]:

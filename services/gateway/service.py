@@ -36,13 +36,13 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
+from kouxing.shared.phones import events
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllable_captions import SyllableCaptions
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionProgress, StartSession
-from kouxing.shared.wire.events import message_to_phone
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Acoustic
@@ -341,7 +341,7 @@ class GatewayService(SessionService):
             final=phone.final,
         )
         self._viewers.forward(phone.session, MessageKind.TEXT, message)
-        for syllable in syllables.update(message_to_phone(phone)):
+        for syllable in syllables.update(events.Phone.from_message(phone)):
             message = browser_messages.text(
                 "syllable",
                 index=syllable.index,

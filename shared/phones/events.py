@@ -3,11 +3,19 @@
 Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.clock import to_seconds
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.inventory import SILENCE
+
+if TYPE_CHECKING:
+    from kouxing_client import messages
 
 
 class Phone(Record, frozen=True, kw_only=True):
@@ -24,6 +32,18 @@ class Phone(Record, frozen=True, kw_only=True):
     duration_s: float  # seconds
     confidence: float  # 0 to 1
     final: bool
+
+    @classmethod
+    def from_message(cls, message: messages.Phone) -> Phone:
+        """Return the phone in a message."""
+        return cls(
+            index=message.index,
+            symbol=message.symbol,
+            onset_s=to_seconds(message.media_time),
+            duration_s=to_seconds(message.duration),
+            confidence=message.confidence,
+            final=message.final,
+        )
 
     @property
     def is_withdrawn(self) -> bool:

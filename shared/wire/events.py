@@ -80,24 +80,12 @@ def event_to_message(event: events.SoundEvent) -> SpeechMessage:
             return Progress(media_time=to_samples(event.time_s), state=AudioState.ENDED)
 
 
-def message_to_phone(message: Phone) -> events.Phone:
-    """Return the phone in a message."""
-    return events.Phone(
-        index=message.index,
-        symbol=message.symbol,
-        onset_s=to_seconds(message.media_time),
-        duration_s=to_seconds(message.duration),
-        confidence=message.confidence,
-        final=message.final,
-    )
-
-
 def message_to_event(message: SpeechMessage) -> events.SoundEvent:
     """Return the event in a message."""
     time_s = to_seconds(message.media_time)
     match message:
         case Phone():
-            return message_to_phone(message)
+            return events.Phone.from_message(message)
         case LipPositions():
             return events.LipPositions(
                 time_s=time_s,
