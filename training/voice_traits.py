@@ -52,11 +52,7 @@ _MIN_DEVIATION = 1e-3
 
 
 def train_traits(
-    recordings: Path,
-    sounds: Sequence[Path],
-    output: Path,
-    *,
-    any_license: bool,
+    recordings: Path, sounds: Sequence[Path], output: Path, *, any_license: bool
 ) -> None:
     """Train the readout, and write it with its card; ``UserError`` if a file cannot be read."""
     rng = np.random.default_rng(SEED)

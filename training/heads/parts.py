@@ -157,16 +157,15 @@ def write(
     vertices = np.concatenate([p.part.vertices for p in pieces])
     fapu = {name: value * METERS_PER_UNIT for name, value in fapu.items()} | {"AU": 1e-5}
 
-    faps, units, bounds, moved, shifts = [], [], [0], [], []
-    for fap in sorted({fap for piece in pieces for fap in piece.fields}):
+    faps = sorted({fap for piece in pieces for fap in piece.fields})
+    bounds, moved, shifts = [0], [], []
+    for fap in faps:
         for piece in pieces:
             if fap in piece.fields:
                 shift = piece.fields[fap] * METERS_PER_UNIT
                 rows = np.flatnonzero(np.abs(shift).max(axis=1) > 2e-6)
                 moved.append(rows + start[piece.name])
                 shifts.append(shift[rows])
-        faps.append(fap)
-        units.append(1e5 if fap == 47 else 1024.0)
         bounds.append(sum(len(rows) for rows in moved))
     centers = meters(np.stack([(e.vertices.max(0) + e.vertices.min(0)) / 2 for e in eyes]))
     arrays: dict[str, Any] = {
@@ -195,7 +194,7 @@ def write(
         "feature_points": np.array(list(points.values())),
         "eye_centres": centers,
         "field_faps": np.array(faps, dtype=np.int64),
-        "field_units": np.array(units),
+        "field_units": np.array([1e5 if fap == 47 else 1024.0 for fap in faps]),
         "field_bounds": np.array(bounds),
         "field_vertices": np.concatenate([*moved, np.zeros(0, int)]).astype(np.uint16),
         "field_shifts": np.concatenate([*shifts, np.zeros((0, 3))]).astype(np.float16),
