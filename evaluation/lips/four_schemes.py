@@ -179,7 +179,7 @@ def without_corrections(events: Sequence[SoundEvent]) -> list[SoundEvent]:
     for event, after in zip_longest(events, events[1:]):
         if not isinstance(event, Phone):
             remaining.append(event)
-        elif _is_emitted(event, after):
+        elif is_emitted(event, after):
             remaining.append(replace(event, index=num_phones))
             num_phones += 1
     return remaining
@@ -194,7 +194,7 @@ def delay_by_one_phone(events: Sequence[SoundEvent]) -> list[SoundEvent]:
         delayed = None
         if isinstance(event, Phone):
             latest[event.index] = event
-            if _is_emitted(event, after):
+            if is_emitted(event, after):
                 delayed = latest.get(event.index - 1)
         elif isinstance(event, SpeechChange) and not event.active and latest:
             delayed = latest[max(latest)]
@@ -204,7 +204,3 @@ def delay_by_one_phone(events: Sequence[SoundEvent]) -> list[SoundEvent]:
         if not isinstance(event, Phone):
             remaining.append(event)
     return remaining
-
-
-def _is_emitted(phone: Phone, after: SoundEvent | None) -> bool:
-    return is_emitted(phone, after if isinstance(after, Phone) else None)

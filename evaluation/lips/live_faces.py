@@ -83,8 +83,5 @@ def drop_first_hypotheses(events: Sequence[SoundEvent]) -> list[SoundEvent]:
     return [
         event
         for event, after in zip_longest(events, events[1:])
-        if not (
-            isinstance(event, Phone)
-            and is_emitted(event, after if isinstance(after, Phone) else None)
-        )
+        if not (isinstance(event, Phone) and is_emitted(event, after))
     ]
