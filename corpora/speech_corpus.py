@@ -203,7 +203,8 @@ def _utterance(row: dict[str, str], inventory: PhoneInventory, *, any_license: b
     path, license_name = Path(row["path"]), row.get("license", "")
     if not (any_license or may_distribute(license_name)):
         raise UserError(
-            f"its license ({license_name or 'none'}) does not allow distributing a model"
+            f"its license ({license_name or 'none'}) does not allow distributing a model;"
+            " 'kouxing train --any-license' uses it"
         )
     if not path.is_file():
         raise UserError(f"no audio file {path}")

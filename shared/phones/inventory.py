@@ -36,7 +36,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from importlib import resources
 from importlib.metadata import entry_points
 from typing import Any
@@ -181,7 +181,22 @@ def find_language(name: str) -> str:
 
     Raises ``UserError`` if it is not installed.
     """
-    return load_inventory(language_codes().get(name, name)).language
+    language = language_codes().get(name, name)
+    if language not in BUILT_IN and language not in _installed_packages():
+        language = next(filter(partial(_has_code, name), _installed_packages()), name)
+    return load_inventory(language).language
+
+
+def _installed_packages() -> dict[str, str]:
+    """Return the packages of the entry points, by language."""
+    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+
+
+def _has_code(code: str, language: str) -> bool:
+    try:
+        return load_inventory(language).code == code
+    except UserError:  # reported if the user names this language
+        return False
 
 
 @lru_cache
@@ -192,7 +207,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
     """
     package = BUILT_IN.get(language)
     if package is None:
-        installed = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+        installed = _installed_packages()
         package = installed.get(language)
         if package is None:
             known = ", ".join([*language_codes(), *sorted(installed.keys() - BUILT_IN.keys())])
@@ -236,6 +251,11 @@ def _inventory_of_tables(language: str, tables: TableLanguage) -> PhoneInventory
     """Return the inventory of a language that uses the universal phones."""
     universal = load_inventory(UNIVERSAL)
     phones = tables.phones
+    if unknown := [phone for phone in phones if phone not in universal.index]:
+        raise ValueError(
+            f"phones.tsv: {', '.join(unknown)}: use the symbols of the universal phones, the column"
+            " phone of shared/phones/universal/phones.tsv"
+        )
     return replace(
         universal,
         language=language,

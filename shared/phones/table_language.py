@@ -45,6 +45,7 @@ from kouxing.shared.phones.universal.segments import (
 from kouxing.shared.tsv_tables import read_table
 
 SETTINGS = "language.toml"
+_REQUIRED = ("code", "titles", "voice", "scripts")  # keys of the settings
 _SIGNS = "%&@#§€$£¥°+="  # espeak-ng speaks them as words
 _UNITS = ("%", "€", "£", "°")  # espeak-ng speaks them after numbers
 _SPACED, _CHARACTER, _MECAB = "spaced", "character", "mecab"
@@ -212,6 +213,8 @@ def _has_character(text: str) -> bool:
 def load_table_language(package: str) -> TableLanguage:
     """Read the tables of a language; ``OSError``, ``KeyError`` or ``ValueError`` if invalid."""
     settings = tomllib.loads(resources.files(package).joinpath(SETTINGS).read_text("utf-8"))
+    if missing := [key for key in _REQUIRED if key not in settings]:
+        raise ValueError(f"{SETTINGS} lacks {', '.join(missing)}")
     return TableLanguage(
         code=settings["code"],
         titles=settings["titles"],

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.phones.inventory import PhoneInventory, find_language, load_inventory
 from tests.languages import MANDARIN, install_language
 
 TOO_MANY_PHONES = tuple(chr(97 + n // 26) + chr(97 + n % 26) for n in range(256))
@@ -82,3 +82,31 @@ def test_rejects_a_broken_package(
     error = f"language broken: cannot read package broken_language: .*{message}"
     with pytest.raises(UserError, match=error):
         load_inventory("broken")
+
+
+@pytest.mark.parametrize(
+    ("settings", "phones", "message"),
+    [
+        ('code = "zxx"\ntitles = {}\nvoice = "cs"\nscripts = []\n', "p\na\nsil\n", ""),
+        ('code = "zxx"\n', "p\nsil\n", r"language\.toml lacks titles, voice, scripts"),
+        ('code = "zxx"\ntitles = {}\nvoice = "cs"\nscripts = []\n', "tʃ\nsil\n", "tʃ: use the sym"),
+    ],
+    ids=["valid", "no titles", "IPA"],
+)
+def test_an_installed_language_of_tables_is_found_by_its_code(
+    settings: str, phones: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    name = f"tables_{len(phones)}_{len(settings)}"  # not cached by another case
+    package = tmp_path / name
+    package.mkdir()
+    (package / "language.toml").write_text(settings, "utf-8")
+    (package / "phones.tsv").write_text(f"phone\n{phones}", "utf-8")
+    install_language(tmp_path, name, name)
+    if message:
+        with pytest.raises(UserError, match=message):
+            find_language(name)
+        with pytest.raises(UserError, match="'zxx' is not installed"):
+            find_language("zxx")
+    else:
+        assert find_language("zxx") == find_language(name) == name

@@ -186,6 +186,7 @@ def test_trains_models_and_writes_cards(tmp_path: Path, capsys: pytest.CaptureFi
     messages = capsys.readouterr().err
     assert messages.endswith("2 rows skipped\n")
     assert "(closed): its license (CC BY-NC)" in messages
+    assert "'kouxing train --any-license' uses it" in messages
     assert "CC0-1.0" in gmm.with_suffix(".md").read_text()
     again = tmp_path / "again.npz"
     train(again, num_mixtures=2)
