@@ -1,6 +1,5 @@
 """Sound through real processes: frames and phones equal those of the chain, for every client."""
 
-import asyncio
 import csv
 import itertools
 from pathlib import Path
@@ -8,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from kouxing_client import Client, FapFrame, Phone
-from kouxing_client.aio import AsyncClient
+from kouxing_client import Client, FapFrame
 from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.live_faces import live_events, live_frames
@@ -153,10 +151,6 @@ def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     assert scored[:, MOUTH].any()
 
 
-CHUNK = 997  # samples, so that no chunk ends with a slice of 20 ms
-Timed = tuple[str, int, int, float]  # symbol, onset and duration in samples at 16 kHz, confidence
-
-
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Some samples, and a loud stereo recording at 44.1 kHz that ends within a word."""
@@ -232,41 +226,3 @@ def test_speak_and_listen_return_the_phones_of_the_chain(
         output, log = listener.communicate(timeout=LIMIT_S)
         assert f"session {name} ended: {len(phones)} phones" in log
         assert output.splitlines() == [listen_line(phone) for phone in phones]
-
-
-def test_the_asyncio_client_returns_the_phones_of_the_chain_bit_for_bit(
-    system: System, recordings: list[Path], expected: dict[str, list[events.Phone]]
-) -> None:
-    async def recognized(client: AsyncClient, path: Path) -> list[Timed]:
-        samples, rate_hz = read_audio(path)
-        session = await client.open_session(
-            encoding="f32le",
-            sample_rate_hz=rate_hz,
-            num_channels=samples.shape[1],
-            paced=False,
-        )
-        async with session:
-            results = await session.results(Phone, keep_all=True)
-            for begin in range(0, len(samples), CHUNK):
-                await session.push(samples[begin : begin + CHUNK].astype("<f4").tobytes())
-            await session.finish()
-            return [
-                (phone.symbol, phone.media_time, phone.duration, phone.confidence)
-                async for phone in results
-                if phone.final and phone.duration
-            ]
-
-    async def run() -> list[list[Timed]]:
-        async with AsyncClient(system.control) as client:
-            return await asyncio.gather(*(recognized(client, path) for path in recordings))
-
-    for path, phones in zip(recordings, asyncio.run(run()), strict=True):
-        assert phones == [
-            (
-                phone.symbol,
-                round(phone.onset_s * 16000),
-                round(phone.duration_s * 16000),
-                phone.confidence,
-            )
-            for phone in expected[path.name]
-        ]

@@ -85,7 +85,7 @@ def test_the_page_works_offline_after_the_first_visit(browser: Browser, site: Pa
 def test_frames_in_the_browser_equal_those_of_node(
     browser: Browser, site: Path, tmp_path: Path
 ) -> None:
-    samples = samples_of_file(DEMO / "lake-male.wav")[:24_000]  # the block network is slow here
+    samples = samples_of_file(DEMO / "lake-male.wav")[:16_000]  # the block network is slow here
     for name, content in web_model().items():
         (tmp_path / name).write_bytes(content)
     with serve_folder(site) as origin:

@@ -239,6 +239,7 @@ def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeCont
             await session.push(CHUNK[:1])
             await session.push(CHUNK[1:])
             await session.set_face(lip_model="learned")
+            await session.finish()
             await asyncio.to_thread(control.publish, control.faps, frame(1), frame(2), END)
             values = [result.values[0] async for result in frames]
             await session.close()
