@@ -13,10 +13,16 @@ from kouxing.shared.keys import load_user_key
 from tests.browser import Browser
 from tests.e2e.page_actions import write_tone
 from tests.e2e.page_control import PageControl
-from tests.system import DEMO, ROOT, Gateway, System, samples_of_file, wait_until
+from tests.system import DEMO, LIMIT_S, ROOT, Gateway, System, samples_of_file, wait_until
 
 PAGE = ROOT / "services" / "gateway" / "page"
 HEADS = {"woman": PAGE / "head.glb", "man": PAGE / "head-man.glb"}
+
+
+@pytest.fixture(autouse=True)
+def _wait_for_last_phones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let clients wait longer for the last phones on a busy machine."""
+    monkeypatch.setattr("kouxing_client.session_core.END_LIMIT_S", LIMIT_S)
 
 
 class CommandRunner:
