@@ -213,4 +213,4 @@ class _Streamer:
             time.sleep(STATUS_S)
 
     def _warn(self, text: str) -> None:
-        self._console.print(text, style="yellow", markup=False, highlight=False)
+        self._console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -261,7 +261,7 @@ class Supervisor:
 
     def _print(self, text: str, style: str | None = None) -> None:
         with contextlib.suppress(OSError):  # the console is a file on a full disk
-            self._console.print(text, style=style, markup=False, highlight=False)
+            self._console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def _console_text(line: bytes) -> str:

@@ -1,10 +1,13 @@
 """What the console of ``kouxing run`` shows of a service's log."""
 
+import io
 import json
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 
-from kouxing.services.cli.supervisor import _console_text
+from kouxing.services.cli.supervisor import Supervisor, _console_text
 
 
 @pytest.mark.parametrize(
@@ -22,3 +25,10 @@ def test_a_warning_names_its_session(entry: dict[str, str], text: str) -> None:
 
 def test_other_text_is_shown_as_it_is() -> None:
     assert _console_text(b"Segmentation fault\n") == "Segmentation fault"
+
+
+def test_a_long_warning_is_one_line(tmp_path: Path) -> None:
+    output = io.StringIO()
+    supervisor = Supervisor([], tmp_path, Console(file=output, width=40), services=())
+    supervisor._warn("turn the receiver on, " * 5)
+    assert len(output.getvalue().splitlines()) == 1
