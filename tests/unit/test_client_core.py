@@ -3,11 +3,11 @@
 from typing import Any, cast
 
 import pytest
-from kouxing_client import SHAPE_NAMES, FapFrame
+from kouxing_client import SHAPE_NAMES, FapFrame, Phone
 from kouxing_client.audio import ANSWER_LIMITS_S
 from kouxing_client.core import RETRY_S, ClientCore
 from kouxing_client.inbox import Inbox
-from kouxing_client.messages import Joined
+from kouxing_client.messages import EndOfFaps, Joined
 from kouxing_client.reach import NO_LISTENER
 from kouxing_client.session_core import (
     MOVE_LIMIT_S,
@@ -197,6 +197,16 @@ def test_audio_waits_for_subscriptions_so_that_no_frame_is_missed() -> None:
     assert sequences(harness.audio()) == []
     harness.pass_time(RESUBSCRIBE_S)
     assert sequences(harness.audio()) == [2]
+
+
+def test_ends_after_the_last_phones_though_a_publisher_confirms_late() -> None:
+    harness, inbox = CoreHarness(), Inbox(None)
+    harness.session.subscribe(Subscription(harness.session, (Phone,), "", inbox))
+    harness.sockets.connections[-1].on_message(EndOfFaps(session="s", epoch=1, sequence=1))
+    harness.confirm()  # the first subscription; phones may follow
+    assert not inbox.is_over
+    harness.confirm()
+    assert inbox.is_over
 
 
 def test_an_unknown_session_ends_unless_it_moves() -> None:

@@ -85,9 +85,11 @@ class Subscription:
             on_complete=self._on_complete,
         )
         self._end_limit_s = math.inf
+        self._awaits_last_phones = False
 
     def start(self) -> None:
         """Subscribe where the session is published now."""
+        self._awaits_last_phones = False
         self.follower.start(self._session.epoch, self._session.endpoints)
 
     def tick(self) -> None:
@@ -122,22 +124,32 @@ class Subscription:
                 self._on_result(Shapes(**header, set=self._shape_set, packed_weights=weights))
 
     def _on_end(self) -> None:
-        """End; before that, wait for the last phones, because they have another publisher.
-
-        It confirms a subscription after everything that it has published before.
-        """
+        """End; before that, wait for the last phones, because they have another publisher."""
         if Phone not in self._classes:
             self.inbox.end(None)
             return
         self._end_limit_s = self._session.sockets.now_s + END_LIMIT_S
+        self._awaits_last_phones = False
+        if self.follower.is_complete:
+            self._await_last_phones()
+
+    def _await_last_phones(self) -> None:
+        """Subscribe to confirmations again.
+
+        A publisher confirms a subscription after everything that it has published before.
+        """
+        self._awaits_last_phones = True
         joined = [topic(Joined.kind, self._session.name)]
         connection = self.follower.await_confirmation()
         for on in (False, True):
             self._session.sockets.set_topics(connection, joined, on=on)
 
     def _on_complete(self) -> None:
-        if self.follower.has_ended:
-            self.inbox.end(None)
+        if self.follower.has_ended and not self.inbox.is_over:
+            if self._awaits_last_phones:
+                self.inbox.end(None)
+            else:  # this confirms an earlier subscription
+                self._await_last_phones()
         if not self.joined.done():
             self.joined.set_result(None)
 
