@@ -69,6 +69,11 @@ def set_min_rate(browser: Browser, rate_hz: float) -> None:
     browser.evaluate(f"{module}.then((it) => {{ it.FaceRecording.minRateHz = {rate_hz} }})")
 
 
+def start_lesson(browser: Browser) -> None:
+    browser.click("learn")
+    browser.click("lesson-start")
+
+
 def read_aloud(browser: Browser) -> None:
     """Record until enough images were taken, however slowly, and wait for the outcome."""
     set_min_rate(browser, 0)
@@ -77,8 +82,7 @@ def read_aloud(browser: Browser) -> None:
         " window.createImageBitmap = (...args) => { numImages += 1; return takeImage(...args); }; 0"
     )
     browser.evaluate("window.kouxing.readingS = 600")
-    browser.click("learn")
-    browser.click("lesson-start")
+    start_lesson(browser)
     is_due = "document.getElementById('lesson-reading').classList.contains('due')"
     browser.wait_for(f"{is_due} && window.numImages > 80", 180)
     browser.evaluate("window.kouxing.readingS = 0.001")
@@ -159,8 +163,7 @@ def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
 def test_a_slow_computer_is_reported_before_reading(browser: Browser) -> None:
     set_min_rate(browser, 1000)
     browser.evaluate("window.kouxing.readingS = 600")
-    browser.click("learn")
-    browser.click("lesson-start")
+    start_lesson(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'")
     assert "too slow to track your face" in text_of(browser, "lesson-problem")
     browser.click("learn-mouth [data-step=problem] .close")
@@ -168,8 +171,7 @@ def test_a_slow_computer_is_reported_before_reading(browser: Browser) -> None:
 
 def test_a_slow_start_is_explained_from_the_first_moment(browser: Browser) -> None:
     browser.evaluate("void (document.body.append = () => {})")  # the tracker never loads
-    browser.click("learn")
-    browser.click("lesson-start")
+    start_lesson(browser)
     assert "On a slow computer" in text_of(browser, "lesson-advice")
     browser.click("learn-mouth [data-step=reading] .close")
     browser.evaluate("delete document.body.append")
@@ -186,8 +188,7 @@ def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
     )
     set_min_rate(browser, 0)
     browser.evaluate("window.kouxing.readingS = 2")
-    browser.click("learn")
-    browser.click("lesson-start")
+    start_lesson(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'", 180)
     problem, found = text_of(browser, "lesson-problem"), browser.evaluate("found")
     browser.evaluate(
@@ -212,8 +213,7 @@ def test_the_page_reports_a_missing_camera(browser: Browser) -> None:
         "navigator.mediaDevices.getUserMedia ="
         " () => Promise.reject(new DOMException('none', 'NotFoundError'))"
     )
-    browser.click("learn")
-    browser.click("lesson-start")
+    start_lesson(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'")
     assert "No camera" in text_of(browser, "lesson-problem")
     browser.evaluate("document.getElementById('learn-mouth').close()")

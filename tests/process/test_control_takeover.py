@@ -12,12 +12,7 @@ from kouxing.shared.wire.session import CloseSession, Done, Error, OpenSession, 
 from tests.control_harness import ControlHarness, make_heartbeat
 from tests.samples import START
 
-PLACED = {
-    "audio": "tcp://127.0.0.1:1",
-    "phones": "tcp://127.0.0.1:1",
-    "phone_input": "tcp://127.0.0.1:1",
-    "faps": "tcp://127.0.0.1:1",
-}
+PLACED = dict.fromkeys(("audio", "phones", "phone_input", "faps"), "tcp://127.0.0.1:1")
 ELSEWHERE = {**PLACED, "audio": "tcp://127.0.0.1:2"}
 
 

@@ -22,25 +22,15 @@ from tests.fake_sockets import FakeConnection, FakeSockets
 
 START_S = 2.0
 OPENED = {
-    "epoch": 1,
-    "token": "t",
-    "audio": "audio 1",
-    "phones": "phones 1",
-    "faps": "faps 1",
+    "epoch": 1, "token": "t", "audio": "audio 1", "phones": "phones 1", "faps": "faps 1",
     "events": "events",
-}
+}  # fmt: skip
 MOVED = {"epoch": 2, "audio": "audio 2", "phones": "phones 2", "faps": "faps 1"}
 STATE = {"state": "open", "age_s": 1.0, "speaking": False, "workers": {}, "facts": {}}
 CONTROL_STATE = {
-    "service": "control",
-    "instance": "control",
-    "role": "control",
-    "state": "ready",
-    "age_s": 0.0,
-    "clock_offset_ms": 0.0,
-    "endpoints": {"events": "events"},
-    "metrics": {},
-}
+    "service": "control", "instance": "control", "role": "control", "state": "ready", "age_s": 0.0,
+    "clock_offset_ms": 0.0, "endpoints": {"events": "events"}, "metrics": {},
+}  # fmt: skip
 
 
 class CoreHarness:
