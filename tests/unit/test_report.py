@@ -15,6 +15,7 @@ from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.page import TABLES
 from kouxing.evaluation.report.run import run_steps, write_result
 from kouxing.evaluation.report.steps import STEPS, Step
+from kouxing.evaluation.report.system_tables import attacks_table
 from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.commands import app as bench_app
 from kouxing.shared.errors import UserError
@@ -121,3 +122,18 @@ def test_a_failed_step_is_reported_and_leaves_the_old_result(
 def test_an_unknown_step_is_an_error() -> None:
     with pytest.raises(UserError, match="no step 'fautls'; choose from read,"):
         CliRunner().invoke(app, ["report", "fautls"], catch_exceptions=False)
+
+
+def test_the_table_of_attacks_has_the_service_that_grew_most() -> None:
+    result = {
+        "attack": "random bytes",
+        "target": "audio",
+        "has_key": False,
+        "growth_mb": {"control": 0.5, "recognizer": 2.0},
+        "kept_mb": {"control": 0.4, "recognizer": 1.0},
+        "restarted": ["gateway"],
+        "p95_ms": {"before": 8.0, "during": 12.0, "after": None},
+    }
+    (row,) = attacks_table([result]).rows
+    assert row[:3] == ["random bytes; gateway restarted", "audio", "no"]
+    assert row[3:] == ["recognizer", "2.0", "1.0", "8 / 12 / -"]
