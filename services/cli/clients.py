@@ -108,7 +108,7 @@ def speak(
             fast=fast, raw=raw, rate=rate, channels=channels, track=track,
         )  # fmt: skip
     else:
-        reject_options("applies to mic and monitor: kouxing speak mic --device", device=device)
+        reject_options("applies to mic and monitor: kouxing speak mic --device NAME", device=device)
     if raw:
         reject_options("does not apply to raw samples; leave it out", track=track)
     else:

@@ -133,7 +133,7 @@ class TimingMethod(StrEnum):
 def reject_options(reason: str, **options: object) -> None:
     """Raise ``UserError`` with a reason if one of the named options was given."""
     for name, value in options.items():
-        if value not in (None, False, ""):
+        if value is not None and value is not False and value != "":  # 0 was given
             raise UserError(f"--{name.replace('_', '-')} {reason}")
 
 

@@ -131,7 +131,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
     [
         ("speak a.wav --rate 8000", "--rate applies to raw samples; add --raw"),
         ("speak a.wav --raw --track 2", "--track does not apply to raw samples"),
-        ("speak a.wav --device USB", "--device applies to mic and monitor"),
+        ("speak a.wav --device USB", "speak mic --device NAME"),
         ("speak mic --fast", "--fast does not apply to mic"),
         ("speak monitor --raw", "--raw does not apply to monitor"),
         ("lips a.wav mouth.png --timing align", "--timing needs a text"),
@@ -142,7 +142,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("express demo --hold 2", "--hold needs an expression"),
         ("express joy:0.4", "for example joy=0.4"),
         ("run --stop-after", "--stop-after needs --play FILE"),
-        ("run --track 2", "--track needs --play FILE"),
+        ("run --track 0", "--track needs --play FILE"),
         ("head export . --head ada", "leave out --head"),
         ("train --any-license heads --parts . -o .", "--any-license does not apply to heads"),
         ("keys add tablet", "tablet.key exists; add --force"),
