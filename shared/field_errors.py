@@ -9,7 +9,7 @@ from kouxing.shared.name_rules import NAME, NAME_RULE
 _TYPES = {
     "array": "a list",
     "bool": "true or false",
-    "bytes": "bytes",
+    "bytes": "binary data",
     "float": "a number",
     "int": "an integer",
     "null": "null",

@@ -19,6 +19,7 @@ from kouxing.shared.wire.session import OpenSession
         ({"encoding": "mp3"}, "encoding must be s16le or f32le"),
         ({"face": {"feeling": -1}}, "face.feeling must be a number of at least 0.0"),
         ({"face": {"shapes": 17 * ["x"]}}, "face.shapes must be a list of at most 16 items"),
+        ({"mouth_profile": 5}, "mouth_profile must be binary data, not an integer"),
         ({"mouth_profile": "?"}, "mouth_profile: Invalid base64 encoded string"),
         ({"language": 5}, "language must be a string, not an integer"),
     ],
