@@ -182,8 +182,8 @@ def find_language(name: str) -> str:
     Raises ``UserError`` if it is not installed.
     """
     language = language_codes().get(name, name)
-    if language not in BUILT_IN and language not in _installed_packages():
-        language = next(filter(partial(_has_code, name), _installed_packages()), name)
+    if language not in BUILT_IN and language not in (installed := _installed_packages()):
+        language = next(filter(partial(_has_code, name), installed), name)
     return load_inventory(language).language
 
 
