@@ -16,6 +16,7 @@ from kouxing.shared.wire.session import OpenSession
 from tests.samples import SAMPLES
 
 PHONE: dict[str, Any] = {"index": 0, "symbol": "a", "duration": 1, "final": True}
+FRAME: dict[str, Any] = {"values": b"\0" * 272, "mask": b"\0" * 9}
 
 
 def parts_of(kind: str, session: str = "s", **fields: object) -> list[bytes]:
@@ -39,6 +40,7 @@ def parts_of(kind: str, session: str = "s", **fields: object) -> list[bytes]:
         (parts_of("open-session", session="a b", request="r"), "body"),
         *((parts_of("phone", **PHONE, confidence=c), "body") for c in (math.nan, 1.5, -0.1)),
         (parts_of("fap-frame", values=b"short", mask=b"\0" * 9), "body"),
+        (parts_of("fap-frame", **FRAME, shapes={"arkit": b"\0" * 7}), "body"),
         (parts_of("done", request="r", version=1), "version"),
         (parts_of("open", request="r", version=1), "version"),
         (parts_of("open", request="r"), "kind"),

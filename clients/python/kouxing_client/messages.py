@@ -100,6 +100,10 @@ class FapFrame(Result, frozen=True, kw_only=True):
     packed_shapes: ShapeMap = msgspec.field(name="shapes", default_factory=dict)
     """``shapes`` as little-endian float32"""
 
+    def __post_init__(self) -> None:
+        if any(len(weights) % 4 for weights in self.packed_shapes.values()):
+            raise ValueError("shapes must have 4 bytes for each weight")
+
     @property
     def values(self) -> array[float]:
         """68 values in FAP units, FAP 1 first."""
