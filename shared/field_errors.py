@@ -38,7 +38,7 @@ def describe_field_error(error: Exception) -> str:
     rest, name = match["rest"], match["name"]
     if rest.startswith(", got `"):
         return f"{name} must be {types}, not {_list_types(rest[7:].rstrip('`'))}"
-    if pattern := re.fullmatch(r" matching regex ['\"]\^(.*)\$['\"]", rest):
+    if pattern := re.fullmatch(r" matching regex ['\"]\^(.*)\$.*['\"]", rest):
         if pattern[1] in (NAME, SESSION_NAME):
             return f"{name} is not a valid name; {NAME_RULE}"
         return f"{name} must be {pattern[1].strip('()').replace('|', ' or ')}"

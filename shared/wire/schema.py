@@ -6,6 +6,7 @@
 import json
 
 import msgspec
+from kouxing_client.field_types import NO_LINE_BREAK
 from kouxing_client.messages import VERSION
 
 from kouxing.shared.wire.kinds import MESSAGES
@@ -23,8 +24,15 @@ def schema() -> dict[str, object]:
         "title": f"kouxing protocol version {VERSION}",
         "description": "Bodies are msgpack maps; base64 strings stand for binary fields.",
         "properties": dict(zip(MESSAGES, references, strict=True)),
-        "$defs": definitions,
+        "$defs": _without_line_break_rule(definitions),
     }
+
+
+def _without_line_break_rule(definitions: dict[str, object]) -> dict[str, object]:
+    """Simplify the patterns, because "$" does not match before a line break in JSON Schema."""
+    rule = json.dumps(NO_LINE_BREAK).strip('"')
+    simplified: dict[str, object] = json.loads(json.dumps(definitions).replace(rule, ""))
+    return simplified
 
 
 def to_text(value: object, depth: int = 0) -> str:

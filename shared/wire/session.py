@@ -4,7 +4,15 @@ from enum import StrEnum
 from typing import Annotated
 
 from kouxing_client.audio import SAMPLE_BYTES
-from kouxing_client.field_types import MAX_AUDIO_BYTES, Count, Endpoint, Name, Seconds, Text
+from kouxing_client.field_types import (
+    MAX_AUDIO_BYTES,
+    Count,
+    Endpoint,
+    Name,
+    Seconds,
+    Text,
+    whole_text,
+)
 from kouxing_client.messages import ServiceState, SessionFacts, SessionState
 from kouxing_client.options import MAX_CHANNELS, MAX_RATE_HZ, MIN_RATE_HZ
 from msgspec import Meta, field
@@ -13,7 +21,7 @@ from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import ServiceMessage
 
-Encoding = Annotated[str, Meta(pattern=f"^({'|'.join(SAMPLE_BYTES)})$")]
+Encoding = Annotated[str, whole_text(f"({'|'.join(SAMPLE_BYTES)})")]
 SampleRate = Annotated[int, Meta(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]
 NumChannels = Annotated[int, Meta(ge=1, le=MAX_CHANNELS)]
 MouthProfile = Annotated[bytes, Meta(max_length=MAX_MOUTH_PROFILE_BYTES)]

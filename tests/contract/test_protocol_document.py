@@ -8,7 +8,7 @@ from typing import Any, get_args
 import msgspec
 import pytest
 from kouxing_client import KouxingError
-from kouxing_client.field_types import MAX_AUDIO_BYTES
+from kouxing_client.field_types import MAX_AUDIO_BYTES, NO_LINE_BREAK
 from kouxing_client.messages import (
     VERSION,
     Lateness,
@@ -110,6 +110,7 @@ def span_text(low: float | None, high: float | None, unit: str = "") -> str:
 
 
 def pattern_text(pattern: str) -> str:
+    pattern = pattern.removesuffix(NO_LINE_BREAK)
     choices = re.fullmatch(r"\^\((.*)\)\$", pattern)
     if choices:
         return " or ".join(f"`{choice}`" for choice in choices[1].split("|"))

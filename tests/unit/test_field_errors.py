@@ -16,6 +16,8 @@ from kouxing.shared.wire.session import OpenSession
         ({"sample_rate_hz": 200000}, "sample_rate_hz must be an integer of at most 48000"),
         ({"sample_rate_hz": "x"}, "sample_rate_hz must be an integer, not a string"),
         ({"session": "a b"}, f"session is not a valid name; {NAME_RULE}"),
+        ({"session": "a\n"}, f"session is not a valid name; {NAME_RULE}"),
+        ({"encoding": "s16le\n"}, "encoding must be s16le or f32le"),
         ({"encoding": "mp3"}, "encoding must be s16le or f32le"),
         ({"face": {"feeling": -1}}, "face.feeling must be a number of at least 0.0"),
         ({"face": {"shapes": 17 * ["x"]}}, "face.shapes must be a list of at most 16 items"),

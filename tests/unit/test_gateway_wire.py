@@ -230,6 +230,7 @@ def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
     [
         ({"stop": True}, "unknown field stop; use follow, play, avatar, "),
         ({"follow": "a b"}, "follow is not a valid name; use "),
+        ({"follow": "a\n"}, "follow is not a valid name; use "),
         ({"play": "song"}, "play must be sample"),
         ({"lip_model": ""}, "the message changes nothing; use follow, play, avatar, "),
         ({}, "the message changes nothing; use follow, play, avatar, "),

@@ -9,9 +9,16 @@ MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the fir
 MAX_SHAPES = 256  # per set
 MAX_AUDIO_BYTES = 64 * 1024  # in one message
 SESSION_NAME = "[A-Za-z0-9_-]{0,64}"  # empty: no session
+NO_LINE_BREAK = r"(?!\n)"  # "$" alone also matches before a final line break
+
+
+def whole_text(pattern: str) -> Meta:
+    """Return the rule that a regular expression matches a whole text."""
+    return Meta(pattern=f"^{pattern}${NO_LINE_BREAK}")
+
 
 Version = Annotated[int, Meta(ge=1, le=65535)]
-SessionName = Annotated[str, Meta(pattern=f"^{SESSION_NAME}$")]
+SessionName = Annotated[str, whole_text(SESSION_NAME)]
 Name = Annotated[str, Meta(min_length=1, max_length=128)]
 Text = Annotated[str, Meta(max_length=2000)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
@@ -19,7 +26,7 @@ Samples = Annotated[int, Meta(ge=0, le=2**53)]  # at 16 kHz
 Seconds = Annotated[float, Meta(ge=0)]
 Milliseconds = Annotated[float, Meta(ge=0)]
 Probability = Annotated[float, Meta(ge=0, le=1)]
-PhoneSymbol = Annotated[str, Meta(pattern=r"^[a-z]{1,4}$")]
+PhoneSymbol = Annotated[str, whole_text("[a-z]{1,4}")]
 FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]
 FapMask = Annotated[bytes, Meta(min_length=MASK_BYTES, max_length=MASK_BYTES)]
 ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
@@ -27,6 +34,6 @@ ShapeMap = Annotated[dict[Name, ShapeWeights], Meta(max_length=16)]
 Endpoint = Annotated[str, Meta(max_length=256)]
 EndpointMap = Annotated[dict[Name, Endpoint], Meta(max_length=16)]
 MetricMap = Annotated[dict[Name, float], Meta(max_length=64)]
-Role = Annotated[str, Meta(pattern="^(control|worker|observer)$")]
-ServiceStatus = Annotated[str, Meta(pattern="^(ready|draining)$")]
-SessionStatus = Annotated[str, Meta(pattern="^(starting|open)$")]
+Role = Annotated[str, whole_text("(control|worker|observer)")]
+ServiceStatus = Annotated[str, whole_text("(ready|draining)")]
+SessionStatus = Annotated[str, whole_text("(starting|open)")]
