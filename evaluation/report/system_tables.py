@@ -202,10 +202,12 @@ def faults_table(outcomes: Sequence[Figures]) -> Table:
                 format_number(face["largest_step"], ".1f"),
             ]
             if face
-            else [outcome["failure"], "-", "-", "-", "-"]
+            else ["-"] * 5
         )
         late_ms = format_number(outcome["late_p95_ms"], ".0f")
-        rows.append([outcome["fault"], *cells, late_ms, str(outcome["num_refused"])])
+        notes = [f"not completed: {outcome['failure']}"] if outcome["failure"] else []
+        title = "; ".join([outcome["fault"], *notes])
+        rows.append([title, *cells, late_ms, str(outcome["num_refused"])])
     return Table(columns, rows)
 
 

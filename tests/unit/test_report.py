@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.page import TABLES
 from kouxing.evaluation.report.run import run_steps, write_result
 from kouxing.evaluation.report.steps import STEPS, Step
-from kouxing.evaluation.report.system_tables import attacks_table
+from kouxing.evaluation.report.system_tables import attacks_table, faults_table
 from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.commands import app as bench_app
+from kouxing.evaluation.system.continuity import Continuity
+from kouxing.evaluation.system.faults import FaultOutcome
 from kouxing.shared.errors import UserError
 
 SCORES = {"r_opening": 0.5, "closure_f1": 0.6, "mtm_ms": 50.0, "slcc": 0.0}
@@ -137,3 +140,16 @@ def test_the_table_of_attacks_has_the_service_that_grew_most() -> None:
     (row,) = attacks_table([result]).rows
     assert row[:3] == ["random bytes; gateway restarted", "audio", "no"]
     assert row[3:] == ["recognizer", "2.0", "1.0", "8 / 12 / -"]
+
+
+def test_the_table_of_faults_says_which_sessions_did_not_complete() -> None:
+    face = Continuity(**{field.name: 2 for field in fields(Continuity)})
+    outcomes = [
+        FaultOutcome(fault="killed", failure="no last frame", face=face, load=0.5),
+        FaultOutcome(fault="gone", failure="no last frame", load=0.5),
+        FaultOutcome(fault="none", failure="", face=face, load=0.5),
+    ]
+    killed, gone, none = faults_table([asdict(outcome) for outcome in outcomes]).rows
+    assert (killed[0], killed[3:5]) == ("killed; not completed: no last frame", ["2", "2 / 2 / 2"])
+    assert (gone[0], gone[1:5]) == ("gone; not completed: no last frame", ["-"] * 4)
+    assert none[0] == "none"
