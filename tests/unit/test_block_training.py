@@ -3,15 +3,19 @@
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.blocks import batches, recipe
 from kouxing.training.blocks.recipe import train_blocks
-from kouxing.training.networks import optimizer, teacher
+from kouxing.training.networks import labels, optimizer, teacher
+from kouxing.training.networks.labels import STATES_PER_PHONE
 from kouxing.training.networks.network import ReadoutShape
+from kouxing.training.training_set import load_examples
 from tests.corpora import write_noises, write_speech
 from tests.system import HELLO
 from tests.unit.test_block_model import SMALL
@@ -32,6 +36,23 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(teacher, "_NUM_STEPS", 2)
 
 
+@pytest.mark.parametrize("name", ["blocks", "gmm"])  # with three and with five states per phone
+def test_each_phone_of_a_text_is_aligned_with_three_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    corpus, model = write_speech(tmp_path / "corpus", {"a": HELLO}), load_model(name)
+    examples = load_examples([corpus], RowErrors(), model.inventory, any_license=False)
+    (example,), (alignment,) = labels._align_examples(model, examples)
+    states = alignment.states[np.diff(alignment.states, prepend=-1) != 0]
+    silence = model.inventory.index[model.inventory.silence]
+    assert states[states // STATES_PER_PHONE != silence].tolist() == [
+        STATES_PER_PHONE * phone + place
+        for phone in example.phones
+        for place in range(STATES_PER_PHONE)
+    ]
+
+
 @pytest.mark.slow
 def test_trains_resumes_and_writes_model_and_card(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -45,7 +66,7 @@ def test_trains_resumes_and_writes_model_and_card(
         [corpus],
         output,
         whisper=write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6)),
-        start=model_path("gmm"),
+        start=None,
         untranscribed=[corpus],
         sounds=[write_noises(tmp_path / "sounds")],
         any_license=False,
@@ -62,7 +83,7 @@ def test_trains_resumes_and_writes_model_and_card(
     frames = WhisperMel().accept_waveform(HELLO)
     assert len(stream.score(frames)) + len(stream.score(None)) == len(frames)
     card = output.with_suffix(".md").read_text()
-    assert "3 steps of 256 s of sound, aligned by `gmm.npz`, on 8 recordings" in card
+    assert "3 steps of 256 s of sound, aligned by `blocks.npz`, on 8 recordings" in card
     assert "CC0-1.0" in card
     left = {path.name for path in tmp_path.iterdir() if path.is_file()}
     assert left == {"blocks.npz", "blocks.md"}
