@@ -25,6 +25,7 @@ from kouxing_client import (
     Shapes,
     find_key,
 )
+from kouxing_client.base import MAX_LIVE
 from kouxing_client.messages import EndOfFaps, Event
 
 from kouxing.shared.keys import add_key, load_user_key
@@ -231,21 +232,26 @@ def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
 
 
 def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeControl) -> None:
+    published = [frame(number) for number in range(1, 4 * MAX_LIVE)]
+
     async def run() -> list[float]:
         async with AsyncClient(control.address, insecure=True) as client:
             assert [state.service for state in (await client.status()).services]
             session = await client.open_session("s")
-            frames = await session.frames()
+            newest = await session.frames()
+            frames = await session.results(FapFrame, keep_all=True)
             await session.push(CHUNK[:1])
             await session.push(CHUNK[1:])
             await session.set_face(lip_model="learned")
             await session.finish()
-            await asyncio.to_thread(control.publish, control.faps, frame(1), frame(2), END)
+            end = EndOfFaps(session="s", epoch=1, sequence=len(published) + 1)
+            await asyncio.to_thread(control.publish, control.faps, *published, end)
+            assert [result.values[0] async for result in newest][-1] == len(published)
             values = [result.values[0] async for result in frames]
             await session.close()
             return values
 
-    assert asyncio.run(run()) == [1.0, 2.0]
+    assert asyncio.run(run()) == [float(message.sequence) for message in published]
 
 
 @pytest.mark.parametrize(

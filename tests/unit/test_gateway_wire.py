@@ -119,6 +119,13 @@ AT_16_KHZ = {"sample_rate_hz": 16000}
         (parse_hello, {}, "^sample_rate_hz is missing$"),
         (parse_hello, {"sample_rate": 16000}, "; unknown field sample_rate; use sample_rate_hz, "),
         (parse_hello, {"sample_rate_hz": 96000}, "must be an integer of at most 48000"),
+        (
+            parse_hello,
+            AT_16_KHZ | {"num_channels": 3},
+            "num_channels must be an integer of at most 2",
+        ),
+        (parse_hello, AT_16_KHZ | {"encoding": "opus"}, "encoding must be s16le or f32le"),
+        (parse_hello, AT_16_KHZ | {"language": 1}, "language must be a string, not an integer"),
         (parse_hello, AT_16_KHZ | {"mouth_profile": "no base64!"}, "mouth_profile"),
         (parse_hello, AT_16_KHZ | {"mouth_profile": LONG_PROFILE}, "mouth_profile"),
         (parse_hello, [1], "object"),
