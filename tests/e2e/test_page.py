@@ -189,6 +189,7 @@ def test_sound_waits_for_frames_while_the_page_is_hidden(
     control: PageControl, talking_page: Browser
 ) -> None:
     page = talking_page
+    page.wait_for(f"{STATE}.soundMinusImageMs !== null")
     before_ms = page.evaluate(f"{STATE}.playoutDelayMs")  # a busy page waits for longer
     page.evaluate(
         "window.ticks = []; window.tick = requestAnimationFrame;"
