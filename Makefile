@@ -78,7 +78,7 @@ test: .venv/installed-dev setup $(LIPS_MODELS) \
 	$(STAGES) $(TEST_STAGES)
 
 test-python:
-	$(PYTEST) -n 3 --dist loadfile
+	$(PYTEST) -n 4 --dist loadfile --no-loadscope-reorder
 
 test-page:
 	$(NPM) $(PAGE) test
