@@ -5,16 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSITIONS, Topology
 from kouxing.services.recognizer.search.phone_lm import ContextGraph, PhoneLanguageModel
-from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.phones.inventory import PhoneInventory, installed_packages, load_inventory
 
 MANDARIN = load_inventory("mandarin")
 NUM_PHONES = len(MANDARIN)
@@ -24,14 +26,20 @@ START = 1 + SIL  # the context after a pause, among the graph's
 NGram = tuple[int, ...]
 
 
-def install_language(folder: Path, name: str, package: str) -> None:
-    """Write the metadata of an installed distribution with a language."""
+@contextmanager
+def installed_language(folder: Path, name: str, package: str) -> Iterator[None]:
+    """Install a distribution with a language into a folder that Python searches."""
     distribution = folder / f"kouxing_{name}-1.0.dist-info"
     distribution.mkdir()
     (distribution / "METADATA").write_text(
         f"Metadata-Version: 2.1\nName: kouxing-{name}\nVersion: 1.0\n"
     )
     (distribution / "entry_points.txt").write_text(f"[kouxing.languages]\n{name} = {package}\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        installed_packages.cache_clear()
+        yield
+    installed_packages.cache_clear()
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,12 +182,13 @@ def find_language(name: str) -> str:
     Raises ``UserError`` if it is not installed.
     """
     language = language_codes().get(name, name)
-    if language not in BUILT_IN and language not in (installed := _installed_packages()):
+    if language not in BUILT_IN and language not in (installed := installed_packages()):
         language = next(filter(partial(_has_code, name), installed), name)
     return load_inventory(language).language
 
 
-def _installed_packages() -> dict[str, str]:
+@lru_cache
+def installed_packages() -> dict[str, str]:
     """Return the packages of the entry points, by language."""
     return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
 
@@ -207,7 +208,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
     """
     package = BUILT_IN.get(language)
     if package is None:
-        installed = _installed_packages()
+        installed = installed_packages()
         package = installed.get(language)
         if package is None:
             known = ", ".join([*language_codes(), *sorted(installed.keys() - BUILT_IN.keys())])

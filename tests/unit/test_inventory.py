@@ -7,7 +7,7 @@ import pytest
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, find_language, load_inventory
-from tests.languages import MANDARIN, install_language
+from tests.languages import MANDARIN, installed_language
 
 TOO_MANY_PHONES = tuple(chr(97 + n // 26) + chr(97 + n % 26) for n in range(256))
 
@@ -71,16 +71,17 @@ def test_rejects_an_unknown_language() -> None:
 def test_rejects_a_broken_package(
     table: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "broken_language", raising=False)  # of an earlier case
     package = tmp_path / "broken_language"
     package.mkdir()
     (package / "__init__.py").touch()
     if table is not None:
         (package / "phones.tsv").write_text(table)
-    install_language(tmp_path, "broken", "broken_language")
     error = f"language broken: cannot read package broken_language: .*{message}"
-    with pytest.raises(UserError, match=error):
+    with (
+        installed_language(tmp_path, "broken", "broken_language"),
+        pytest.raises(UserError, match=error),
+    ):
         load_inventory("broken")
 
 
@@ -94,19 +95,18 @@ def test_rejects_a_broken_package(
     ids=["valid", "no titles", "IPA"],
 )
 def test_an_installed_language_of_tables_is_found_by_its_code(
-    settings: str, phones: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: str, phones: str, message: str, tmp_path: Path
 ) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
     name = f"tables_{len(phones)}_{len(settings)}"  # not cached by another case
     package = tmp_path / name
     package.mkdir()
     (package / "language.toml").write_text(settings, "utf-8")
     (package / "phones.tsv").write_text(f"phone\n{phones}", "utf-8")
-    install_language(tmp_path, name, name)
-    if message:
-        with pytest.raises(UserError, match=message):
-            find_language(name)
-        with pytest.raises(UserError, match="'zxx' is not installed"):
-            find_language("zxx")
-    else:
-        assert find_language("zxx") == find_language(name) == name
+    with installed_language(tmp_path, name, name):
+        if message:
+            with pytest.raises(UserError, match=message):
+                find_language(name)
+            with pytest.raises(UserError, match="'zxx' is not installed"):
+                find_language("zxx")
+        else:
+            assert find_language("zxx") == find_language(name) == name

@@ -22,7 +22,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.training.model_files import save_gmm
-from tests.languages import flat_language, install_language
+from tests.languages import flat_language, installed_language
 from tests.live_streams import recognize_live
 from tests.system import VOWELS_FILE
 
@@ -33,9 +33,7 @@ SAMPLES = read_audio(VOWELS_FILE)[0][:, 0]
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PhoneInventory]:
     """Install the toy language."""
     folder = tmp_path_factory.mktemp("toy")
-    install_language(folder, "toy", "tests.toy_language")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(folder))
+    with installed_language(folder, "toy", "tests.toy_language"):
         yield load_inventory("toy")
     load_inventory.cache_clear()
     load_lip_model.cache_clear()
