@@ -22,7 +22,7 @@ class Table:
 
 
 def show_results(json_file: Path | None, results: object, *tables: Table) -> None:
-    """Print the tables of a command, and write its results unless ``json_file`` is None."""
+    """Print the tables of a command. Write its results to the JSON file, if there is one."""
     console = Console()
     for table in tables:
         print_table(console, table.title, table.columns, table.rows)

@@ -45,9 +45,9 @@ def recognize_events(
 class LivePipeline:
     """Computes the FAP frames of one session from its audio, one channel.
 
-    ``lip_model`` is for the acoustic model's language, so ``synthesizer.lips`` is ignored. If
-    ``lip_predictor`` is None, the recognizer's default predictor is used. ``events`` are the events
-    that the recognizer has emitted so far.
+    ``lip_model`` is for the acoustic model's language, so ``synthesizer.lips`` is ignored. Without
+    ``lip_predictor``, the recognizer uses its default predictor. ``events`` are the events that the
+    recognizer has emitted so far.
 
     Examples
     --------

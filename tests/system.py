@@ -52,7 +52,7 @@ def samples_of_file(path: Path) -> NDArray[np.float32]:
 
 
 HELLO = samples_of_file(DEMO / "hello-female.wav")[:24_000]  # 1.5 s
-# Runs the command line. A shell's background processes ignore Ctrl-C, and so do their children.
+# Runs the command line. Programs that a shell starts in the background ignore Ctrl-C.
 CTRL_C_COMMAND = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)

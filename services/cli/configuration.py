@@ -23,7 +23,7 @@ The sources of a value, from weakest to strongest:
 1. the default in the tables below
 2. a TOML file (`--config FILE`) with one table per service, such as `[recognizer]`
 3. the environment: `KOUXING_<SERVICE>_<KEY>`, such as `KOUXING_RECOGNIZER_MIN_CONFIDENCE`
-4. the command line: `--set SERVICE.KEY=VALUE`; commands of one service also take `--set KEY=VALUE`
+4. the command line: `--set SERVICE.KEY=VALUE`, or `--set KEY=VALUE` for a command of one service
 
 Services also have the keys of `[common]`. To set such a key for all services, use the table
 `[common]` or the variable `KOUXING_<KEY>`. Only the driver and the gateway have `head`. Only these
