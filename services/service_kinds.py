@@ -34,7 +34,7 @@ KINDS: dict[str, ServiceKind] = {  # in order of start
     "recognizer": ServiceKind(
         name="recognizer",
         role="worker",
-        summary="Run a recognizer: audio in, phones with times out.",
+        summary="Run a recognizer: audio in, timestamped phones out.",
         config="kouxing.services.recognizer.config:RecognizerConfig",
         service="kouxing.services.recognizer.service:RecognizerService",
         provides=("audio", "unpaced_audio", "phones"),

@@ -180,7 +180,7 @@ def correlate_by_speaker(
 
 
 def opening_range(opening: Array) -> float:
-    """Return the range of an opening without its extreme twentieths."""
+    """Return the range of an opening from its 5th to its 95th percentile."""
     low, high = np.percentile(opening, [5, 95])
     return float(high - low)
 
@@ -220,7 +220,7 @@ def phone_spread(clips: ScoredClips) -> float | None:
 
 
 def _measured_middles_s(clip: ScoredClip) -> Array:
-    """Return the middles of the phones during which the real lips were tracked."""
+    """Return the midpoints of the phones during which the real lips were tracked."""
     if not len(clip.real.time_s):
         return np.zeros(0)
     phones = clip.reference.phones

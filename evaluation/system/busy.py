@@ -143,7 +143,7 @@ def _speaker(
     limit_s = quiet_s + FIRST_FRAME_LIMIT_S
     while not speaker.arrived_s:
         if quiet_s > limit_s:
-            raise UserError("no frame arrives; close other programs and try again")
+            raise UserError("no frames arrived; close other programs and try again")
         quiet_s += SETTLE_S
         generator.speak_until(quiet_s)
     yield generator, quiet_s

@@ -190,7 +190,7 @@ def listen(
     if form in SPEECH_FORMATS:
         reject_options(f"does not apply to {form}, which are only printed", output=output)
     if form is ListenFormat.LIVELINK and output is None:
-        raise UserError("--as livelink is a table; add --output face.csv")
+        raise UserError("--as livelink writes a CSV file; add --output face.csv")
     check_output(output, force=force)
     follow(_session_name(session), output, form, find_control_address(control), alphabet)
 

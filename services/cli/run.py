@@ -92,7 +92,7 @@ def run(
     sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
     with lock_output_folder(out), contextlib.ExitStack() as startup:
         startup.enter_context(
-            lock_startup(lambda: print_message("waiting for another kouxing to finish starting"))
+            lock_startup(lambda: print_message("waiting until another kouxing has started"))
         )
         moved = _moved_addresses(settings, has_port_option=port is not None)
         control_environment = _control_environment(settings, moved)

@@ -41,8 +41,8 @@ class _Service:
     log_thread: threading.Thread | None = None  # copies the log of the process
     started_s: float = -math.inf
     restart_at_s: float = math.inf
-    backoff_s: float = 0.0  # delay before the restart after a soon crash
-    is_restarting: bool = False  # started again, and not ready yet
+    backoff_s: float = 0.0  # delay before the restart after an early crash
+    is_restarting: bool = False  # restarted, but not ready yet
     error: str = ""  # newest error in the configuration
 
     @property
@@ -203,7 +203,7 @@ class Supervisor:
         status = process.poll()
         if status is None:
             if process.hangs:
-                self._warn(f"{service.name} hangs; killing it")
+                self._warn(f"{service.name} is not responding; killing it")
                 process.kill()
             elif process.is_ready and service.is_restarting:
                 service.is_restarting = False

@@ -60,7 +60,7 @@ def parse_target(url: str) -> Target:
 
 def _check_combination(target: Target) -> None:
     if target.is_mouth_only and target.options.get("head") == "on":
-        raise UserError("only=mouth leaves the head to another program; leave out head=on")
+        raise UserError("only=mouth lets another program control the head; leave out head=on")
     if target.camera is not None and is_loopback(target.host) and target.camera[1] == target.port:
         raise UserError(
             f"camera must differ from the program's port {target.port}; set the tracker to send to"

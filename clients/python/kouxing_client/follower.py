@@ -186,7 +186,7 @@ class Follower:
         self._retry_s = self._transport.now_s + RETRY_S
         self._connection = self._transport.subscribe(
             self.session,
-            (*self._classes, Joined),  # a publisher confirms it after the others
+            (*self._classes, Joined),  # subscribed last, so its confirmation covers the others
             self._addresses - self._live_addresses,
             self._live_addresses,
             lambda message: self._on_arrival(message, confirmed),

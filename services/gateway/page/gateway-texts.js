@@ -103,7 +103,7 @@ const CHINESE = {
     "camera 应为端口（例如 39541）或 地址:端口，而不是 {text}",
   "camera must differ from the program's port {port}; set the tracker to send to the port of camera":
     "camera 的端口不能与目标程序的端口 {port} 相同；请让面部追踪程序发送到 camera 的端口",
-  "only=mouth leaves the head to another program; leave out head=on":
+  "only=mouth lets another program control the head; leave out head=on":
     "only=mouth 表示头部由其他程序控制，请去掉 head=on",
   "cannot reach {address}: {reason}": "无法连接 {address}：{reason}",
   "VTube Studio asks whether kouxing may move the model: press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
