@@ -21,7 +21,7 @@ from kouxing.evaluation.system.wait import wait_until
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 
-_TIMEOUT_S = 60.0
+_TIMEOUT_S = 120.0
 
 
 def is_installed() -> bool:

@@ -27,7 +27,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 @pytest.mark.parametrize(
     ("service", "blow", "text"),
     [
-        ("recognizer", signal.SIGSTOP, "recognizer hangs"),
+        ("recognizer", signal.SIGSTOP, "recognizer is not responding"),
         ("synthesizer", signal.SIGKILL, "synthesizer ended with status -9"),
     ],
 )

@@ -87,3 +87,12 @@ test("it reconnects with increasing delays, to the session chosen last", (t) => 
   const states = calls.map(([, connected]) => connected);
   assert.deepEqual(states, [true, false, false, true, false, false]);
 });
+
+test("it follows a session that was chosen while it was connecting", () => {
+  const viewer = new ViewerSocket(toViewer, "old", record().handlers);
+  const [socket] = FakeWebSocket.instances;
+  viewer.follow("new");
+  assert.deepEqual(socket.sent, []);
+  socket.open();
+  assert.deepEqual(socket.sent, [{ follow: "new" }]);
+});

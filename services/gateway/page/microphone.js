@@ -7,7 +7,7 @@ import { UserError, translate } from "./language.js";
 
 const RETRY_MS = 500;
 const TAIL_MS = 1000; // silence after a file, for its last frames
-const GIVE_UP_MS = 30000; // longer than the restart of a crashed service
+const GIVE_UP_MS = 60000; // longer than the restart of a crashed service on a busy machine
 
 export class Microphone {
   #handlers;

@@ -47,11 +47,13 @@ export class ViewerSocket {
   }
 
   #connect() {
-    const socket = new WebSocket(this.#address(this.#chosen));
+    const chosen = this.#chosen;
+    const socket = new WebSocket(this.#address(chosen));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.#retryMs = RETRY_MS.min;
       this.#handlers.state(true);
+      if (this.#chosen !== chosen) this.follow(this.#chosen); // chosen while it was connecting
     };
     socket.onmessage = (event) => this.#receive(event.data);
     // Node 22 reports a failed connection only as an error.
