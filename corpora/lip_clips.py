@@ -131,14 +131,16 @@ def read_clips(
     """Read the clips of a folder in one language, or in all with None.
 
     Without ``any_license``, clips whose license does not allow distributing a model are not in the
-    split ``train``. Raises UserError if there are no clips, or one of them cannot be read.
+    split ``train``. A ``.json`` file without a ``.flac`` or ``.csv`` file of the same name is not
+    a clip. Raises UserError if there are no clips, or one of them cannot be read.
     """
     held = folder / "held.txt"
     held_out = set(read_text(held, _MAX_BYTES).split()) if held.exists() else set()
     clips = [
         clip
         for path in sorted(folder.glob("*.json"))
-        if (clip := _read_clip(path, language, any_license=any_license, held_out=held_out))
+        if any(path.with_suffix(suffix).exists() for suffix in (".flac", ".csv"))
+        and (clip := _read_clip(path, language, any_license=any_license, held_out=held_out))
     ]
     if not clips:
         kind = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")

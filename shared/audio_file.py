@@ -24,6 +24,8 @@ from kouxing.shared.phase_cancellation import PhaseCancellationGuard, Samples
 from kouxing.shared.sound_formats import (
     MAX_ZERO_BYTES,
     NUM_BEGIN_BYTES,
+    NUM_MARK_BYTES,
+    audio_file_kind,
     find_sound_start,
     needs_more,
     needs_whole_file,
@@ -73,7 +75,8 @@ def open_audio(
     The path ``-`` is standard input. Pipes are decoded while they arrive. If no format fits, a pipe
     is read as raw samples. ``raw``: the content is raw samples of this format.
 
-    Raises ``UserError`` if the file is missing, empty, too large, not audio, or below 8 kHz. While
+    Raises ``UserError`` if the file is missing, empty, too large, not audio, not raw samples as
+    stated, or below 8 kHz. While
     reading, raises it if samples are not finite.
     """
     file = sys.stdin.buffer if path == _PIPE else open_file(path, MAX_FILE_BYTES, pipe=True)
@@ -82,7 +85,7 @@ def open_audio(
 
     def open_source() -> AudioSource:
         if raw is not None:
-            return raw_audio(_PeekablePipe(file), raw, name)
+            return _open_raw(file, raw, name)
         if is_pipe:
             return _open_pipe(file, name, block_s, track)
         return _open_file(file, str(path), name, block_s, track)
@@ -151,6 +154,13 @@ def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -
     return _make_source(sound, name, name, block_s, begin, lambda: pipe.num_bytes)
 
 
+def _open_raw(stream: BinaryIO, raw: RawFormat, name: str) -> AudioSource:
+    pipe = _PeekablePipe(stream)
+    if kind := audio_file_kind(pipe.peek_header()):
+        raise UserError(f"{name}: this is {kind}, not raw samples; leave out --raw")
+    return raw_audio(pipe, raw, name)
+
+
 def _wav_audio(stream: Readable, begin: bytes, wav: WavPcm, name: str) -> AudioSource:
     stream.read(wav.offset)
     parts = WavParts(stream, begin, wav.num_bytes, name)
@@ -175,6 +185,12 @@ class _PeekablePipe:
             piece = self._stream.read1(NUM_BEGIN_BYTES)
             if not piece:
                 break
+            self._begin += piece
+        return self._begin
+
+    def peek_header(self) -> bytes:
+        """Return enough of the first bytes to recognize a common file format."""
+        while len(self._begin) < NUM_MARK_BYTES and (piece := self._stream.read1(NUM_BEGIN_BYTES)):
             self._begin += piece
         return self._begin
 

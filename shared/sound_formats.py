@@ -17,6 +17,7 @@ _COMMON = {
     (0, b".snd"): "an AU file", (0, b"caff"): "a CAF file", (4, b"ftyp"): "an MP4 file",
     (0, b"\x1a\x45\xdf\xa3"): "WebM, the format of MediaRecorder",
 }  # fmt: skip
+NUM_MARK_BYTES = max(offset + len(mark) for offset, mark in _COMMON)  # enough for `audio_file_kind`
 _SOUND = (
     *_COMMON, (0, b"RIFX"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"), (0, b"#!AMR"),
     (0, b"\x30\x26\xb2\x75\x8e\x66\xcf\x11"), (0, b"FLV"), (0, b"wvpk"), (0, b"TTA1"),

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from kouxing.services.cli.captions import write_syllables
+from kouxing.services.cli.captions import check_characters, write_syllables
 from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
+from kouxing.services.cli.options import CaptionKind
 from kouxing.services.cli.spoken_text import read_transcript, report_mismatch
 from kouxing.services.driver.video import film
 from kouxing.services.driver.video.time_stretch import stretch_time
@@ -102,6 +103,7 @@ def animate(
     mouth: Path | None,
     expressiveness: float | None,
     track: int | None = None,
+    captions: CaptionKind | None = None,
     language: str,
 ) -> FaceMotion:
     """Animate a face from a sound file.
@@ -110,9 +112,11 @@ def animate(
     equal the live services' frames with default settings. Otherwise the whole
     recording is known, and its phones are aligned with ``text``, a text or the name of a file with
     it, if given. ``language`` is the language of the speech. With ``text_may_differ``, a text that
-    cannot be read or does not fit the sound is reported and ignored.
+    cannot be read or does not fit the sound is reported and ignored. ``captions`` is what the
+    captions will show.
 
-    Raises ``UserError`` if a file cannot be read, or the text has nothing to say.
+    Raises ``UserError`` if a file cannot be read, the text has nothing to say, or the captions
+    cannot show its characters.
     """
     loading = progress.add_task("loading", total=None)
     model, predictor = _load_models(mouth, language)
@@ -126,6 +130,8 @@ def animate(
         if not text_may_differ:
             raise
         print_message(f"the text is ignored: {error}")
+    if transcript is not None and captions is CaptionKind.CHARACTERS:
+        check_characters(transcript, model.inventory)
     progress.remove_task(loading)
     samples = read_mono_16k(source, track, progress)
     events: Sequence[SoundEvent]

@@ -15,7 +15,7 @@ from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.syllable_captions import group_syllables
-from kouxing.shared.phones.transcript import TimedSyllable, Transcript
+from kouxing.shared.phones.transcript import SpokenSyllable, TimedSyllable, Transcript
 
 if TYPE_CHECKING:
     from kouxing.services.cli.animation import FaceMotion
@@ -32,10 +32,28 @@ def write_syllables(
         return [_join_phones(group, inventory) for group in group_syllables(phones, inventory)]
     syllables = []
     for timed in find_syllable_times(phones, transcript, inventory):
-        spelling = inventory.write(timed.spelling)
-        text = timed.text if inventory.readable.search(timed.text) else spelling
+        text, spelling = _write(timed, inventory)
         syllables.append(replace(timed, text=text, spelling=spelling))
     return syllables
+
+
+def check_characters(transcript: Transcript, inventory: PhoneInventory) -> None:
+    """Check that captions can show the characters of a text. Call this before long work.
+
+    Raises ``UserError`` if the text has no characters, or no font has them.
+    """
+    written = [_write(syllable, inventory) for syllable in transcript.syllables]
+    if all(text == spelling for text, spelling in written):
+        raise UserError("--captions characters needs a text in characters; this one is pinyin")
+    if not can_draw("".join(text for text, _ in written)):
+        raise UserError(f"--captions characters: {NO_CHINESE_FONT}, or use --captions pinyin")
+
+
+def _write(syllable: SpokenSyllable | TimedSyllable, inventory: PhoneInventory) -> tuple[str, str]:
+    """Return the character of a syllable, or else its spelling, and its spelling."""
+    spelling = inventory.write(syllable.spelling)
+    has_character = inventory.readable.search(syllable.text)
+    return syllable.text if has_character else spelling, spelling
 
 
 def _join_phones(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyllable:
@@ -47,11 +65,7 @@ def _join_phones(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyll
 def make_captions(
     kind: CaptionKind | None, motion: FaceMotion, size_px: tuple[int, int]
 ) -> CaptionDrawer | None:
-    """Return the captions of a video of this size, if any.
-
-    Raises ``UserError`` if characters are required, but there is no text with characters, or no
-    font has them.
-    """
+    """Return the captions of a video of this size, if any."""
     if kind is None:
         return None
     captions: list[Caption] = []
@@ -59,8 +73,6 @@ def make_captions(
         captions = _phone_captions(motion.phones or [], load_inventory(motion.language))
     else:
         is_text = kind is CaptionKind.CHARACTERS
-        if is_text and all(syllable.text == syllable.spelling for syllable in motion.syllables):
-            raise UserError("--captions characters needs a text in characters; this one is pinyin")
         captions = [
             Caption(
                 syllable.onset_s,
@@ -69,8 +81,6 @@ def make_captions(
             )
             for syllable in motion.syllables
         ]
-    if not can_draw("".join(caption.text for caption in captions)):
-        raise UserError(f"--captions characters: {NO_CHINESE_FONT}, or use --captions pinyin")
     return CaptionDrawer(captions, size_px)
 
 

@@ -78,6 +78,7 @@ class _MouthMotion:
     key_frames: KeyFrames
     widths: tuple[Array, Array]  # times, and the width at each, relative to the mouth at rest
     inventory: PhoneInventory
+    shows_text: bool  # whether labels show characters next to their spelling
 
     def widths_at(self, times_s: Sequence[float] | Array) -> Array:
         """Return the width at times (n,), relative to the mouth at rest."""
@@ -133,6 +134,10 @@ def draw_mouth(
         text = Transcriber(speech_to_text).transcribe(samples) or None
         print_message(f"{source}: {text or 'no words were recognized'}")
     transcript = None if text is None else read_transcript(text, inventory)
+    texts = [] if transcript is None else [syllable.text for syllable in transcript.syllables]
+    shows_text = suffix in (".svg", ".csv") or can_draw("".join(texts))
+    if not shows_text:
+        print_message(f"labels show only pinyin: {NO_CHINESE_FONT}")
     with open_progress() as progress:
         with_progress = partial(progress.track, description="timing")
         timed = _time_phones(source, samples, transcript, timing, inventory, with_progress)
@@ -148,6 +153,7 @@ def draw_mouth(
         key_frames=build_key_frames(phones, load_table(inventory)),
         widths=widths,
         inventory=inventory,
+        shows_text=shows_text,
     )
     print_message(f"wrote {output}: {write(output, mouth)}")
 
@@ -198,18 +204,14 @@ def _find_widths(
     return np.array([time_s for time_s, _ in frames]), 1.0 + np.array(stretch)
 
 
-def _syllable_labels(mouth: _MouthMotion, *, are_pixels: bool) -> list[LabelSpan]:
+def _syllable_labels(mouth: _MouthMotion) -> list[LabelSpan]:
     """Return the label of each syllable: its characters, if they can be drawn, and its spelling."""
-    texts = [item.text for item in mouth.syllables if item.text != item.spelling]
-    shows_text = not are_pixels or can_draw("".join(texts))
-    if not shows_text:
-        print_message(f"labels show only pinyin: {NO_CHINESE_FONT}")
     return [
         (
             item.onset_s,
             item.onset_s + item.duration_s,
             f"{item.text} {item.spelling}"
-            if shows_text and item.text != item.spelling
+            if mouth.shows_text and item.text != item.spelling
             else item.spelling,
         )
         for item in mouth.syllables
@@ -242,7 +244,7 @@ def _key_frame_mouths(
 
 def _write_picture(output: Path, mouth: _MouthMotion) -> str:
     is_svg = output.suffix.lower() == ".svg"
-    moments = _key_frame_mouths(mouth, _syllable_labels(mouth, are_pixels=not is_svg))
+    moments = _key_frame_mouths(mouth, _syllable_labels(mouth))
     if len(moments) > _MAX_MOUTHS:
         raise UserError(
             f"{output}: a picture holds {_MAX_MOUTHS} mouths, but this sound has {len(moments)};"
@@ -257,7 +259,7 @@ def _write_picture(output: Path, mouth: _MouthMotion) -> str:
 
 
 def _write_video(output: Path, mouth: _MouthMotion) -> str:
-    labels = _syllable_labels(mouth, are_pixels=True)
+    labels = _syllable_labels(mouth)
     write = mouth.inventory.write
     symbols = [(start_s, end_s, write(symbol)) for start_s, end_s, symbol in mouth.symbols]
     frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))

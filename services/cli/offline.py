@@ -204,7 +204,7 @@ def render(
             else:
                 motion = animate(
                     source, models, progress, live=live, text=text, mouth=mouth,
-                    expressiveness=expressiveness, track=track,
+                    expressiveness=expressiveness, track=track, captions=captions,
                     language=language or DEFAULT_LANGUAGE,
                 )  # fmt: skip
             if not motion.frames:

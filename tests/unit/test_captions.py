@@ -1,15 +1,20 @@
 """Captions: what they contain, where they are drawn, and slow motion."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+from rich.progress import Progress
 
-from kouxing.services.cli.animation import FaceMotion, slow_down
+from kouxing.services.cli.animation import FaceMotion, animate, slow_down
 from kouxing.services.cli.captions import make_captions, write_syllables
 from kouxing.services.cli.options import CaptionKind
 from kouxing.services.driver.render.captions import Caption, CaptionDrawer, band_height_px
 from kouxing.services.driver.video.time_stretch import stretch_time
+from kouxing.shared import fonts
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from tests import lips
 
 MANDARIN = load_inventory()
@@ -75,9 +80,18 @@ def test_long_texts_and_pauses_start_a_new_line() -> None:
     assert (margins == margins[0, 0]).all(), "the lines fit"
 
 
-def test_characters_need_a_text_in_characters() -> None:
-    with pytest.raises(UserError, match="needs a text in characters"):
-        make_captions(CaptionKind.CHARACTERS, motion_of("lv4 shi4 gui4"), SIZE)
+def test_checks_the_characters_and_their_font_before_the_sound_is_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options: dict[str, Any] = {"live": False, "mouth": None, "expressiveness": None}
+    options |= {"captions": CaptionKind.CHARACTERS, "language": DEFAULT_LANGUAGE}
+    monkeypatch.setattr(fonts, "_chinese_font", lambda _size_px: None)
+    for text, message in (
+        ("lv4 shi4 gui4", "needs a text in characters"),
+        ("绿是贵", "no font with Chinese characters was found; install one"),
+    ):
+        with Progress(disable=True) as progress, pytest.raises(UserError, match=message):
+            animate(Path("no.wav"), ["learned"], progress, text=text, **options)
 
 
 def test_slow_motion_keeps_the_pitch_and_moves_everything() -> None:

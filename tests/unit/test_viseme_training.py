@@ -74,6 +74,7 @@ def test_reads_tracked_clips_and_rigs(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="b_rig"):  # shapes of the rig are missing
         read_clips(tmp_path)
     (tmp_path / "b_rig.json").unlink()
+    (tmp_path / "results.json").write_text("[]")  # not a clip
     (film,) = read_clips(tmp_path)
     assert film.split == "held"
     assert film.faps[0, [JAW, LOWER_LIP]].tolist() == [10.0, -20.0]
