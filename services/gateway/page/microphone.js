@@ -76,7 +76,7 @@ export class Microphone {
   /** Open a source with open(source) and stream it, unless it is stopped in the meantime. */
   async #startFrom(open, isFile = false) {
     this.stop();
-    const run = { isFile };
+    const run = { isFile, hasPlayed: false };
     this.#run = run;
     this.#handlers.state("starting");
     const source = { stream: null, context: null, fileSpeech: null };
@@ -138,13 +138,21 @@ export class Microphone {
     this.#giveUpMs = null;
     this.#handlers.session(session);
     this.#handlers.state("on");
-    this.#fileSpeech?.play(() => setTimeout(() => this.#endFile(), TAIL_MS));
+    this.#playFile();
     const name = this.#handlers.lipModel();
     if (name !== null) this.chooseLipModel(name);
   }
 
+  /** Start the file. It continues while the connection is interrupted. */
+  #playFile() {
+    const run = this.#run;
+    if (!run.isFile || run.hasPlayed) return;
+    run.hasPlayed = true;
+    this.#fileSpeech.play(() => setTimeout(() => this.#run === run && this.#endFile(), TAIL_MS));
+  }
+
   #endFile() {
-    this.#handlers.fileEnded(this.#fileSpeech?.name);
+    this.#handlers.fileEnded(this.#fileSpeech.name);
     this.stop();
   }
 

@@ -1,0 +1,129 @@
+// The microphone and files in its place: they stop, start and reconnect. Browser parts are fakes.
+
+import assert from "node:assert/strict";
+import test from "node:test";
+import { Microphone } from "../../services/gateway/page/microphone.js";
+
+const FILE = { name: "speech.wav", size: 1 };
+
+class FakeWebSocket {
+  static OPEN = 1;
+  static newest = null;
+  readyState = 0;
+  sent = [];
+  constructor() {
+    FakeWebSocket.newest = this;
+  }
+  send(text) {
+    this.sent.push(JSON.parse(text));
+  }
+  close() {
+    this.readyState = 3;
+  }
+  /** Open the connection and a session. */
+  openSession(session) {
+    this.readyState = FakeWebSocket.OPEN;
+    this.onopen();
+    this.onmessage({ data: JSON.stringify({ type: "opened", session }) });
+  }
+}
+
+/** As in browsers, it starts only once. */
+class FakeSource {
+  static newest = null;
+  #hasStarted = false;
+  constructor() {
+    FakeSource.newest = this;
+  }
+  connect() {}
+  start() {
+    assert.ok(!this.#hasStarted, "a source starts only once");
+    this.#hasStarted = true;
+  }
+}
+
+const stream = { getTracks: () => [{ stop() {} }] };
+
+test.beforeEach((t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  globalThis.WebSocket = FakeWebSocket;
+  globalThis.location = { protocol: "http:", host: "localhost:8080", hash: "" };
+  Object.defineProperty(globalThis, "navigator", {
+    value: { mediaDevices: { getUserMedia: async () => stream } },
+    configurable: true,
+  });
+  globalThis.AudioContext = class {
+    sampleRate = 48000;
+    audioWorklet = { addModule: async () => {} };
+    close() {}
+    resume() {}
+    createMediaStreamSource = () => ({ connect() {} });
+    decodeAudioData = async () => ({ getChannelData: () => [1] });
+  };
+  globalThis.AudioWorkletNode = class {
+    port = {};
+  };
+  globalThis.AudioBufferSourceNode = FakeSource;
+  globalThis.MediaStreamAudioDestinationNode = class {
+    stream = stream;
+  };
+  globalThis.fetch = async () => ({
+    ok: true,
+    headers: new Map(),
+    arrayBuffer: async () => new ArrayBuffer(0),
+  });
+});
+
+/** Return a microphone and the states that it reports. */
+function makeMicrophone() {
+  const states = [];
+  const microphone = new Microphone({
+    mouthProfile: () => "",
+    language: () => "",
+    lipModel: () => "learned",
+    state: (state) => states.push(state),
+    level() {},
+    session() {},
+    fileEnded: (name) => states.push(`${name} ended`),
+    error: ({ text }) => states.push(text),
+  });
+  return { microphone, states };
+}
+
+test("the end of a file stops it after its last frames", async (t) => {
+  const { microphone, states } = makeMicrophone();
+  await microphone.startFile(FILE);
+  FakeWebSocket.newest.openSession("file");
+  FakeSource.newest.onended();
+  assert.ok(microphone.isActive);
+  t.mock.timers.tick(1000);
+  assert.ok(!microphone.isActive);
+  assert.deepEqual(states.slice(-3), ["on", "speech.wav ended", "off"]);
+});
+
+test("the end of a file does not stop the microphone that was started after it", async (t) => {
+  const { microphone, states } = makeMicrophone();
+  await microphone.startFile(FILE);
+  FakeWebSocket.newest.openSession("file");
+  FakeSource.newest.onended();
+  await microphone.start();
+  FakeWebSocket.newest.openSession("voice");
+  t.mock.timers.tick(1000);
+  assert.ok(microphone.isActive);
+  assert.equal(states.at(-1), "on");
+});
+
+test("a file continues in another session if the connection is interrupted", async (t) => {
+  const { microphone, states } = makeMicrophone();
+  await microphone.startFile(FILE);
+  FakeWebSocket.newest.openSession("first");
+  FakeWebSocket.newest.onclose();
+  assert.equal(states.at(-1), "interrupted");
+  t.mock.timers.tick(500);
+  FakeWebSocket.newest.openSession("second");
+  assert.equal(states.at(-1), "on");
+  assert.deepEqual(FakeWebSocket.newest.sent.at(-1), { lip_model: "learned" });
+  FakeSource.newest.onended();
+  t.mock.timers.tick(1000);
+  assert.equal(states.at(-1), "off");
+});
