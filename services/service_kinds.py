@@ -4,6 +4,7 @@ import contextlib
 import errno
 import secrets
 import socket
+import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -89,9 +90,14 @@ def read_settings(
 
 
 def free_port_environment(
-    names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
+    names: Collection[str] = tuple(KINDS),
+    hosts: Mapping[str, str] | None = None,
+    reservations: contextlib.ExitStack | None = None,
 ) -> dict[str, str]:
-    """Return an environment in which services bind free ports, on 127.0.0.1 or the given hosts."""
+    """Return an environment in which services bind free ports, on 127.0.0.1 or the given hosts.
+
+    On Linux, no other program gets these ports until ``reservations`` is closed.
+    """
     environment = {}
     with contextlib.ExitStack() as probes:  # all stay open, so that the ports differ
         for name in names:
@@ -103,6 +109,8 @@ def free_port_environment(
                 port = str(probe.getsockname()[1])
                 address = f"tcp://{host}:{port}" if bound is BindAddress.ENDPOINT else port
                 environment[variable_name(name, key)] = address
+        if reservations is not None and sys.platform == "linux":
+            reservations.push(probes.pop_all())
     if "control" in names:
         environment[variable_name(COMMON, "control")] = environment[
             variable_name("control", "control")
@@ -124,6 +132,8 @@ def _bind_free_port(host: str) -> socket.socket:
             if error.errno != errno.EADDRINUSE:
                 raise
         else:
+            # On Linux, servers, which also set this option, can still bind the port.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             return probe
 
 

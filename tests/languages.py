@@ -42,6 +42,19 @@ def installed_language(folder: Path, name: str, package: str) -> Iterator[None]:
     installed_packages.cache_clear()
 
 
+def small_inventory(**changes: object) -> PhoneInventory:
+    """Return an inventory of three phones, with changes to its fields."""
+    values = {
+        "language": "small",
+        "phones": ("m", "a", "sil"),
+        "kinds": ("initial", "vowel", "silence"),
+        "visemes": {"m": (("b", 1.0),), "a": (("a", 0.5), ("e", 0.5)), "sil": (("rest", 1.0),)},
+        "before_rounded": {},
+        "pronounce": lambda text: [tuple(text)],
+    }
+    return PhoneInventory(**(values | changes))  # type: ignore[arg-type]
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """Log-probabilities of n-grams, and log back-off weights of contexts."""

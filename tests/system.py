@@ -39,9 +39,9 @@ LONG_TIMEOUTS = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on 
 ADMIT_ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
 LIGHT_MODEL = {"KOUXING_RECOGNIZER_ACOUSTIC": "light"}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
-MAX_RESERVED_PORTS = 200
+MAX_RESERVATIONS = 50
 
-_reserved: deque[socket.socket] = deque()
+_reservations: deque[contextlib.ExitStack] = deque()  # of ports
 
 
 def samples_of_file(path: Path) -> NDArray[np.float32]:
@@ -63,30 +63,29 @@ main()
 
 def free_port() -> int:
     """Return a port that no other program is given before a test binds it."""
-    return _reserve_port("127.0.0.1", 0)
+    reservation = contextlib.ExitStack()
+    reserved = reservation.enter_context(socket.socket())
+    reserved.bind(("127.0.0.1", 0))
+    # The socket does not listen, so a server, which also sets this option, can bind the port.
+    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    _keep(reservation)
+    return int(reserved.getsockname()[1])
 
 
 def own_addresses(
     names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
 ) -> dict[str, str]:
     """Return an environment in which services bind ports that no other program is given."""
-    addresses = free_port_environment(names, hosts)
-    for address in set(addresses.values()):
-        host, _, port = address.removeprefix("tcp://").rpartition(":")
-        _reserve_port(host or "127.0.0.1", int(port))
+    reservations = contextlib.ExitStack()
+    addresses = free_port_environment(names, hosts, reservations)
+    _keep(reservations)
     return addresses
 
 
-def _reserve_port(host: str, port: int) -> int:
-    # The socket is bound but does not listen. Only a program that sets SO_REUSEADDR and names
-    # this port can bind it, as servers do.
-    reserved = socket.socket()
-    reserved.bind((host, port))
-    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    _reserved.append(reserved)
-    if len(_reserved) > MAX_RESERVED_PORTS:
-        _reserved.popleft().close()
-    return int(reserved.getsockname()[1])
+def _keep(reservation: contextlib.ExitStack) -> None:
+    _reservations.append(reservation)
+    if len(_reservations) > MAX_RESERVATIONS:
+        _reservations.popleft().close()
 
 
 def child_environment() -> dict[str, str]:

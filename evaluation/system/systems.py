@@ -89,8 +89,9 @@ class LocalSystem(System):
         settings: Mapping[str, str] | None = None,
         spare: str = "",
     ) -> None:
+        self._reserved_ports = contextlib.ExitStack()
         self.environment = {
-            **free_port_environment(services),
+            **free_port_environment(services, reservations=self._reserved_ports),
             "KOUXING_DRIVER_VIEW": "none",
             "KOUXING_INSECURE": "false",
             "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
@@ -122,6 +123,7 @@ class LocalSystem(System):
 
     def __exit__(self, *_: object) -> None:
         self.supervisor.stop()
+        self._reserved_ports.close()
 
     def process_of(self, session: str, service: str) -> int:
         """Return the id of the process that serves a session."""

@@ -13,7 +13,7 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
 from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, frames_of
 from tests.firefox import Firefox
-from tests.process.test_lips_package import faps_of
+from tests.lips_package import faps_of
 from tests.sound_server import sound_server
 from tests.system import DEMO, samples_of_file
 

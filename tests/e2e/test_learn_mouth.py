@@ -20,10 +20,10 @@ from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from tests import heads
 from tests.browser import Browser
+from tests.face_landmarks import landmark_file
 from tests.fake_control import FakeControl
 from tests.heads import neutral_faps
 from tests.system import DEMO, Gateway, wait_until
-from tests.unit.test_face_landmarks import landmark_file
 
 NUM_PICTURES = 8
 

@@ -11,7 +11,7 @@ from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.services.cli.web_model import web_model
 from tests.browser import Browser
 from tests.e2e.lips_page import NOTE, PACKAGE, check_sound_waits_for_a_click, frames_of
-from tests.process.test_lips_package import faps_of
+from tests.lips_package import faps_of
 from tests.system import DEMO, NODE, samples_of_file
 
 SIZE_PX = (320, 480)  # heads are drawn without a GPU

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import socket
+import sys
 from unittest import mock
 
 import pytest
@@ -13,6 +14,7 @@ from kouxing.services.service_kinds import (
     KINDS,
     available_port_environment,
     extra_worker_environments,
+    free_port_environment,
     kind_of,
     read_settings,
 )
@@ -53,6 +55,18 @@ def test_a_taken_default_and_port_0_are_replaced_by_a_free_port() -> None:
         for settings in (read_settings(), read_settings(assignments={"gateway.port": "0"})):
             port = int(available_port_environment(settings)["KOUXING_GATEWAY_PORT"])
             assert port not in (0, taken)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux reserves ports")
+def test_only_a_server_gets_a_reserved_port() -> None:
+    with contextlib.ExitStack() as reservations:
+        addresses = free_port_environment(["gateway"], reservations=reservations)
+        address = "127.0.0.1", int(addresses["KOUXING_GATEWAY_PORT"])
+        with socket.socket() as other, pytest.raises(OSError, match="in use"):
+            other.bind(address)
+        socket.create_server(address).close()
+    with socket.socket() as other:
+        other.bind(address)
 
 
 def test_a_common_key_is_set_for_the_services_that_have_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,22 +11,26 @@ from typing import Any
 import numpy as np
 import pytest
 import soxr
-from numpy.typing import NDArray
 
-from kouxing.evaluation.system import lips_package
 from kouxing.evaluation.system.lips_package import exported_models, package_faps, server_events
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent
+from tests.lips_package import (
+    DELAY_S,
+    FRAME_RATE_HZ,
+    RATE_HZ,
+    Frames,
+    faps_of,
+    package_output,
+    server_faps,
+)
 from tests.system import DEMO, NODE, ROOT, VOWELS_FILE, samples_of_file
 
 SCRIPTS = ROOT / "clients" / "kouxing-lips" / "tests"
-RATE_HZ = 16_000
-DELAY_S, FRAME_RATE_HZ = 0.06, 50.0
 HEAD_TURN = slice(47, 50)  # FAPs 48 to 50
-TONGUE = [13, 43, 44, 45, 46]  # FAPs 14, and 44 to 47: jaw thrust and tongue
 FILES = [
     *(
         DEMO / f"{name}.wav"
@@ -34,7 +38,6 @@ FILES = [
     ),
     VOWELS_FILE,
 ]
-Frames = NDArray[np.float32]
 
 
 @pytest.fixture(scope="module")
@@ -43,26 +46,9 @@ def models() -> Iterator[Path]:
         yield folder
 
 
-def package_output(models: Path, samples: Frames, **options: Any) -> dict[str, Any]:
-    return lips_package.package_output(
-        models, samples, **{"chunk": 441, "shapes": [*SHAPE_SETS], **options}
-    )
-
-
-def faps_of(models: Path, samples: Frames, **options: Any) -> Frames:
-    return package_faps(package_output(models, samples, **options))
-
-
 @cache
 def output_of(models: Path, file: Path) -> dict[str, Any]:
     return package_output(models, samples_of_file(file))
-
-
-def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> Frames:
-    """Return the server's frames without idle motion and tongue."""
-    faps = lips_package.server_faps(events, feeling)
-    faps[:, TONGUE] = 0.0
-    return faps
 
 
 def opening(faps: Frames) -> Frames:

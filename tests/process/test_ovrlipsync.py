@@ -22,7 +22,7 @@ from kouxing.services.recognizer.voice_traits import load_voice_readout
 from kouxing.shared.face.shapes import OCULUS
 from kouxing.shared.phones.events import Phone
 from tests.documents import code_blocks
-from tests.process.test_lips_package import FRAME_RATE_HZ, Frames, server_faps
+from tests.lips_package import FRAME_RATE_HZ, Frames, server_faps
 from tests.system import DEMO, NODE, ROOT, samples_of_file
 
 SOURCE = ROOT / "clients" / "ovrlipsync"

@@ -16,8 +16,8 @@ from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
+from tests.face_landmarks import FACE, landmark_file
 from tests.system import DEMO, samples_of_file
-from tests.unit.test_face_landmarks import FACE, landmark_file
 from tests.videos import write_video
 
 PICTURES = Path(__file__).parents[1] / "golden"

@@ -8,9 +8,8 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.alphabets import Alphabet, respell
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
-from tests.languages import MANDARIN
+from tests.languages import MANDARIN, small_inventory
 from tests.lips import phone
-from tests.unit.test_inventory import small
 
 ENGLISH = load_inventory("english")
 
@@ -67,7 +66,7 @@ def test_a_final_of_mandarin_is_several_letters_of_ipa() -> None:
 
 
 def test_a_language_without_universal_phones_has_no_ipa() -> None:
-    inventory = small()
+    inventory = small_inventory()
     assert [p.symbol for p in respell(spoken("m a"), inventory)] == ["m", "a"]
     with pytest.raises(UserError, match="language small does not list universal phones"):
         respell(spoken("m a"), inventory, Alphabet.IPA)

@@ -1,6 +1,5 @@
 """The block model: its scores, its chunks and its file."""
 
-from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -8,56 +7,16 @@ import pytest
 import torch
 
 from kouxing.services.recognizer.acoustic import blocks as blocks_module
-from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.encoder import ENCODER_PATH
-from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import export_onnx
-from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout, block_layout
+from kouxing.training.blocks.network import block_layout
 from kouxing.training.model_files import save_blocks, write_archive
-from kouxing.training.networks.network import EncoderShape
-from tests.system import HELLO
+from tests.block_networks import BLOCK, FRAMES, LENGTH, RIGHT, SCALE, blocks, networks, scores_of
 
 pytestmark = [pytest.mark.usefixtures("one_thread")]
-
-FRAMES = np.resize(WhisperMel().accept_waveform(HELLO), (330, 80))  # more than a past
-FRAMES[40, 7] = FRAMES[:40].max() - 3.0  # below the floor
-SMALL = partial(EncoderShape, width=32, heads=2, layers=4, inner=48)
-BLOCK, RIGHT = 5, 10
-LENGTH = BLOCK + RIGHT
-SCALE = np.float32(0.5)
-
-
-@cache
-def networks(num_states: int = 180) -> tuple[BlockEncoder, BlockReadout]:
-    torch.manual_seed(0)
-    encoder = BlockEncoder(SMALL()).eval()
-    with torch.no_grad():  # trained weights are larger than initial ones
-        encoder.first.weight *= 6
-        encoder.second.weight *= 6
-        for name, weight in encoder.named_parameters():
-            if name.endswith("query_key_value.weight"):
-                weight.mul_(2)
-    return encoder, BlockReadout(96, num_states, READOUT).eval()
-
-
-@cache
-def blocks() -> BlockModel:
-    shipped = load_model()
-    assert isinstance(shipped, BlockModel)
-    return BlockModel(
-        topology=shipped.topology,
-        network=export_onnx(*networks(shipped.topology.num_states), BLOCK),
-        log_prior=shipped.log_prior,
-        acoustic_scale=float(SCALE),
-    )
-
-
-def scores_of(model: BlockModel, frames: np.ndarray) -> np.ndarray:
-    stream = model.create_stream()
-    return np.concatenate([stream.score(frames), stream.score(None)])
 
 
 def torch_scores(frames: np.ndarray, block_length: int, right_context: int = RIGHT) -> np.ndarray:

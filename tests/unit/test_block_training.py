@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,9 +17,9 @@ from kouxing.training.networks import labels, optimizer, teacher
 from kouxing.training.networks.labels import STATES_PER_PHONE
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.training_set import load_examples
+from tests.block_networks import SMALL
 from tests.corpora import write_noises, write_speech
 from tests.system import HELLO
-from tests.unit.test_block_model import SMALL
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -72,7 +73,7 @@ def test_trains_resumes_and_writes_model_and_card(
         any_license=False,
     )
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "export_onnx", interrupt)
+        patch.setattr(recipe, "export_onnx", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             train(num_steps=2)
     train(num_steps=3)
@@ -87,7 +88,3 @@ def test_trains_resumes_and_writes_model_and_card(
     assert "CC0-1.0" in card
     left = {path.name for path in tmp_path.iterdir() if path.is_file()}
     assert left == {"blocks.npz", "blocks.md"}
-
-
-def interrupt(*_arguments: object) -> None:
-    raise KeyboardInterrupt

@@ -9,13 +9,13 @@ import pytest
 from kouxing.corpora.clip_archive import write_clip_archive
 from kouxing.corpora.lip_clips import read_clips
 from kouxing.shared.errors import UserError
-from tests.unit.test_lip_scores import write_clip
+from tests.lip_clips import write_held_out_clip
 
 
 def test_packs_the_clips_that_may_be_shared(tmp_path: Path) -> None:
     folder, archive = tmp_path / "clips", tmp_path / "clips.zip"
     folder.mkdir()
-    write_clip(folder)
+    write_held_out_clip(folder)
     about = folder / "cam_1.json"
     for name in ("MIT; footage by third parties", "CC BY-NC 4.0"):
         about.write_text(json.dumps({"language": "zh", "license": name}))

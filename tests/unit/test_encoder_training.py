@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,9 +24,8 @@ from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import EncoderShape
 from tests.corpora import write_noises, write_speech
+from tests.lip_clips import clip_name_for, write_training_clip
 from tests.system import HELLO
-from tests.unit.test_block_training import interrupt
-from tests.unit.test_lips_training import name_for, write_clip
 from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -94,8 +94,8 @@ def test_trains_resumes_and_writes_a_model(
     corpus = write_speech(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
     clips = tmp_path / "clips"
     clips.mkdir()
-    write_clip(clips, name_for("train"), "anna", "CC0")
-    write_clip(clips, name_for("choice"), "berta", "MIT")
+    write_training_clip(clips, clip_name_for("train"), "anna", "CC0")
+    write_training_clip(clips, clip_name_for("choice"), "berta", "MIT")
     output = tmp_path / "encoder.npz"
     sounds = [write_noises(tmp_path / "sounds")]
     train = partial(
@@ -108,7 +108,7 @@ def test_trains_resumes_and_writes_a_model(
         any_license=False,
     )
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "save_encoder", interrupt)
+        patch.setattr(recipe, "save_encoder", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             train(untranscribed=[corpus], num_steps=2)
     with pytest.raises(UserError, match="targets of other recordings or models; delete it"):

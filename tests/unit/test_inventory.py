@@ -6,22 +6,10 @@ from pathlib import Path
 import pytest
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory, find_language, load_inventory
-from tests.languages import MANDARIN, installed_language
+from kouxing.shared.phones.inventory import find_language, load_inventory
+from tests.languages import MANDARIN, installed_language, small_inventory
 
 TOO_MANY_PHONES = tuple(chr(97 + n // 26) + chr(97 + n % 26) for n in range(256))
-
-
-def small(**changes: object) -> PhoneInventory:
-    values = {
-        "language": "small",
-        "phones": ("m", "a", "sil"),
-        "kinds": ("initial", "vowel", "silence"),
-        "visemes": {"m": (("b", 1.0),), "a": (("a", 0.5), ("e", 0.5)), "sil": (("rest", 1.0),)},
-        "before_rounded": {},
-        "pronounce": lambda text: [tuple(text)],
-    }
-    return PhoneInventory(**(values | changes))  # type: ignore[arg-type]
 
 
 def test_mandarin_has_the_phones_of_the_paper() -> None:
@@ -48,7 +36,7 @@ def test_mandarin_has_the_phones_of_the_paper() -> None:
 )
 def test_rejects_bad_phones(changes: dict[str, object], message: str) -> None:
     with pytest.raises(UserError, match=f"language small: .*{message}"):
-        small(**changes)
+        small_inventory(**changes)
 
 
 def test_rejects_an_unknown_language() -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 from typer.testing import CliRunner
 
 from kouxing.corpora.figures import new_figure
@@ -19,22 +18,12 @@ from kouxing.evaluation.recognizer.disturbances import CLEAN, MUSIC
 from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
+from tests.lip_clips import write_held_out_clip
 from tests.lips import clip_of
-from tests.system import DEMO
-
-
-def write_clip(folder: Path) -> None:
-    """Write a held-out clip whose tracked mouth opens and closes four times a second."""
-    samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=16_000)
-    soundfile.write(folder / "cam_1.flac", samples, rate_hz)
-    rows = [f"{t:.2f},0,{-150 + 150 * np.cos(8 * np.pi * t):.0f}" for t in np.arange(25) / 25]
-    (folder / "cam_1.csv").write_text("\n".join(["t,F4_lower_t_midlip,F5_raise_b_midlip", *rows]))
-    (folder / "cam_1.json").write_text('{"speaker": "ann", "language": "zh"}')
-    (folder / "held.txt").write_text("ann")
 
 
 def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
-    write_clip(tmp_path)
+    write_held_out_clip(tmp_path)
     path = tmp_path / "scores.json"
     options = ["--lips", "learned", "--delay-ms", "0", "--delay-ms", "60"]
     conditions = ["--condition", CLEAN, "--condition", MUSIC]
@@ -55,7 +44,7 @@ def test_the_command_compares_faces_with_the_real_lips(tmp_path: Path) -> None:
 
 
 def test_omitted_clips_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_clip(tmp_path)
+    write_held_out_clip(tmp_path)
     for suffix in (".flac", ".json"):
         shutil.copy(tmp_path / f"cam_1{suffix}", tmp_path / f"cam_2{suffix}")
     (tmp_path / "cam_2.csv").write_text("t,F16_push_b_lip\n0.00,10\n0.04,20")

@@ -7,7 +7,7 @@ from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.session import OpenSession
-from tests.unit.test_sessions import Cluster, worker
+from tests.control_cluster import Cluster, worker
 
 MAX_LOAD = 0.8
 WORKERS = ("recognizer-1", "recognizer-2", "synthesizer-1", "synthesizer-2")

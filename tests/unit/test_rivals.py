@@ -9,11 +9,11 @@ from kouxing.evaluation.lips.curve_tables import read_table
 from kouxing.evaluation.rivals import tables
 from kouxing.evaluation.rivals.tables import LOUDNESS, write_tables
 from kouxing.shared.errors import UserError
-from tests.unit.test_lip_scores import write_clip
+from tests.lip_clips import write_held_out_clip
 
 
 def test_loudness_rises_with_the_voice(tmp_path: Path) -> None:
-    write_clip(tmp_path)
+    write_held_out_clip(tmp_path)
     write_tables(tmp_path, tmp_path / "out", [LOUDNESS])
     path = tmp_path / "out" / LOUDNESS / "cam_1.csv"
     table = read_table(path)
@@ -31,7 +31,7 @@ def test_unknown_and_missing_programs_are_errors(
 ) -> None:
     with pytest.raises(UserError, match="unknown program: wava; choose from headaudio, "):
         write_tables(tmp_path, tmp_path / "out", ["wava"])
-    write_clip(tmp_path)
+    write_held_out_clip(tmp_path)
     monkeypatch.setattr(tables, "FOLDER", tmp_path)
     for program in ("headaudio", "pylipsync"):
         with pytest.raises(UserError, match="is not installed; run 'make report'"):

@@ -22,9 +22,7 @@ from kouxing.training.model_files import save_universal
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.universal.encoder import BLOCK_LENGTH, RIGHT_CONTEXT, FeatureEncoder
 from kouxing.training.universal.export import export_extension
-from tests.live_streams import LiveStream
-from tests.system import HELLO
-from tests.unit.test_block_model import (
+from tests.block_networks import (
     BLOCK,
     FRAMES,
     LENGTH,
@@ -33,6 +31,8 @@ from tests.unit.test_block_model import (
     networks,
     scores_of,
 )
+from tests.live_streams import LiveStream
+from tests.system import HELLO
 
 pytestmark = [pytest.mark.usefixtures("one_thread")]
 

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import soundfile
@@ -14,7 +15,6 @@ from kouxing.training.universal import alignment, recipe, trainer
 from kouxing.training.universal.recipe import train_universal
 from tests.corpora import write_manifest
 from tests.system import HELLO
-from tests.unit.test_block_training import interrupt
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -57,7 +57,7 @@ def test_trains_resumes_and_writes_model_and_card(
         train_universal, [], output, learners=[], languages=languages, clips=None, any_license=False
     )
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "export_extension", interrupt)
+        patch.setattr(recipe, "export_extension", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             train(num_steps=1)
     train(num_steps=2)
