@@ -63,7 +63,10 @@ export class Viewer {
   readonly ready: Promise<void>;
   /** Show another session; "" for the newest. */
   follow(session: string): void;
-  /** Send a command of GATEWAY.md, such as { expressions: { joy: 0.5 } }. */
+  /**
+   * Send a command of GATEWAY.md, such as { expressions: { joy: 0.5 } }. It waits for the first connection. It is
+   * dropped while the viewer is disconnected.
+   */
   send(command: object): void;
   close(): void;
 }

@@ -5,6 +5,7 @@ import { ViewerSocket } from "../../services/gateway/page/viewer-socket.js";
 import { NUM_FAPS, readMessage } from "../../services/gateway/page/messages.js";
 
 class FakeWebSocket {
+  static CONNECTING = 0;
   static OPEN = 1;
   static instances = [];
   readyState = 0;
@@ -95,4 +96,31 @@ test("it follows a session that was chosen while it was connecting", () => {
   assert.deepEqual(socket.sent, []);
   socket.open();
   assert.deepEqual(socket.sent, [{ follow: "new" }]);
+});
+
+test("a command waits while it is connecting, and is dropped if that fails", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const viewer = new ViewerSocket(toViewer, "", record().handlers);
+  viewer.send({ play: "sample" });
+  FakeWebSocket.instances[0].open();
+  assert.deepEqual(FakeWebSocket.instances[0].sent, [{ play: "sample" }]);
+  FakeWebSocket.instances[0].onclose();
+  t.mock.timers.tick(300);
+  viewer.send({ play: "sample" });
+  viewer.follow("new");
+  FakeWebSocket.instances[1].onclose();
+  t.mock.timers.tick(600);
+  FakeWebSocket.instances[2].open();
+  assert.equal(FakeWebSocket.instances[2].url, "ws://localhost:8080/viewer?session=new");
+  assert.deepEqual(FakeWebSocket.instances[2].sent, []);
+});
+
+test("the handler of a lost connection can close it for good", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const { handlers } = record();
+  const viewer = new ViewerSocket(toViewer, "", { ...handlers, state: (isConnected) => isConnected || viewer.close() });
+  FakeWebSocket.instances[0].open();
+  FakeWebSocket.instances[0].onclose();
+  t.mock.timers.tick(5000);
+  assert.equal(FakeWebSocket.instances.length, 1);
 });

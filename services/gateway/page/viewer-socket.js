@@ -9,7 +9,8 @@ export class ViewerSocket {
   #address;
   #handlers;
   #chosen;
-  #socket = null;
+  #socket = null; // null after close()
+  #unsent = []; // commands that wait until the socket has connected
   #retryTimer = null;
   #retryMs = RETRY_MS.min;
 
@@ -33,35 +34,40 @@ export class ViewerSocket {
     this.send({ follow: session });
   }
 
-  /** Send a command if the socket is open. */
+  /** Send a command. It waits while the socket is connecting, and is dropped if that fails. */
   send(command) {
-    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(command));
+    const state = this.#socket?.readyState;
+    if (state === WebSocket.OPEN) this.#socket.send(JSON.stringify(command));
+    else if (state === WebSocket.CONNECTING) this.#unsent.push(command);
   }
 
   /** Disconnect and stop reconnecting. */
   close() {
+    const socket = this.#socket;
+    if (socket === null) return;
+    this.#socket = null;
     clearTimeout(this.#retryTimer);
-    this.#socket.onclose = this.#socket.onerror = null;
-    this.#socket.close();
+    socket.onclose = socket.onerror = null;
+    socket.close();
     this.#handlers.state(false);
   }
 
   #connect() {
-    const chosen = this.#chosen;
-    const socket = new WebSocket(this.#address(chosen));
+    const socket = new WebSocket(this.#address(this.#chosen));
     socket.binaryType = "arraybuffer";
+    this.#unsent = [];
     socket.onopen = () => {
       this.#retryMs = RETRY_MS.min;
+      for (const command of this.#unsent) this.send(command);
       this.#handlers.state(true);
-      if (this.#chosen !== chosen) this.follow(this.#chosen); // chosen while it was connecting
     };
     socket.onmessage = (event) => this.#receive(event.data);
     // Node 22 reports a failed connection only as an error.
     socket.onclose = socket.onerror = () => {
       socket.onclose = socket.onerror = null;
-      this.#handlers.state(false);
       this.#retryTimer = setTimeout(() => this.#connect(), this.#retryMs);
       this.#retryMs = Math.min(RETRY_MS.max, this.#retryMs * 2);
+      this.#handlers.state(false); // may call close()
     };
     this.#socket = socket;
   }
