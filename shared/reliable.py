@@ -99,15 +99,14 @@ class ReliableReceiver:
     def receive(self, message: Message, sender: Peer) -> bool:
         """Return whether a message is the next one. The caller must drop all others.
 
-        The first message of a greater epoch sets the number from which the epoch is counted.
+        Every epoch starts with the number 1.
         """
         if message.epoch < self._epoch:
             return False
         self._peer = sender
         if message.epoch > self._epoch:
             self._epoch = message.epoch
-            self._last = message.sequence - 1
-            self._acknowledged = self._last
+            self._last = self._acknowledged = 0
         if message.sequence != self._last + 1:
             self.acknowledge()  # reports which messages are missing
             return False

@@ -88,6 +88,31 @@ def test_a_new_epoch_starts_again_and_old_ones_are_ignored() -> None:
     assert link.received == [1, 2, 3, 1]
 
 
+def test_the_lost_first_message_of_an_epoch_is_resent() -> None:
+    link = ReliablePair()
+    link.send(3)
+    link.deliver()
+    link.sender = link.make_sender(epoch=2)
+    link.send(3)
+    link.deliver(lose=(1,))
+    assert link.received == [1, 2, 3]
+    link.acknowledge()
+    assert link.sender.tick(RESEND_AFTER_S) == 3
+    link.deliver()
+    assert link.received == [1, 2, 3, 1, 2, 3]
+
+
+def test_the_last_messages_of_an_ended_session_do_not_hide_a_session_with_its_name() -> None:
+    ended, link = ReliablePair(), ReliablePair()
+    ended.send(5)
+    for message in list(ended.dealer.sent)[3:]:
+        link.dealer.send(message)
+    link.send(2)
+    link.deliver()
+    link.acknowledge()
+    assert link.received == [1, 2]
+
+
 def test_acknowledges_at_intervals_until_everything_is_acknowledged() -> None:
     link = ReliablePair()
     link.send(1)
