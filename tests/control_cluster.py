@@ -58,7 +58,8 @@ class Cluster:
         return self.sessions.open(opening, client, 0.0)
 
     def report(self, record: SessionRecord, instance: str, **fields: Any) -> None:
-        """Record a heartbeat about a session."""
+        """Record a heartbeat about a session that its client uses."""
+        record.announced = True
         heartbeat = worker(instance.partition("-")[0], instance)
         sessions = {record.name: SessionProgress(**fields)}
         self.sessions.record_progress(record, replace(heartbeat, sessions=sessions))

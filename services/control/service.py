@@ -327,7 +327,9 @@ class ControlService(Service):
 
     def _on_speech(self, speech: Speech, instance: str) -> None:
         record = self._sessions.get(speech.session)
-        if record is None or (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
+        if record is None or not record.announced:  # of an earlier session with this name
+            return
+        if (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
             return
         if not record.speaking:  # a new recognizer repeats the start of speech
             record.speech_time = speech.media_time

@@ -198,6 +198,8 @@ class SessionTable:
 
     def record_progress(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
         """Record a service's progress in a session; return the time without input."""
+        if not record.announced:  # the heartbeat may be about an earlier session with this name
+            return 0.0
         state = heartbeat.sessions[record.name]
         record.final_until = max(record.final_until, state.final_until)
         if state.skipped_s:

@@ -100,6 +100,19 @@ def test_stops_unknown_sessions_only_after_the_deadline(harness: ControlHarness)
     assert CloseSession(session="mine") in harness.receive(recognizer, 2)
 
 
+def test_late_speech_of_an_ended_session_does_not_concern_a_new_one_with_its_name(
+    harness: ControlHarness, client: Socket
+) -> None:
+    recognizer, _ = harness.services
+    harness.receive(recognizer)
+    client.send(OpenSession(session="mine", request="1"))
+    harness.receive(recognizer)
+    recognizer.send(Speech(session="mine", epoch=1, sequence=9, media_time=2840, active=True))
+    recognizer.send(make_heartbeat("recognizer"))
+    harness.receive(recognizer)
+    assert not harness.control._sessions.find("mine").speaking
+
+
 def test_repeats_session_moved_to_the_client(
     harness: ControlHarness, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:

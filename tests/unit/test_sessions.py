@@ -185,6 +185,18 @@ def test_a_session_moves_to_another_recognizer_and_resumes_where_it_was(cluster:
     assert record.next_sequence == 121, "the new recognizer has no audio yet"
 
 
+def test_a_late_heartbeat_about_an_ended_session_does_not_concern_a_new_one_with_its_name(
+    cluster: Cluster,
+) -> None:
+    ended = cluster.open("demo")
+    cluster.sessions.remove(ended, 0.0)
+    record = cluster.open("demo")
+    old = SessionProgress(last_droppable_sequence=900, final_until=48_000, idle_s=59.0)
+    heartbeat = replace(worker("recognizer", "recognizer-1"), sessions={"demo": old})
+    assert cluster.sessions.record_progress(record, heartbeat) == 0.0
+    assert (record.next_sequence, record.final_until) == (1, 0)
+
+
 @pytest.mark.parametrize(
     ("lost", "reported", "last"),
     [
