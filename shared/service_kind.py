@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pkgutil
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from kouxing.shared.config import ServiceConfig
@@ -18,8 +18,6 @@ class ServiceKind:
     name: str
     role: str  # worker: placed in sessions; observer: takes part in all sessions
     summary: str = ""
-    config: str = ""  # configuration class, as module:class
-    service: str = ""  # service class, as module:class
     provides: tuple[str, ...] = ()  # endpoints of sessions that only this kind may provide
     needs: tuple[str, ...] = ()  # endpoints of sessions that it connects to
     client_roles: tuple[str, ...] = ()  # roles of its key, in addition to service:NAME
@@ -31,12 +29,16 @@ class ServiceKind:
 
     @property
     def config_type(self) -> type[ServiceConfig]:
-        """The class of its configuration."""
-        config_type: type[ServiceConfig] = pkgutil.resolve_name(self.config)
+        """The class of its configuration, such as ``ControlConfig``."""
+        config_type: type[ServiceConfig] = self._import_class("config")
         return config_type
 
     @property
     def service_type(self) -> type[Service]:
-        """The class of the service."""
-        service_type: type[Service] = pkgutil.resolve_name(self.service)
+        """The class of the service, such as ``ControlService``."""
+        service_type: type[Service] = self._import_class("service")
         return service_type
+
+    def _import_class(self, module: str) -> Any:
+        class_name = self.name.title() + module.title()
+        return pkgutil.resolve_name(f"kouxing.services.{self.name}.{module}:{class_name}")
