@@ -24,9 +24,7 @@ from kouxing.services.cli.options import (
     reject_options,
 )
 from kouxing.services.driver.config import Framing
-from kouxing.services.heads import DEFAULT_HEAD
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 from kouxing.shared.terminal import (
     Force,
@@ -65,6 +63,7 @@ _FORMAT_OF_SUFFIX = {
     ".textgrid": PhoneFormat.TEXTGRID,
 }
 _SUFFIX_OF_FORMAT = {form: suffix for suffix, form in _FORMAT_OF_SUFFIX.items()}
+_DEFAULTS = ExportOptions()
 
 
 def render(
@@ -111,19 +110,19 @@ def render(
             " mouths) in .tsv, .xml and .json.",
         ),
     ] = None,
-    head: HeadName = DEFAULT_HEAD,
+    head: HeadName = _DEFAULTS.head,
     size: Annotated[
         str, typer.Option(help="Size of the picture, WIDTHxHEIGHT in pixels.")
-    ] = "1280x720",
+    ] = _DEFAULTS.size,
     background: Annotated[
         str,
         typer.Option(
             help="Background: studio, transparent (not for .mp4), #rrggbb, or a color name."
         ),
-    ] = "studio",
+    ] = _DEFAULTS.background,
     camera: Annotated[
         Framing, typer.Option(help="Part that fills the picture, or the head from the side.")
-    ] = Framing.FACE,
+    ] = _DEFAULTS.camera,
     rate: Annotated[
         float | None,
         typer.Option(
@@ -139,7 +138,7 @@ def render(
     ] = None,
     speed: Annotated[
         float, typer.Option(min=0.25, max=1, help="Speed at the same pitch; 0.5 is half as fast.")
-    ] = 1.0,
+    ] = _DEFAULTS.speed,
     track: AudioTrack = None,
     sound: Annotated[Path | None, typer.Option(help="Sound file to add to curves.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of a single picture, seconds.")] = None,
@@ -166,7 +165,7 @@ def render(
         raise UserError("a live stream has no text in advance; use either --live or --text")
     if captions is CaptionKind.CHARACTERS and text is None:
         raise UserError("--captions characters needs the spoken text; add --text")
-    models = tuple(lips or [DEFAULT_LIP_MODEL])
+    models = tuple(lips or _DEFAULTS.lips)
     if mouth is not None and "learned" not in models:
         raise UserError("--mouth applies to learned lips; add --lips learned")
     *sources, last = files

@@ -139,7 +139,7 @@ def reject_options(reason: str, **options: object) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportOptions:
-    """How ``kouxing render`` shows and writes a face. The defaults match its options."""
+    """How ``kouxing render`` shows and writes a face, with the defaults of its options."""
 
     lips: tuple[str, ...] = (DEFAULT_LIP_MODEL,)
     form: CurveFormat | None = None  # None: the first one of the format
