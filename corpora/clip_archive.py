@@ -16,7 +16,7 @@ def write_clip_archive(folder: Path, archive: Path) -> int:
     """Write the clips of a folder that may be shared to a ZIP file, and return their number.
 
     ``held.txt`` names all held-out clips. ``clips.tsv`` lists split, language, speaker and license
-    of each clip. Raises UserError if no clip may be shared, or the file cannot be written.
+    of each clip. Raises ``UserError`` if no clip may be shared, or the file cannot be written.
     """
     clips = [clip for clip in read_clips(folder, language=None) if _may_share(clip.license)]
     if not clips:

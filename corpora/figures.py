@@ -9,7 +9,7 @@ _DOTS_PER_INCH = 80
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """Create an empty figure; raises UserError if matplotlib is not installed."""
+    """Create an empty figure; raises ``UserError`` if matplotlib is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (optional)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -21,7 +21,7 @@ def new_figure(width_in: float, height_in: float) -> Any:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure in the format of the file's suffix; raises UserError if that fails."""
+    """Write a figure in the format of the file's suffix; raises ``UserError`` if that fails."""
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:

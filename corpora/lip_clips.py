@@ -132,7 +132,7 @@ def read_clips(
 
     Without ``any_license``, clips whose license does not allow distributing a model are not in the
     split ``train``. A ``.json`` file without a ``.flac`` or ``.csv`` file of the same name is not
-    a clip. Raises UserError if there are no clips, or one of them cannot be read.
+    a clip. Raises ``UserError`` if there are no clips, or one of them cannot be read.
     """
     held = folder / "held.txt"
     held_out = set(read_text(held, _MAX_BYTES).split()) if held.exists() else set()

@@ -34,8 +34,8 @@ def read_video(
     """Read a video of any format that FFmpeg supports; return the audio, 16 kHz mono, (n,).
 
     ``on_image`` is called with each image: its time in the audio, seconds, and upright RGB,
-    (height, width, 3). ``track`` is the audio track, from 1. Raises UserError if the video cannot
-    be read, has no images or no audio, or is too long.
+    (height, width, 3). ``track`` is the audio track, from 1. Raises ``UserError`` if the video
+    cannot be read, has no images or no audio, or is too long.
     """
     check_video(path)
     with (
@@ -75,7 +75,7 @@ def _image_of(frame: av.VideoFrame) -> NDArray[np.uint8]:
 def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tuple[int, int]:
     """Write the clip of a video as ``.flac``, ``.csv`` and ``.json``.
 
-    Returns the number of images with a face, and of all images. Raises UserError if the video
+    Returns the number of images with a face, and of all images. Raises ``UserError`` if the video
     cannot be read, or a face is rarely visible.
     """
     mesh = FaceMesh()

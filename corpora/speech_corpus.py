@@ -153,7 +153,7 @@ def read_corpus(
     ``errors`` receives a message for every row that cannot be used. Without ``split`` all splits
     are read. ``audio`` is the base folder of a manifest's paths, by default the manifest's folder.
     Without ``any_license``, rows whose license does not allow distributing a model are skipped.
-    Raises UserError if the layout is unknown, or a list is missing or not UTF-8 text.
+    Raises ``UserError`` if the layout is unknown, or a list is missing or not UTF-8 text.
     """
     if folder.suffix == ".tsv" and not folder.is_dir():
         rows = _manifest_rows(folder, audio)
@@ -186,7 +186,7 @@ def read_corpus(
 def audio_files(folder: Path) -> list[Path]:
     """Find and sort the recordings in a folder, at any depth, except those that are held out.
 
-    Raises UserError if the folder contains no audio.
+    Raises ``UserError`` if the folder contains no audio.
     """
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
     if not files:

@@ -170,7 +170,7 @@ class ServiceConfig(BaseModel):
     """Accept unencrypted connections from anyone. docs/security.md describes the risks."""
     log_level: LogLevel = "info"
     """Lowest level of log messages to write."""
-    instance: Annotated[str, Field(max_length=128), ValueHint("text of up to 128 letters")] = ""
+    instance: Annotated[str, Field(max_length=128), ValueHint("up to 128 characters")] = ""
     """Name of this process. If empty, a name is generated."""
     metrics: Annotated[
         str, AfterValidator(_check_metrics), ValueHint("HOST:PORT such as 127.0.0.1:9100, or empty")

@@ -70,13 +70,13 @@ def with_host(endpoint: str, host: str) -> str:
     return f"tcp://{host}:{port}"
 
 
-def local_address(towards: str = "192.0.2.1") -> str:
-    """Return the local address for connections to a host, without sending anything.
+def local_address(destination: str = "192.0.2.1") -> str:
+    """Return the local address for connections to a host. Nothing is sent.
 
     Without a host, or if it cannot be reached, this is the address of the default route, or
-    127.0.0.1 without a route.
+    127.0.0.1 if there is no route.
     """
-    for host in dict.fromkeys((towards, "192.0.2.1")):
+    for host in dict.fromkeys((destination, "192.0.2.1")):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect((host.strip("[]"), 9))

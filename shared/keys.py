@@ -312,10 +312,10 @@ def read_key(path: Path) -> Key:
 
 def _key_error(path: Path) -> UserError:
     if path.parent != key_folder():
-        return UserError(f"{path} is not a key file; copy it again")
+        return UserError(f"{path} is not a valid key file; copy it from control's machine again")
     return UserError(
-        f"{path} is not a key file. If it came from another machine, copy it again. Otherwise run:"
-        f" {_replace_hint(path)}"
+        f"{path} is not a valid key file. If it came from another machine, copy it from there"
+        f" again. Otherwise run: {_replace_hint(path)}"
     )
 
 

@@ -70,7 +70,7 @@ def load_examples(
     """Read the recordings of one split, with their log-mel features, samples and weights.
 
     ``errors`` receives a message for every row that cannot be used. For ``any_license``, see
-    :func:`read_corpus`. Raises UserError if no recording can be used.
+    :func:`read_corpus`. Raises ``UserError`` if no recording can be used.
     """
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
@@ -125,7 +125,7 @@ def load_untranscribed(folder: Path, errors: RowErrors) -> list[NDArray[np.int16
     """Read recordings without text, in any language, except those held out for measuring.
 
     Returns samples at 16 kHz, trimmed and cut into pieces of up to 20 s. ``errors`` receives a
-    message for every file that cannot be used. Raises UserError if no file can be used.
+    message for every file that cannot be used. Raises ``UserError`` if no file can be used.
     """
     files = [Utterance(utterance_id=str(path), path=path) for path in audio_files(folder)]
     sounds = samples_of(files)

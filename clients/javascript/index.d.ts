@@ -133,6 +133,6 @@ export class Playout {
   mediaAt(nowMs: number): MediaTime | null;
   frameArrived(nowMs: number, mediaTime: MediaTime): void;
   soundArrived(nowMs: number, mediaTime: MediaTime, numSamples: number): void;
-  /** Move towards the measured delay. Call it for every image. */
+  /** Move toward the measured delay. Call it for every image. */
   adjust(nowMs: number): void;
 }

@@ -60,8 +60,8 @@ def read_tables(
 ) -> dict[str, CurveTable]:
     """Read ``CLIP.csv`` of all held-out clips, and of those training clips that have one.
 
-    Raises UserError if a held-out clip has no table, a table cannot be read, or its columns differ
-    from the first one's columns.
+    Raises ``UserError`` if a held-out clip has no table, a table cannot be read, or its columns
+    differ from the first one's columns.
     """
     paths = {clip.name: folder / f"{clip.name}.csv" for clip in (*held_out, *training)}
     missing = [paths[clip.name] for clip in held_out if not paths[clip.name].is_file()]
@@ -103,8 +103,8 @@ def fap_conversion(folder: Path, tables: Collection[CurveTable]) -> FapConversio
     """Return the conversion of a folder's curves to FAPs.
 
     Shapes have the FAPs of this package's tables. An opening has no unit. Over all tables, its
-    first percentile is mapped to 0, and its 99th to 400 FAP units. Raises UserError if no column
-    has a known name.
+    first percentile is mapped to 0, and its 99th to 400 FAP units. Raises ``UserError`` if no
+    column has a known name.
     """
     names = next(iter(tables)).names
     basis, offset = np.zeros((len(names), NUM_FAPS)), np.zeros(NUM_FAPS)

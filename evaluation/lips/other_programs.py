@@ -32,7 +32,7 @@ def load_programs(
 ) -> dict[str, MouthFunction]:
     """Load the mouths of other programs from folders of tables; return them by title.
 
-    Raises UserError if a table is missing or cannot be used (see ``read_tables``).
+    Raises ``UserError`` if a table is missing or cannot be used (see ``read_tables``).
     """
     mouths: dict[str, MouthFunction] = {}
     for folder in folders:
@@ -45,7 +45,7 @@ def load_programs(
 def load_program_faps(folder: Path, clips: Sequence[LipClip]) -> FapsFunction:
     """Load a program's curves as shipped, at the delay that agrees best with the given clips.
 
-    Raises UserError if a table is missing or cannot be used (see ``read_tables``).
+    Raises ``UserError`` if a table is missing or cannot be used (see ``read_tables``).
     """
     faps_of, _ = _program_faps(folder, read_tables(folder, clips, ()), clips)
     return faps_of

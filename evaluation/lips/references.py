@@ -123,7 +123,7 @@ def reference_of(
 def clips_to_score(folder: Path, *, language: str | None = None) -> list[LipClip]:
     """Read the held-out clips of a folder that the shipped viseme parameters were not trained on.
 
-    Clips with sound out of sync are left out. Raises UserError if no clip is left.
+    Clips with sound out of sync are left out. Raises ``UserError`` if no clip is left.
     """
     return _held_out(folder, read_clips(folder, language=language), ())
 

@@ -72,7 +72,7 @@ def score_schemes(
     recognizers: Sequence[RecognizerSetup],
     lips: Sequence[str],
 ) -> SchemeComparison:
-    """Score all conditions; raises UserError if there are neither texts nor tracked lips."""
+    """Score all conditions; raises ``UserError`` if there are neither texts nor tracked lips."""
     if all(s.aligned is None and not len(s.sentence.clip.time_s) for s in sentences):
         raise UserError("no sentence has a text or tracked lips")
     conditions = all_conditions(recognizers, lips)

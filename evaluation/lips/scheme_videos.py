@@ -46,7 +46,7 @@ def write_videos(
     all sentences in all conditions. ``programs`` are folders with curves of other programs, and
     each is a condition, at its best delay for these sentences. Clips with tracked lips add the
     conditions ``reference`` and ``anchor``, a mouth at rest. All mouths have an expressiveness of
-    1, like the tracked one. Raises UserError if a file cannot be written, or a program's table
+    1, like the tracked one. Raises ``UserError`` if a file cannot be written, or a program's table
     cannot be used.
     """
     missing = [

@@ -42,7 +42,7 @@ def sample_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
 
 
 def corpus_sentences(model: AcousticModel, corpus: Path) -> list[Sentence]:
-    """Read twenty sentences of the split ``test``; raises UserError if the split is empty."""
+    """Read twenty sentences of the split ``test``; raises ``UserError`` if the split is empty."""
     errors = RowErrors()
     utterances = read_corpus(corpus, errors, model.inventory, split="test")
     if not utterances:

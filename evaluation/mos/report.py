@@ -49,7 +49,7 @@ class Opinion:
 
 
 def make_report(study: Study, answers: Iterable[Answer]) -> list[Opinion]:
-    """Compute the results; raises UserError if there are no answers."""
+    """Compute the results; raises ``UserError`` if there are no answers."""
     groups = group_scores(study, answers)
     if not groups:
         raise UserError(f"no answers yet; collect them with: kouxing mos serve {study.folder}")

@@ -109,7 +109,7 @@ async def serve(
 ) -> None:
     """Serve a study until SIGINT or SIGTERM, with the gateway's address and access rules.
 
-    ``on_ready`` is called with the page's address. Raises UserError if the address is not
+    ``on_ready`` is called with the page's address. Raises ``UserError`` if the address is not
     available, or the certificate cannot be read.
     """
     stop = asyncio.Event()

@@ -88,7 +88,7 @@ class AnswerStore:
 
 
 def read_answers(folder: Path) -> list[Answer]:
-    """Read all answers; raises UserError if the file cannot be read."""
+    """Read all answers; raises ``UserError`` if the file cannot be read."""
     path = folder / FILE_NAME
     with check_content(path, "a file of listening-test answers"):
         return [Answer(**line) for line in _read_lines(path) if "token" not in line]

@@ -48,7 +48,7 @@ def check_no_study(folder: Path) -> None:
 def new_study(folder: Path) -> Study:
     """Find the videos ``CONDITION/SENTENCE.mp4`` of a folder and write ``study.json``.
 
-    Raises UserError if the folder already is a study, lacks videos, or has one without sound.
+    Raises ``UserError`` if the folder already is a study, lacks videos, or has one without sound.
     """
     check_no_study(folder)
     videos = [path for path in sorted(folder.glob("*/*")) if path.suffix.lower() in SUFFIXES]
@@ -61,7 +61,7 @@ def new_study(folder: Path) -> Study:
 
 
 def load_study(folder: Path) -> Study:
-    """Read the study of a folder; raises UserError if it is missing, invalid or incomplete."""
+    """Read the study of a folder; raises ``UserError`` if it is missing, invalid or incomplete."""
     file = folder / FILE_NAME
     if not file.exists():
         raise UserError(f"{file} is missing; create it with: kouxing mos new {folder}")

@@ -52,7 +52,7 @@ def align_corpus(
 ) -> list[AlignedRecording]:
     """Align the recordings of one split of a corpus in the model's language.
 
-    Prints the rows that cannot be used. Raises UserError if the split has no usable recording.
+    Prints the rows that cannot be used. Raises ``UserError`` if the split has no usable recording.
     """
     references, errors = [], RowErrors()
     utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)

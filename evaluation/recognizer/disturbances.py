@@ -67,7 +67,7 @@ def check_conditions(names: Sequence[str], known: Sequence[str] = CONDITIONS) ->
 def held_out_music(sounds: Sequence[Sound]) -> Samples:
     """Return the held-out music, or synthesized music if ``sounds`` is empty.
 
-    Raises UserError if the sounds contain no held-out music.
+    Raises ``UserError`` if the sounds contain no held-out music.
     """
     if not sounds:
         return synthetic_sounds.music(_MUSIC_S)

@@ -50,8 +50,8 @@ def evaluate_languages(
 ) -> dict[str, dict[str, Any]]:
     """Measure the recognizers; return figures in the form of ``evaluate_recognizer``.
 
-    A language is a code such as ``en`` or ``en-GRID``. Raises UserError if a recording's language
-    is unknown, or hama is not installed.
+    A language is a code such as ``en`` or ``en-GRID``. Raises ``UserError`` if a recording's
+    language is unknown, or hama is not installed.
     """
     scores: dict[str, dict[str, ErrorStats]] = defaultdict(
         lambda: defaultdict(lambda: ErrorStats(load_inventory(UNIVERSAL)))
@@ -109,7 +109,7 @@ def _phone(symbol: str) -> Phone:
 
 
 def _run_hama(references: Sequence[AlignedRecording]) -> Iterator[tuple[str, ...]]:
-    """Yield the phones of each recording. Raises UserError if hama's output has unknown letters."""
+    """Yield the phones of each recording; raises ``UserError`` if hama outputs unknown letters."""
     with tempfile.TemporaryDirectory() as name:
         for number, reference in enumerate(references):
             reference.read_audio().astype("<f4").tofile(Path(name) / f"{number:06}.f32")

@@ -62,7 +62,7 @@ _PROFILE = {
 def write_tables(folder: Path, output: Path, programs: Sequence[str]) -> None:
     """Write ``output/PROGRAM/CLIP.csv`` for the held-out and the training clips of a folder.
 
-    Existing tables are kept. Raises UserError if a program is unknown, not installed, or fails.
+    Existing tables are kept. Raises ``UserError`` if a program is unknown, not installed, or fails.
     """
     unknown = {*programs} - {*PROGRAMS}
     if unknown:
@@ -102,14 +102,14 @@ def _run(program: str, clips: Sequence[LipClip], tables: Path, profile: Any = No
 
 
 def find_installed(name: str) -> Path:
-    """Return an installed file or folder of the programs. Raises UserError if it is missing."""
+    """Return an installed file or folder of the programs. Raises ``UserError`` if it is missing."""
     if not (FOLDER / name).exists():
         raise UserError("this program is not installed; run 'make report' to install it")
     return FOLDER / name
 
 
 def find_node() -> str:
-    """Return the Node next to Python, or else on the path. Raises UserError if Node is missing."""
+    """Return the Node next to Python, or else on the path; raises ``UserError`` if missing."""
     node = shutil.which("node", path=str(Path(sys.executable).parent)) or shutil.which("node")
     if node is None:
         raise UserError("Node is missing; install it with: pip install 'kouxing[page]'")

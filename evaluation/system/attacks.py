@@ -91,7 +91,7 @@ class AttackResult:
 def measure(path: Path, console: Console) -> list[AttackResult]:
     """Start the services, attack them in each way and return the figures.
 
-    The other client streams the file. Raises UserError if the file is not audio.
+    The other client streams the file. Raises ``UserError`` if the file is not audio.
     """
     length_s = len(PHASES) * PHASE_S + 2 * SESSION_START_S
     speech = np.resize(to_16_khz(*read_audio(path)), round(length_s * MEDIA_RATE_HZ))

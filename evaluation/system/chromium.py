@@ -30,7 +30,9 @@ def is_installed() -> bool:
 
 
 class Chromium:
-    """A headless Chromium with one page, drawn without a GPU; raises UserError if not installed.
+    """A headless Chromium with one page, drawn without a GPU.
+
+    Raises ``UserError`` if Chromium is not installed.
 
     The microphone repeats a WAV file, the camera an MJPEG file at 30 frames per second. ``folder``
     is for the profile.

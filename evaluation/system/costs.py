@@ -83,7 +83,10 @@ class RenderingCosts:
 
 
 def measure_images() -> RenderingCosts:
-    """Render the default head with visemes, blinks and nods; needs OpenGL, or raises UserError."""
+    """Render the default head with visemes, blinks and nods.
+
+    Raises ``UserError`` if OpenGL is missing.
+    """
     rates, stages = {}, {}
     load_s: dict[str, float] = {}
     opengl = ""

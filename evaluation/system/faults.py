@@ -188,7 +188,7 @@ def measure(
     """Stream an audio file during faults, one after another; yield the effects of each.
 
     ``names`` are keys of ``FAULTS``; if empty, all run. ``logs`` gets a subfolder for each fault
-    and instant. Raises UserError for an unknown fault, or if the file is not audio.
+    and instant. Raises ``UserError`` for an unknown fault, or if the file is not audio.
     """
     unknown = sorted(set(names) - set(FAULTS))
     if unknown:

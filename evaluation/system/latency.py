@@ -75,7 +75,7 @@ def stream(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Stream in real time; return media time and both latencies of every frame, seconds.
 
-    Frames after the last sample are omitted. Raises UserError if the session does not complete.
+    Frames after the last sample are omitted. Raises ``UserError`` if the session does not complete.
     """
     session = client.open_session(encoding="f32le", language=language)
     (received,) = speak([session], sound)

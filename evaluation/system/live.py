@@ -76,7 +76,7 @@ def speak(
 def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> ReceivedResults:
     """Return what a session receives for audio without any fault; it is not paced.
 
-    Raises UserError if results are missing every time, as on a machine that is too busy.
+    Raises ``UserError`` if results are missing every time, as on a machine that is too busy.
     """
     for _ in range(NUM_TRIES):
         session = client.open_session(encoding="f32le", paced=False)

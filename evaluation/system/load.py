@@ -101,8 +101,8 @@ def measure(
     """Start all services, put them under load, return the figures.
 
     The last step has ``num_sessions``; each is measured for ``step_s``. ``language`` is the
-    language of the speech. If None, it is the recognizer's. Raises UserError if a file is not audio
-    or the services cannot start.
+    language of the speech. If None, it is the recognizer's. Raises ``UserError`` if a file is not
+    audio or the services cannot start.
     """
     speech = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
@@ -175,7 +175,7 @@ class CumulativeUsage:
 
 
 def usage_of(client: Client) -> dict[str, CumulativeUsage]:
-    """Return the resources used by each service; raises UserError if one stays lost."""
+    """Return the resources used by each service; raises ``UserError`` if one stays lost."""
     usage: dict[str, CumulativeUsage] = {}
 
     def is_complete() -> bool:

@@ -42,7 +42,8 @@ class NetworkLink:
 class Network:
     """Up to 250 hosts with one address each; their names have up to 15 letters.
 
-    Raises UserError if this process is not root, a tool is missing, or namespaces are forbidden.
+    Raises ``UserError`` if this process is not root, a tool is missing, or namespaces are
+    forbidden.
     """
 
     def __init__(self, hosts: Sequence[str], link: NetworkLink) -> None:
@@ -155,7 +156,7 @@ def _command(namespace: str, *command: str) -> list[str]:
 
 
 def _run_command(*command: str) -> str:
-    """Run a command and return its output; raises UserError with its errors if it fails."""
+    """Run a command and return its output; raises ``UserError`` with its errors if it fails."""
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if result.returncode != 0:
         raise UserError(f"{' '.join(command)}: {result.stderr.strip()}")

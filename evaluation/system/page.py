@@ -40,7 +40,7 @@ class Drawing:
 def measure(path: Path, console: Console) -> dict[str, Drawing]:
     """Start the services and a browser; return the figures when idle and with the microphone.
 
-    Raises UserError if the file is not audio, or the services or Chromium cannot start.
+    Raises ``UserError`` if the file is not audio, or the services or Chromium cannot start.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -212,7 +212,7 @@ class HostsSystem(System):
             )
 
     def _wait_until_ready(self) -> None:
-        """Wait until services have registered at control; raises UserError after READY_S."""
+        """Wait until services have registered at control; raises ``UserError`` after READY_S."""
 
         def is_ready() -> bool:
             try:

@@ -180,8 +180,8 @@ def listen(
 ) -> None:
     """Print or record the output of a session until it ends.
 
-    Shapes are printed as JSON lines, rhubarb's mouths when they change, and syllables and phones
-    once they are final.
+    Blendshapes are printed as JSON lines. With --as rhubarb, a line is printed whenever the mouth
+    shape changes. Syllables and phones are printed once they are final.
     """
     from kouxing.services.cli.follow import follow
 

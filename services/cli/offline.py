@@ -149,7 +149,7 @@ def render(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Make a video, pictures or curves from sound, or from curves.
+    """Render a recording, or existing animation curves, as a video, images or curves.
 
     The output is a video (.mp4, .mov, .webm, or .webp without sound) or a picture (.png). Other
     outputs are numbered pictures (a folder, or a pattern such as face%05d.png), curves (.fap, .csv,

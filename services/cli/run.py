@@ -220,8 +220,8 @@ def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) ->
     warnings = [f"{owner}; this kouxing uses free ports"] if taken else []
     if BOUND_CONTROL_VARIABLE in moved:
         warnings.append(
-            "commands with the same HOME and XDG_STATE_HOME use this kouxing; for other programs,"
-            f" set KOUXING_CONTROL={control}"
+            "commands run by this user connect to this system; in other environments, set"
+            f" KOUXING_CONTROL={control}"
         )
     return "; ".join(warnings)
 

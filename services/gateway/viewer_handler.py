@@ -236,7 +236,8 @@ class ViewerHandler:
             viewer.shape_encoder = make_avatar_encoder(command.avatar, command.format)
             self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.header_message())
         elif not command.problem:
-            raise UserError(f"the message changes nothing; use {', '.join(VIEWER_COMMANDS)}")
+            names = ", ".join(VIEWER_COMMANDS)
+            raise UserError(f"the message contains no command; send one of {names}")
 
     def _on_sample_end(self, session: str, error: str) -> None:
         """Show the newest session again to viewers of the sample sentence, with the error."""

@@ -87,8 +87,8 @@ def compute_mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Arra
     """Compute the FAPs of a mouth relative to its own neutral face, FAP units, (n, 28).
 
     ``landmarks`` are ``LANDMARKS`` of each frame, pixels, (n, 43, 3). ``level_db`` are the audio
-    levels, (n,). FAPs without a landmark are NaN. Raises UserError if the landmarks do not form an
-    upright face.
+    levels, (n,). FAPs without a landmark are NaN. Raises ``UserError`` if the landmarks do not form
+    an upright face.
     """
     points = _align_head(landmarks.astype(np.float64))
     height = points[:, _landmark_index(_UPPER_LIP), _Y] - points[:, _landmark_index(_LOWER_LIP), _Y]

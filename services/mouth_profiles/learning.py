@@ -143,7 +143,7 @@ def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> flo
 def fit_profile(observations: Observations) -> MouthProfile:
     """Fit a profile; cross-validation chooses the strength of the ridge.
 
-    Raises UserError if there is too little speech with tracked lips.
+    Raises ``UserError`` if there is too little speech with tracked lips.
     """
     usable = observations[_is_known(observations)]
     speech_s = len(usable) * POSITION_S

@@ -35,13 +35,13 @@ class RecognizerConfig(LiveConfig):
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
         default_factory=lambda values: _rule_of_model(values).num_stable_frames
     )
-    """Consecutive frames that must agree before a phone is emitted (N = 3 in Li 2011). Other
-    defaults: 1 with acoustic = light or gmm."""
+    """Consecutive frames that must agree before a phone is emitted (N = 3 in Li 2011). The
+    default is 1 if acoustic is light or gmm."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         default_factory=lambda values: _rule_of_model(values).min_confidence
     )
-    """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011. Other
-    defaults: 0.9 with acoustic = light or gmm."""
+    """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011. The
+    default is 0.9 if acoustic is light or gmm."""
 
     @property
     def output_rule(self) -> OutputRuleConfig:

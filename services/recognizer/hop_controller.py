@@ -33,12 +33,13 @@ class ProcessorTime:
 class HopController:
     """Chooses the hop of the block network from the load of a recognizer.
 
-    The network's time is proportional to 1 / hop. The hop is the shortest hop with a sufficiently
-    low expected load. It also increases while a session is behind, because other programs use the
-    processor. It increases after one period and decreases after several.
+    The processor time of the network is proportional to 1 / hop, so the controller chooses the
+    shortest hop whose expected load is low enough. While a session is behind, it also increases the
+    hop, because other programs may be using the processor. It increases the hop after one period,
+    but decreases it only after several.
 
-    ``work`` is the work so far, which does not count toward the load. Times are in seconds, on any
-    monotonic clock.
+    ``work`` is the processor time spent before the controller was created; it is ignored. Times are
+    in seconds, on any monotonic clock.
     """
 
     def __init__(self, work: ProcessorTime, now_s: float) -> None:

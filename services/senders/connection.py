@@ -13,7 +13,7 @@ from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
 
 RETRY_S = 1.0
-_REFUSED_S = 1.0  # without an error for this time, a program is listening
+_REFUSED_S = 1.0  # if no error arrives within this time, assume that a program is listening
 
 Options = Mapping[str, tuple[str, ...]]
 COMMON_OPTIONS: Options = {"delay": ("0",), "only": ("face", "mouth")}

@@ -32,8 +32,8 @@ class SynthesizerConfig(FaceConfig, LiveConfig):
     lips: Annotated[str, KnownNames(lip_model_names)] = DEFAULT_LIP_MODEL
     """Default lip model. A client can choose another one for its session."""
     delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(default_factory=_delay_ms)
-    """Delay between a frame's audio and the frame, in steps of 20 ms. Other defaults: 160 with
-    lips = dynamic-visemes or ferguson."""
+    """Delay between a frame's audio and the frame, in steps of 20 ms. The default is 160 if
+    lips is dynamic-visemes or ferguson."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""
     feeling: Annotated[float, Field(ge=0, le=1)] = 0.5

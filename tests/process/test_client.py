@@ -71,11 +71,11 @@ def test_the_client_finds_the_key_that_commands_use(
     path = tmp_path / "kouxing" / "client.key"
     for text in ('{"public": "short"}', "[" * 100_000):
         path.write_text(text)
-        with pytest.raises(KouxingError, match="is not a key file"):
+        with pytest.raises(KouxingError, match="is not a valid key file"):
             Client()
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(KouxingError, match="is not a key file"):
+    with pytest.raises(KouxingError, match="is not a valid key file"):
         Client()
 
 

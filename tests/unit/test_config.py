@@ -76,7 +76,7 @@ def test_a_default_may_depend_on_another_key() -> None:
     (item,) = (one for one in given.describe(RecognizerConfig) if one.key == "num_stable_frames")
     assert (item.value, item.default) == (1, 2)
     assert item.is_default
-    assert item.meaning.endswith("Other defaults: 1 with acoustic = light or gmm.")
+    assert item.meaning.endswith("The default is 1 if acoustic is light or gmm.")
     short = {name for name, rule in MODEL_RULES.items() if rule.num_stable_frames == 1}
     assert short == {"light", "gmm"}
     delays_ms = {

@@ -239,8 +239,8 @@ def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
         ({"follow": "a b"}, "follow is not a valid name; use "),
         ({"follow": "a\n"}, "follow is not a valid name; use "),
         ({"play": "song"}, "play must be sample"),
-        ({"lip_model": ""}, "the message changes nothing; use follow, play, avatar, "),
-        ({}, "the message changes nothing; use follow, play, avatar, "),
+        ({"lip_model": ""}, "the message contains no command; send one of follow, play, avatar, "),
+        ({}, "the message contains no command; send one of follow, play, avatar, "),
     ],
 )
 def test_answers_commands_of_viewers_without_effect(command: dict[str, object], error: str) -> None:

@@ -147,7 +147,7 @@ def use_other_secret(path: Path) -> None:
         (
             "lamp.key",
             lambda path: path.write_text(""),
-            r"is not a key file.*revoke lamp; rm -r .*lamp",
+            r"is not a valid key file.*revoke lamp; rm -r .*lamp",
         ),
         ("control.key", lambda path: path.write_text("{"), r"control\.key .*rm -r .*kouxing"),
         ("control.key", Path.unlink, r"control\.key .*rm -r .*kouxing"),

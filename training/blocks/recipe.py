@@ -72,8 +72,8 @@ def train_blocks(
 ) -> None:
     """Train the block model, and write it with its card.
 
-    The arguments are the options of ``kouxing train blocks``. Raises UserError if there is nothing
-    to train on, or a file cannot be read.
+    The arguments are the options of ``kouxing train blocks``. Raises ``UserError`` if there is
+    nothing to train on, or a file cannot be read.
     """
     start = start or model_path("blocks")
     before = load_model(start)

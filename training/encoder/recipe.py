@@ -73,8 +73,8 @@ def train_encoder(
 ) -> None:
     """Train the audio encoder, and write it with its model card.
 
-    The arguments are the options of ``kouxing train encoder``. Raises UserError if there is nothing
-    to train on, or a file cannot be read.
+    The arguments are the options of ``kouxing train encoder``. Raises ``UserError`` if there is
+    nothing to train on, or a file cannot be read.
     """
     teachers, inventory = load_teachers(whisper)
     errors = RowErrors()

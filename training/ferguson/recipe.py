@@ -235,7 +235,7 @@ def train_ferguson(
 ) -> None:
     """Learn the table from the training clips and recordings.
 
-    Raises UserError if no data may be used, or the file cannot be written.
+    Raises ``UserError`` if no data may be used, or the file cannot be written.
     """
     model = load_model()
     inventory = model.inventory
@@ -268,7 +268,7 @@ def training_rows(
 ) -> list[Utterance]:
     """Read sentences of the training split, at most ``_MAX_OF_SPEAKER`` of each speaker.
 
-    Raises UserError if there are no usable sentences.
+    Raises ``UserError`` if there are no usable sentences.
     """
     chosen: list[Utterance] = []
     of_speaker: Counter[str] = Counter()

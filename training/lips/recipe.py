@@ -87,7 +87,7 @@ class Basis:
 def train_lips(folder: Path, output: Path, *, any_license: bool) -> None:
     """Train the lip model, and write it with its card.
 
-    The arguments are the options of ``kouxing train lips``. Raises UserError if no clip may be
+    The arguments are the options of ``kouxing train lips``. Raises ``UserError`` if no clip may be
     used, or a file cannot be read.
     """
     clips = read_clips(folder, any_license=any_license, language=None)

@@ -135,7 +135,7 @@ def _align_examples(
 ) -> tuple[list[Example], list[Alignment]]:
     """Align each recording with its text; drop recordings that do not fit.
 
-    Raises UserError if no recording fits its text.
+    Raises ``UserError`` if no recording fits its text.
     """
     topology = aligner.topology
     inventory = topology.inventory

@@ -58,7 +58,7 @@ _LAYER_NAMES = {
 def load_whisper(network: Encoder, folder: Path) -> None:
     """Load the weights of Whisper's convolutions and of the network's layers.
 
-    ``folder`` contains ``model.bin`` in CTranslate2's format. Raises UserError if the file is
+    ``folder`` contains ``model.bin`` in CTranslate2's format. Raises ``UserError`` if the file is
     missing, invalid, or for another kind or size of model.
     """
     path = folder / _FILE_NAME

@@ -211,8 +211,8 @@ def train_phone_lm(
     """Estimate a phone language model, and write it to a file.
 
     Texts are counted, and with about a hundredth of their weight the natural sentences of the
-    corpora's split ``train``. ``drawn`` are phones from ``open_gram.draw_phones``. Raises UserError
-    if a file cannot be read, or there is nothing to count.
+    corpora's split ``train``. ``drawn`` are phones from ``open_gram.draw_phones``. Raises
+    ``UserError`` if a file cannot be read, or there is nothing to count.
     """
     errors = RowErrors()
     streams = [join_sentences(_read_sentences(text, inventory), inventory) for text in texts]
@@ -248,7 +248,7 @@ def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> Phone
 def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
     """Read a file of :func:`train_phone_lm`, or the phone language model of a recognizer's model.
 
-    Raises UserError if the file contains no phone language model, or one for another language.
+    Raises ``UserError`` if the file contains no phone language model, or one for another language.
     """
     try:
         phone_lm = parse_phone_lm(read_archive(path))

@@ -49,7 +49,7 @@ def train_universal(
 ) -> None:
     """Train the universal readout of the shipped block model, and write it with its card.
 
-    The arguments are the options of ``kouxing train universal``. Raises UserError if there is
+    The arguments are the options of ``kouxing train universal``. Raises ``UserError`` if there is
     nothing to train on, or a file cannot be read.
     """
     model = load_model()

@@ -60,8 +60,8 @@ def read_training_set(
 
     ``mandarin`` are Mandarin corpora, ``learners`` English by native speakers of Mandarin,
     ``languages`` corpora of several languages, and ``clips`` a folder with clips of GRID. Without
-    ``any_license``, their license must allow distributing the model. Raises UserError if nothing
-    can be used.
+    ``any_license``, their license must allow distributing the model. Raises ``UserError`` if
+    nothing can be used.
     """
     groups: dict[str, list[Utterance]] = defaultdict(list)
     for corpus in mandarin:

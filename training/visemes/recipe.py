@@ -100,7 +100,7 @@ def closure_reach(
 def train_visemes(folder: Path, output: Path, *, any_license: bool) -> None:
     """Train viseme parameters on the training clips of a folder.
 
-    Raises UserError if no clip may be used, or the file cannot be written.
+    Raises ``UserError`` if no clip may be used, or the file cannot be written.
     """
     clips = read_clips(folder, any_license=any_license)
     used = [clip for clip in clips if clip.split == "train"]

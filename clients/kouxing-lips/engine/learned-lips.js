@@ -136,7 +136,7 @@ function separateLips(faps, { UPPER, LOWER, BOTH }) {
   });
 }
 
-/** Move inner lips towards rest, and the outer lips by the same distance, in place. */
+/** Move inner lips toward rest, and the outer lips by the same distance, in place. */
 function moveToRest(faps, amount, inner, outer) {
   inner.forEach((column, i) => {
     const shift = amount * faps[column];

@@ -64,5 +64,5 @@ def read_key(path: str | Path) -> Key:
         ) from None
     except (msgspec.MsgspecError, ValueError, TypeError, RecursionError):
         raise KouxingError(
-            f"{path} is not a key file; copy it again from control's machine"
+            f"{path} is not a valid key file; copy it from control's machine again"
         ) from None

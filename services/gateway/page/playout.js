@@ -46,7 +46,7 @@ class Streak {
  * visible. A constant difference between the page's clock and the sender's cancels out. Without
  * sound, as for the user's own voice, the face waits less.
  *
- * The drift of the network and of the clocks moves the target. The offset glides towards the target
+ * The drift of the network and of the clocks moves the target. The offset glides toward the target
  * by at most 5 ms per second, and the sound follows by resampling. Only if the error exceeds 30 ms,
  * half of it is corrected immediately, every half second. So one bad second does not cause a leap. After a
  * stall, the delayed data arrives in a burst. The burst is not measured, so the page is live when it ends.
@@ -123,7 +123,7 @@ export class Playout {
     this.soundEnds.add(nowMs, endMs);
   }
 
-  /** Move the offset towards its target. Call it for every image. */
+  /** Move the offset toward its target. Call it for every image. */
   adjust(nowMs) {
     this.#glide(nowMs);
     if (this.offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
@@ -160,7 +160,7 @@ export class Playout {
   /**
    * Return whether data is too late to measure the usual delay. Data that was delayed by the network
    * or by a busy page arrives in one burst whose end is on time. If later data is also late, the
-   * sender paused. Start again after a pause, or if media time leapt ahead.
+   * sender paused. Start again after a pause, or if media time jumped ahead.
    */
   #isLate(nowMs, latenessMs, streak) {
     if (this.offsetMs === null) return false;

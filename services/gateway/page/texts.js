@@ -2,7 +2,7 @@
 
 export const TEXTS = {
   // Main view
-  canvas: { en: "talking head; the arrow keys turn it, Home returns it to the front", zh: "说话的头像：方向键转动，Home 键回到正面" },
+  canvas: { en: "Talking head. Use the arrow keys to turn it and Home to reset the view.", zh: "说话的头像：方向键转动，Home 键回到正面" },
   loading: { en: "Loading the head …", zh: "正在加载头像…" },
   phonesLabel: { en: "recognized speech", zh: "识别结果" },
   phones: { en: "Phones", zh: "声韵母" },
@@ -116,8 +116,8 @@ export const TEXTS = {
   useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
   speechLanguage: { en: "Speech language", zh: "说话的语言" },
-  speechErrors: {
-    en: "The lips work in any language.",
+  anyLanguage: {
+    en: "Lip sync works in any language.",
     zh: "口型适用于任何语言。",
   },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
@@ -181,7 +181,7 @@ export const TEXTS = {
   lessonFinish: { en: "I'm done reading", zh: "读完了" },
   lessonLearning: { en: "Learning your mouth. This takes a few seconds …", zh: "正在学习你的口型，需要几秒钟…" },
   lessonTracking: {
-    en: "You can stop reading. This computer is slow, so the lips in the images are found now: {percent} %.",
+    en: "You can stop reading. This computer is slow, so it is analyzing the recorded images now: {percent} %.",
     zh: "可以停止朗读了。这台电脑较慢，正在查找画面中的嘴唇：{percent} %。",
   },
   learning: { en: "learning", zh: "学习中" },

@@ -12,7 +12,7 @@ time. In addition to the pair of eq. 11, visemes within ``delay_s`` act. A longe
 therefore closer to the full model (Wang & Cai 2003, eq. 6).
 
 Lips move before the sound, but a phone is recognized about 0.1 s after its onset. Therefore the
-mouth starts moving towards an expected viseme after the last phone (`timeline`). While no phone
+mouth starts moving toward an expected viseme after the last phone (`timeline`). While no phone
 follows, the expected viseme stays just after the time at which a new phone would already be
 recognized. This halves the lag of the lips at short delays.
 """
