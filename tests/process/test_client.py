@@ -8,7 +8,7 @@ import os
 import socket
 from array import array
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -229,6 +229,29 @@ def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
     with pytest.raises(KouxingError, match="closed"):
         client.status()
     session.close()  # does not wait for the thread, which has ended
+    with pytest.raises(KouxingError, match="closed"):
+        session.frames()
+    events = session.events()
+    with pytest.raises(KouxingError, match="closed"):
+        events.get(0.0)
+    events.close()
+
+
+def test_a_request_of_another_thread_fails_while_the_client_ends(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    thread, answers = client._thread, list[Future[Any]]()
+    close = thread.core.close
+
+    def close_late(failure: KouxingError) -> None:
+        close(failure)
+        answers.append(thread.submit(lambda core: core.request("status-request")))
+
+    monkeypatch.setattr(thread.core, "close", close_late)
+    client.close()
+    (answer,) = answers
+    assert answer.done()
+    assert "closed" in str(answer.exception())
 
 
 def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeControl) -> None:

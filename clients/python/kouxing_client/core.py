@@ -68,10 +68,15 @@ class ClientCore:
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
         self._located_s: dict[str, float] = {}  # when a silent session was last located
         self._events: Connection | None = None
+        self._closed: KouxingError | None = None  # reason why this client is closed
         self._commands = self._connect()
 
     def request(self, kind: str, session: str = "", **fields: object) -> Future[Fields]:
         """Send a request to control; the future gets the answer's fields, or ``Refused``."""
+        if self._closed is not None:
+            answer = new_future()
+            answer.set_exception(self._closed)
+            return answer
         name = secrets.token_hex(8)
         parts = encode(kind, session, {**fields, "request": name})
         now_s = self._sockets.now_s
@@ -122,6 +127,8 @@ class ClientCore:
         """Pass a session's events to an inbox, even after the session has ended."""
         self._inboxes.setdefault(session, []).append(inbox)
         self._watch(session, on=True)
+        if self._closed is not None:
+            inbox.end(self._closed)
 
     def remove_inbox(self, session: str, inbox: Inbox) -> None:
         """Stop passing events to an inbox."""
@@ -148,7 +155,8 @@ class ClientCore:
                 self._locate(session)
 
     def close(self, failure: KouxingError) -> None:
-        """End all sessions, and answer all requests with a failure."""
+        """End all sessions, and answer all requests, also later ones, with a failure."""
+        self._closed, self._events = failure, None
         for request in self._requests.values():
             request.answer.set_exception(failure)
         for session in self.sessions:

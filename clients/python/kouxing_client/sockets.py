@@ -66,8 +66,8 @@ def connect(raw: Connection, endpoint: str, key: Key | None) -> None:
 class Sockets:
     """Opens sockets and passes on what they receive.
 
-    Only ``call`` may be used by any thread. All other methods are for the thread that calls
-    ``step``, and for the constructor's thread before that.
+    Any thread may use ``call`` and, after ``close``, ``run_calls``. All other methods are for the
+    thread that calls ``step``, and for the constructor's thread before that.
 
     The key is this program's; None if nothing is encrypted.
     """
@@ -108,8 +108,16 @@ class Sockets:
                 self.drain(raw)
         with contextlib.suppress(BlockingIOError):
             self._woken.recv(4096)
+        self.run_calls()
+
+    def run_calls(self) -> None:
+        """Run the requested calls."""
         while self._calls:
-            self._calls.popleft()()
+            try:
+                function = self._calls.popleft()
+            except IndexError:  # another thread has taken the last one
+                return
+            function()
 
     def connect(
         self,

@@ -44,6 +44,7 @@ class ClientThread:
         self._sockets = Sockets(key)
         self._tick_s = 0.0
         self._is_stopping = False
+        self._has_ended = False  # from now on, the calling threads run functions themselves
         try:
             self.core = ClientCore(self._sockets, control, timeout_s, start_s)
         except KouxingError:
@@ -60,6 +61,8 @@ class ClientThread:
     def call(self, function: Callable[[], None]) -> None:
         """Let the thread call a function soon."""
         self._sockets.call(function)
+        if self._has_ended:
+            self._sockets.run_calls()
 
     def submit(self, function: Callable[[ClientCore], Future[T]]) -> Future[T]:
         """Let the thread call a function; return the future that this function returns."""
@@ -70,7 +73,7 @@ class ClientThread:
         def run() -> None:
             map_future(function(self.core), lambda result: result, answer)
 
-        self._sockets.call(run)
+        self.call(run)
         return answer
 
     def forget(self, session: SessionCore) -> Future[None]:
@@ -81,7 +84,7 @@ class ClientThread:
             session.end(None)
             closed.set_result(None)
 
-        self._sockets.call(end)
+        self.call(end)
         return closed
 
     def close(self) -> None:
@@ -105,6 +108,8 @@ class ClientThread:
         finally:
             self.core.close(failure)
             self._sockets.close()
+            self._has_ended = True
+            self._sockets.run_calls()
 
     def _step(self) -> None:
         is_busy = any(session.is_blocked for session in self.core.sessions)
