@@ -3,7 +3,7 @@
 from typing import Any, cast
 
 import pytest
-from kouxing_client import SHAPE_NAMES, FapFrame, Phone
+from kouxing_client import SHAPE_NAMES, FapFrame, KouxingError, Phone
 from kouxing_client.audio import ANSWER_LIMITS_S
 from kouxing_client.core import RETRY_S, ClientCore
 from kouxing_client.inbox import Inbox
@@ -246,3 +246,21 @@ def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
         harness.pass_time(6.0)
     assert inbox.is_over
     assert "refuses this client" in str(inbox.failure)
+
+
+def test_a_failing_function_of_the_program_does_not_keep_other_sessions_open() -> None:
+    harness = CoreHarness()
+
+    def fail(_result: object) -> None:
+        raise ValueError("a bug")
+
+    inbox = Inbox(None)
+    failing = Subscription(harness.session, (FapFrame,), "", inbox, fail)
+    harness.session.subscribe(failing)
+    other = harness.subscribe()
+    frame = FapFrame(session="s", epoch=1, sequence=1, packed_values=bytes(272), mask=bytes(9))
+    harness.sockets.at("faps 1")[0].unread.append(frame)
+    harness.core.close(KouxingError("the client failed"))
+    assert inbox.is_over
+    assert other.is_over
+    assert harness.session.is_over

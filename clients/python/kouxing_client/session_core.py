@@ -101,7 +101,12 @@ class Subscription:
 
     def end(self, failure: KouxingError | None) -> None:
         """Stop; ``failure`` is the reason why the session has ended early."""
-        self.follower.drain()
+        try:
+            self.follower.drain()
+        except Exception as error:  # of ``on_result``; other subscriptions must also end
+            if failure is None:
+                failure = KouxingError(f"on_result failed: {error!r}")
+                failure.__cause__ = error
         self.follower.close()
         self.inbox.end(None if self.follower.has_ended else failure)
         if not self.joined.done():
