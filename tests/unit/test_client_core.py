@@ -264,3 +264,17 @@ def test_a_failing_function_of_the_program_does_not_keep_other_sessions_open() -
     assert inbox.is_over
     assert other.is_over
     assert harness.session.is_over
+
+
+def test_closes_a_session_that_opens_after_its_request_has_failed() -> None:
+    harness = CoreHarness()
+    opening = harness.core.open_session({"sample_rate_hz": 16000, "session": "late"})
+    harness.pass_time(10.1)
+    assert opening.exception(0) is not None
+    _, request = harness.commands.sent[-1]
+    for _ in range(2):  # control repeats the answer
+        harness.commands.answer("session-opened", request=request["request"], **OPENED)
+    assert [kind for kind, _ in harness.commands.sent].count("close-session") == 1
+    kind, closing = harness.commands.sent[-1]
+    assert (kind, closing["session"], closing["token"]) == ("close-session", "s", "t")
+    assert len(harness.core.sessions) == 1

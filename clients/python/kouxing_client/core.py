@@ -63,6 +63,7 @@ class ClientCore:
         self._start_s = start_s
         self._has_started = False  # control has sent something
         self._requests: dict[str, _Request] = {}
+        self._failed_openings: set[str] = set()  # requests that control may still fulfill
         self._refused_s = math.inf  # when control started to reject this key
         self._is_diagnosing = False  # searching for the reason why control does not answer
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
@@ -197,6 +198,8 @@ class ClientCore:
             is_unanswerable = self._is_late(request) and reason == NO_LISTENER
             if self._sockets.now_s > request.end_s or is_unanswerable:
                 self._requests.pop(name).answer.set_exception(failure)
+                if kind_of(request.parts) == "open-session":
+                    self._failed_openings.add(name)
             request.is_checked = self._sockets.now_s > request.start_s
         if self._is_refused():
             for session in self.sessions:
@@ -267,11 +270,19 @@ class ClientCore:
             for request in self._requests.values():
                 request.answer.set_exception(refused(fields))
             self._requests.clear()
-        elif pending := self._requests.pop(str(fields.get("request")), None):
+        else:
+            self._on_answer(str(fields.get("request")), kind, fields)
+
+    def _on_answer(self, name: str, kind: str, fields: Fields) -> None:
+        if pending := self._requests.pop(name, None):
             if kind == "error":
                 pending.answer.set_exception(refused(fields))
             else:
                 pending.answer.set_result(fields)
+        elif name in self._failed_openings:
+            self._failed_openings.remove(name)
+            if kind == "session-opened":  # nobody would use or close it
+                self.request("close-session", fields["session"], token=fields["token"])
 
     def _on_event(self, parts: list[bytes]) -> None:
         if kind_of(parts) == "session-moved" and (message := decode(parts)) is not None:
