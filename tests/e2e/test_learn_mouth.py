@@ -69,9 +69,9 @@ def set_min_rate(browser: Browser, rate_hz: float) -> None:
     browser.evaluate(f"{module}.then((it) => {{ it.FaceRecording.minRateHz = {rate_hz} }})")
 
 
-def start_lesson(browser: Browser) -> None:
+def start_recording(browser: Browser) -> None:
     browser.click("learn")
-    browser.click("lesson-start")
+    browser.click("learn-start")
 
 
 def read_aloud(browser: Browser) -> None:
@@ -82,8 +82,8 @@ def read_aloud(browser: Browser) -> None:
         " window.createImageBitmap = (...args) => { numImages += 1; return takeImage(...args); }; 0"
     )
     browser.evaluate("window.kouxing.readingS = 600")
-    start_lesson(browser)
-    is_due = "document.getElementById('lesson-reading').classList.contains('due')"
+    start_recording(browser)
+    is_due = "document.getElementById('learn-reading').classList.contains('due')"
     browser.wait_for(f"{is_due} && window.numImages > 80", 180)
     browser.evaluate("window.kouxing.readingS = 0.001")
     browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
@@ -114,12 +114,12 @@ def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
         " { ...options, body: (window.recording = window.longer ?? options.body) });"
     )
     read_aloud(browser)
-    assert "of speech show the lips; film 10 s or more" in text_of(browser, "lesson-problem")
+    assert "of speech show the lips; film 10 s or more" in text_of(browser, "learn-problem")
     browser.evaluate(
         "window.send = fetch; window.fetch = async () => { throw new Error('offline') }"
     )
-    browser.click("lesson-resend")
-    browser.wait_for("document.getElementById('lesson-problem').innerText.includes('not answer')")
+    browser.click("learn-resend")
+    browser.wait_for("document.getElementById('learn-problem').innerText.includes('not answer')")
     browser.evaluate("fetch = send")  # the recording is kept
 
     recording = browser.evaluate(
@@ -128,16 +128,16 @@ def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
     )
     content = base64.b64encode(lengthen(recording.encode("latin-1"))).decode()
     browser.evaluate(f"window.longer = Uint8Array.from(atob('{content}'), (c) => c.charCodeAt(0))")
-    browser.click("lesson-resend")
+    browser.click("learn-resend")
     browser.wait_for("window.kouxing.state.lesson === 'result'", 180)
-    assert "more closely" in text_of(browser, "lesson-verdict")
-    assert "Opening" in text_of(browser, "lesson-figures")
+    assert "more closely" in text_of(browser, "learn-verdict")
+    assert "Opening" in text_of(browser, "learn-figures")
     for curve in ("tracked", "before", "after"):
-        path = f"document.getElementById('lesson-{curve}')"
+        path = f"document.getElementById('learn-{curve}')"
         assert browser.evaluate(f"{path}.getTotalLength()") > 100, curve
 
     assert browser.evaluate("window.kouxing.state.mouthProfile") == ""
-    browser.click("lesson-keep")
+    browser.click("learn-keep")
     browser.open(browser.evaluate("location.href"))
     browser.wait_for("window.kouxing.state.mouthProfile !== ''")
     profile = base64.b64decode(browser.evaluate("window.kouxing.state.mouthProfile"))
@@ -153,8 +153,8 @@ def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
     browser.wait_for("!window.kouxing.state.microphone")
 
     browser.click("learn")
-    assert "opening" in text_of(browser, "lesson-profile")
-    browser.click("lesson-forget")
+    assert "opening" in text_of(browser, "learn-profile")
+    browser.click("learn-forget")
     assert browser.evaluate("window.kouxing.state.mouthProfile + localStorage.length") == "0"
     wrong = [text for text in browser.page_errors if '"error"' in text or "exception" in text]
     assert ["learn-mouth" in text for text in wrong] == [True]  # the refusal
@@ -163,16 +163,16 @@ def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
 def test_a_slow_computer_is_reported_before_reading(browser: Browser) -> None:
     set_min_rate(browser, 1000)
     browser.evaluate("window.kouxing.readingS = 600")
-    start_lesson(browser)
+    start_recording(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'")
-    assert "too slow to track your face" in text_of(browser, "lesson-problem")
+    assert "too slow to track your face" in text_of(browser, "learn-problem")
     browser.click("learn-mouth [data-step=problem] .close")
 
 
 def test_a_slow_start_is_explained_from_the_first_moment(browser: Browser) -> None:
     browser.evaluate("void (document.body.append = () => {})")  # the tracker never loads
-    start_lesson(browser)
-    assert "On a slow computer" in text_of(browser, "lesson-advice")
+    start_recording(browser)
+    assert "On a slow computer" in text_of(browser, "learn-advice")
     browser.click("learn-mouth [data-step=reading] .close")
     browser.evaluate("delete document.body.append")
 
@@ -188,9 +188,9 @@ def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
     )
     set_min_rate(browser, 0)
     browser.evaluate("window.kouxing.readingS = 2")
-    start_lesson(browser)
+    start_recording(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'", 180)
-    problem, found = text_of(browser, "lesson-problem"), browser.evaluate("found")
+    problem, found = text_of(browser, "learn-problem"), browser.evaluate("found")
     browser.evaluate(
         "import('/face-tracker.js').then(({ FaceTracker }) => {"
         " FaceTracker.prototype.find = window.find; })"
@@ -213,9 +213,9 @@ def test_the_page_reports_a_missing_camera(browser: Browser) -> None:
         "navigator.mediaDevices.getUserMedia ="
         " () => Promise.reject(new DOMException('none', 'NotFoundError'))"
     )
-    start_lesson(browser)
+    start_recording(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'")
-    assert "No camera" in text_of(browser, "lesson-problem")
+    assert "No camera" in text_of(browser, "learn-problem")
     browser.evaluate("document.getElementById('learn-mouth').close()")
 
 
@@ -223,5 +223,5 @@ def test_the_page_explains_that_cameras_need_https(browser: Browser) -> None:
     browser.evaluate("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
     browser.click("learn")
     browser.wait_for("window.kouxing.state.lesson === 'intro'")
-    assert "https" in text_of(browser, "lesson-insecure")
-    browser.wait_for("document.getElementById('lesson-start').disabled")
+    assert "https" in text_of(browser, "learn-insecure")
+    browser.wait_for("document.getElementById('learn-start').disabled")

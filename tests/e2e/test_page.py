@@ -208,10 +208,10 @@ def test_reports_a_face_that_is_behind_and_draws_fewer_pictures(
     control.look_ahead_ms = LOOK_AHEAD_MS + 2010
     status = "document.getElementById('status').textContent"
     page.wait_for(f"/behind: this computer is busy +\\d\\.\\d s/.test({status})")
-    page.evaluate("document.getElementById('fewer-pictures').click()")
-    page.wait_for("!document.getElementById('all-pictures').hidden")
-    page.evaluate("document.getElementById('all-pictures').click()")
-    page.wait_for("document.getElementById('all-pictures').hidden")
+    page.evaluate("document.getElementById('lower-frame-rate').click()")
+    page.wait_for("!document.getElementById('restore-frame-rate').hidden")
+    page.evaluate("document.getElementById('restore-frame-rate').click()")
+    page.wait_for("document.getElementById('restore-frame-rate').hidden")
     control.look_ahead_ms = LOOK_AHEAD_MS
 
 

@@ -110,7 +110,7 @@ def test_a_screen_reader_finds_names(browser: Browser, gateway: Gateway) -> None
         ".filter((item) => item.getAttribute('aria-live') !== 'off').map((item) => item.id)"
     )
     announced = ["turned", "state", "notice", "behind", "send-problem"]
-    announced += ["lesson-advice", "lesson-learning", "lesson-problem"]
+    announced += ["learn-advice", "learn-progress", "learn-problem"]
     assert live == announced
 
 

@@ -26,7 +26,7 @@ const CAMERA_ERRORS = {
 
 const dialog = element("learn-mouth");
 
-export class MouthLesson {
+export class LearnMouthDialog {
   readingS = 40;
   #profiles;
   #handlers;
@@ -41,12 +41,12 @@ export class MouthLesson {
     this.#profiles = profiles;
     this.#handlers = handlers;
     for (const [id, onClick] of Object.entries({
-      "lesson-start": () => this.#record(),
-      "lesson-finish": () => this.#finish(),
-      "lesson-resend": () => this.#learn(),
-      "lesson-again": () => this.#record(),
-      "lesson-keep": () => this.#keep(this.#learned),
-      "lesson-forget": () => this.#keep(null),
+      "learn-start": () => this.#record(),
+      "learn-finish": () => this.#finish(),
+      "learn-resend": () => this.#learn(),
+      "learn-again": () => this.#record(),
+      "learn-keep": () => this.#keep(this.#learned),
+      "learn-forget": () => this.#keep(null),
     })) {
       element(id).onclick = onClick;
     }
@@ -65,19 +65,19 @@ export class MouthLesson {
   open() {
     this.#recording = this.#learned = null;
     const { lang } = document.documentElement;
-    element("lesson-text").value = lang;
+    element("learn-text").value = lang;
     const { current } = this.#profiles;
-    element("lesson-profile").hidden = current === null;
+    element("learn-profile").hidden = current === null;
     if (current !== null) {
       const [, before, after] = correlationRows(current)[0];
       const day = new Date(current.learnedOn).toLocaleDateString(lang);
-      element("lesson-profile").firstElementChild.textContent =
-        translate("lessonLearned", { day, before, after });
+      element("learn-profile").firstElementChild.textContent =
+        translate("learnedOn", { day, before, after });
     }
     const isSecure = navigator.mediaDevices !== undefined;
-    element("lesson-start").disabled = !isSecure;
-    element("lesson-insecure").hidden = isSecure;
-    element("lesson-insecure").textContent = translate("cameraInsecure");
+    element("learn-start").disabled = !isSecure;
+    element("learn-insecure").hidden = isSecure;
+    element("learn-insecure").textContent = translate("cameraInsecure");
     this.#show("intro");
     dialog.showModal();
     this.#handlers.opened();
@@ -89,8 +89,8 @@ export class MouthLesson {
   }
 
   #fail(text) {
-    element("lesson-problem").textContent = text;
-    element("lesson-resend").hidden = this.#recording === null;
+    element("learn-problem").textContent = text;
+    element("learn-resend").hidden = this.#recording === null;
     this.#show("problem");
   }
 
@@ -128,7 +128,7 @@ export class MouthLesson {
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
         video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 } },
       });
-      const video = element("lesson-video");
+      const video = element("learn-video");
       video.srcObject = stream;
       [context] = await Promise.all([openCaptureContext(), tracker.load(), video.play()]);
       signal.throwIfAborted();
@@ -149,14 +149,14 @@ export class MouthLesson {
   #prepare() {
     this.#recording = null;
     this.#numSlow = 0;
-    const language = element("lesson-text").value;
-    element("lesson-reading").lang = language;
-    element("lesson-reading").textContent = READING_TEXTS[language];
-    element("lesson-reading").classList.remove("due");
-    element("lesson-finish").disabled = true;
-    element("lesson-time").value = 0;
-    element("lesson-count").textContent = "";
-    element("lesson-advice").textContent = translate("lessonStarting");
+    const language = element("learn-text").value;
+    element("learn-reading").lang = language;
+    element("learn-reading").textContent = READING_TEXTS[language];
+    element("learn-reading").classList.remove("due");
+    element("learn-finish").disabled = true;
+    element("learn-time").value = 0;
+    element("learn-count").textContent = "";
+    element("learn-advice").textContent = translate("learnStarting");
     this.#show("reading");
   }
 
@@ -218,7 +218,7 @@ export class MouthLesson {
     for (const [index, { takenMs, image }] of images.entries()) {
       if (signal.aborted) return;
       const percent = Math.floor((100 * index) / images.length);
-      element("lesson-learning").textContent = translate("lessonTracking", { percent });
+      element("learn-progress").textContent = translate("learnTracking", { percent });
       recording.addFace(takenMs, await tracker.find(image));
     }
   }
@@ -226,18 +226,18 @@ export class MouthLesson {
   #showTime(startMs, recording) {
     const nowMs = performance.now();
     if (startMs === null) {
-      element("lesson-advice").textContent = translate("lessonShowFace");
+      element("learn-advice").textContent = translate("learnShowFace");
       return;
     }
     const readingMs = nowMs - startMs - CLOSED_LIPS_MS;
     const totalMs = 1000 * this.readingS * (this.#isSlow ? SLOW_FACTOR : 1);
     const remainingS = Math.ceil((readingMs < 0 ? -readingMs : totalMs - readingMs) / 1000);
-    element("lesson-count").textContent = remainingS;
-    element("lesson-time").value = Math.max(0, readingMs / totalMs);
-    element("lesson-reading").classList.toggle("due", readingMs >= 0);
-    element("lesson-finish").disabled = readingMs < MIN_READING * totalMs;
-    const advice = recording.advice(nowMs) ?? (readingMs < 0 ? "lessonLipsClosed" : "lessonRead");
-    element("lesson-advice").textContent = translate(advice);
+    element("learn-count").textContent = remainingS;
+    element("learn-time").value = Math.max(0, readingMs / totalMs);
+    element("learn-reading").classList.toggle("due", readingMs >= 0);
+    element("learn-finish").disabled = readingMs < MIN_READING * totalMs;
+    const advice = recording.advice(nowMs) ?? (readingMs < 0 ? "learnLipsClosed" : "learnRead");
+    element("learn-advice").textContent = translate(advice);
     if (remainingS <= 0) this.#finish();
   }
 
@@ -246,7 +246,7 @@ export class MouthLesson {
   async #learn() {
     this.#abort = new AbortController();
     const { signal } = this.#abort;
-    element("lesson-learning").textContent = translate("lessonLearning");
+    element("learn-progress").textContent = translate("learnProgress");
     this.#show("learning");
     let answer;
     try {
@@ -268,17 +268,17 @@ export class MouthLesson {
   }
 
   #showResult({ before, after, curves }) {
-    element("lesson-verdict").textContent = translate(verdict({ before, after }));
+    element("learn-verdict").textContent = translate(verdict({ before, after }));
     const rows = correlationRows({ before, after }).map((cells) => {
       const row = document.createElement("tr");
       row.append(...cells.map((text, index) => (index === 0 ? cell("th", translate(text)) : cell("td", text))));
       return row;
     });
-    element("lesson-figures").replaceChildren(...rows);
+    element("learn-figures").replaceChildren(...rows);
     const box = { ...BOX, ...extent(...CURVES.map((name) => curves.opening[name])) };
     for (const name of CURVES) {
       const path = curvePath(curves.time_s, curves.opening[name], box);
-      element(`lesson-${name}`).setAttribute("d", path);
+      element(`learn-${name}`).setAttribute("d", path);
     }
     this.#show("result");
   }
@@ -308,7 +308,7 @@ function errorText(error) {
 }
 
 function drawLips(video, lips, landmarks) {
-  const canvas = element("lesson-lips");
+  const canvas = element("learn-lips");
   canvas.width = video.videoWidth; // this also clears it
   canvas.height = video.videoHeight;
   if (landmarks === null) return;

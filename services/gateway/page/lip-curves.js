@@ -40,8 +40,8 @@ function correlationText(correlation) {
 /** Return the key of the text that summarizes the result. */
 export function verdict({ before, after }) {
   const gain = mean(after) - mean(before);
-  if (mean(after) < MIN_CORRELATION || gain < -MIN_GAIN) return "lessonWorse";
-  return gain > MIN_GAIN ? "lessonBetter" : "lessonSame";
+  if (mean(after) < MIN_CORRELATION || gain < -MIN_GAIN) return "resultWorse";
+  return gain > MIN_GAIN ? "resultBetter" : "resultSame";
 }
 
 function mean(correlations) {

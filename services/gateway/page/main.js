@@ -4,7 +4,7 @@ import { socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
 import { translate, translateError } from "./language.js";
-import { MouthLesson } from "./learn-mouth.js";
+import { LearnMouthDialog } from "./learn-mouth.js";
 import { LevelMeter } from "./level.js";
 import { Player } from "./player.js";
 import { SendersPanel } from "./senders-panel.js";
@@ -43,9 +43,9 @@ const speech = new SpeechControls(sound, {
   fileStarted: () => notice.clear(), // an error about the file before it
   fileEnded(file) {
     const isShown = gateway.session !== null && gateway.session === speech.session;
-    if (isShown && !caption.hasSpeech) showNews(translate("noSpeech", { file }));
+    if (isShown && !caption.hasSpeech) showToast(translate("noSpeech", { file }));
   },
-  news: showNews,
+  toast: showToast,
   session(name) {
     if (name !== null) {
       showLipModel();
@@ -60,11 +60,11 @@ const player = new Player(sound, (nowMs, mediaTime) =>
 const stage = new Stage(player.faps, sound, {
   loaded: () => player.playout.reset(),
   failed: (text) => showError({ text }),
-  news: showNews,
+  toast: showToast,
 });
 const senders = new SendersPanel(element("settings"));
 const statusBar = new StatusBar({ gateway, player, speech, sound, notice, senders });
-const lesson = new MouthLesson(mouthProfiles, {
+const learnMouth = new LearnMouthDialog(mouthProfiles, {
   opened: () => speech.pause(),
   closed: () => {
     speech.resume();
@@ -115,7 +115,7 @@ function handleMessage(message) {
 
 function showSession(message) {
   const { isOther, isRestart } = gateway.setSession(message);
-  if (isRestart) showNews(translate("serviceRestarted"));
+  if (isRestart) showToast(translate("serviceRestarted"));
   if (isOther) statusBar.reset();
   if (gateway.session !== null) {
     // A session that has ended stays visible and audible to its end.
@@ -128,12 +128,12 @@ function showSession(message) {
   statusBar.show();
 }
 
-function showNews(text) {
-  notice.showNews(text, "hint");
+function showToast(text) {
+  notice.showToast(text, "hint");
 }
 
 function showError(error) {
-  notice.showNews(translateError(error), "error");
+  notice.showToast(translateError(error), "error");
 }
 
 /** Whether the session that is shown is the microphone's, or the sample that this page asked for. */
@@ -172,8 +172,8 @@ let statusMs = 0; // when the status was shown last
 let nextDraw = 0; // id of the requested call
 
 function draw(nowMs) {
-  // During a lesson the machine is needed to find the user's face.
-  if (lesson.step !== "closed") return;
+  // While the user's mouth is being learned, the machine is needed to find their face.
+  if (learnMouth.step !== "closed") return;
   nextDraw = requestAnimationFrame(draw);
   const { mediaTime, frameTime, hasChanged } = player.update(nowMs, stage.visibleDelayMs);
   const shown = { mediaTime: frameTime, faps: player.faps.slice() };
@@ -198,7 +198,7 @@ function draw(nowMs) {
 window.kouxing = {
   onImage: null, // called for each image that becomes visible
   set readingS(seconds) {
-    lesson.readingS = seconds;
+    learnMouth.readingS = seconds;
   },
   get state() {
     return {
@@ -223,7 +223,7 @@ window.kouxing = {
       mouthProfile: mouthProfiles.current?.profile ?? "",
       drawing: stage.drawing,
       recording: stage.isRecording,
-      lesson: lesson.step,
+      lesson: learnMouth.step,
     };
   },
 };
@@ -233,7 +233,7 @@ element("sample").onclick = () => {
   socket.send(name === null ? { play: "sample" } : { play: "sample", lip_model: name });
   speech.unblockSound();
 };
-element("learn").onclick = () => lesson.open();
+element("learn").onclick = () => learnMouth.open();
 element("light-model").onclick = () => chooseAcousticModel("light");
 element("full-model").onclick = () => chooseAcousticModel("full");
 document.body.dataset.view = query.get("view") ?? "";

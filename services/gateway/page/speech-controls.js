@@ -10,12 +10,12 @@ export class SpeechControls {
   session = null;
   #sound;
   #handlers;
-  #wasSoundWanted = false; // before the microphone or a lesson muted the sound
+  #wasSoundWanted = false; // before the microphone or Learn my mouth muted the sound
 
   /**
    * @param {Sound} sound the session's sound
    * @param handlers { mouthProfile(), language(), lipModel(), level(rms), fileEnded(name), error({ code, text }): as
-   *   of Microphone, fileStarted(), news(text), session(name): the microphone's session, null when it ends }
+   *   of Microphone, fileStarted(), toast(text), session(name): the microphone's session, null when it ends }
    */
   constructor(sound, handlers) {
     this.#sound = sound;
@@ -56,7 +56,7 @@ export class SpeechControls {
     this.microphone.start();
   }
 
-  /** Stop the microphone and mute the sound, for a lesson. */
+  /** Stop the microphone and mute the sound, for Learn my mouth. */
   pause() {
     this.microphone.stop();
     this.#mute();

@@ -65,15 +65,15 @@ export class Stage {
   /**
    * @param faps 68 values that are updated before each call of draw
    * @param {Sound} sound for videos
-   * @param handlers { loaded(), failed(text), news(text) }
+   * @param handlers { loaded(), failed(text), toast(text) }
    */
   constructor(faps, sound, handlers) {
     this.#faps = faps;
     this.#sound = sound;
     this.#handlers = handlers;
     element("record").onclick = () => this.#toggleRecording();
-    element("fewer-pictures").onclick = () => this.#changeDrawRate((drawRate) => drawRate.halve());
-    element("all-pictures").onclick = () => this.#changeDrawRate((drawRate) => drawRate.restore());
+    element("lower-frame-rate").onclick = () => this.#changeDrawRate((drawRate) => drawRate.halve());
+    element("restore-frame-rate").onclick = () => this.#changeDrawRate((drawRate) => drawRate.restore());
     element("head").onkeydown = (event) => {
       if (this.#head === null || TURN_DEGREES[event.key] === undefined) return;
       event.preventDefault();
@@ -114,8 +114,8 @@ export class Stage {
   /** Show a quality below the full one, and the buttons that change the image rate. */
   showDrawing() {
     if (this.#head === null) return;
-    element("fewer-pictures").hidden = !this.#head.drawRate.canHalve;
-    element("all-pictures").hidden = !this.#head.drawRate.isReduced;
+    element("lower-frame-rate").hidden = !this.#head.drawRate.canHalve;
+    element("restore-frame-rate").hidden = !this.#head.drawRate.isReduced;
     const text = drawingText(this.#head.drawing);
     element("head").title = text;
     setText(element("drawing"), text);
@@ -150,7 +150,7 @@ export class Stage {
       this.#head.film(BACKGROUND);
       this.#recorder.start(element("head"), await this.#sound.tap(), (video) => {
         const file = save(video);
-        this.#handlers.news(translate(file.endsWith(".mp4") ? "videoSaved" : "webmSaved", { file }));
+        this.#handlers.toast(translate(file.endsWith(".mp4") ? "videoSaved" : "webmSaved", { file }));
       });
     }
     element("record").setAttribute("aria-pressed", this.#recorder.isRecording);

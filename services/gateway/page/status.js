@@ -5,7 +5,7 @@ import { element, setText } from "./elements.js";
 import { translate } from "./language.js";
 import { SILENT_DB } from "./level.js";
 
-const NEWS_MS = 8000; // for which news is shown
+const TOAST_MS = 8000; // for which a toast is shown
 const SHOWN_AFTER_MS = 1000; // shorter faults are not shown
 
 /** The state that the gateway reports: the connection, the session that is shown, missing services. */
@@ -183,8 +183,8 @@ export class StatusBar {
     const fault = this.#fault.update(nowMs, hintText(gateway));
     const pause = isMicrophoneInterrupted ? translate("microphoneInterrupted") : "";
     const microphone = this.#microphoneFault.update(nowMs, pause);
-    if (fault.isOver) notice.showNews(translate("recovered"), "hint");
-    if (microphone.isOver && speech.state === "on") notice.showNews(translate("microphoneResumed"), "hint");
+    if (fault.isOver) notice.showToast(translate("recovered"), "hint");
+    if (microphone.isOver && speech.state === "on") notice.showToast(translate("microphoneResumed"), "hint");
     notice.showHint(fault.hint || microphone.hint);
   }
 }
@@ -196,27 +196,27 @@ export function showLevel(decibels) {
   element("meter").setAttribute("aria-valuenow", Math.round(decibels));
 }
 
-/** The notice at the top: recent news and errors, else a hint about a lasting problem. */
+/** The notice at the top: for some seconds a toast, otherwise a hint about a lasting problem. */
 export class Notice {
-  #newsTimer = null;
+  #toastTimer = null;
 
-  /** Show an "error", or news as a "hint", for some seconds. */
-  showNews(text, kind) {
-    clearTimeout(this.#newsTimer);
-    this.#newsTimer = setTimeout(() => (this.#newsTimer = null), NEWS_MS);
+  /** Show a toast, in the color of an "error" or a "hint". */
+  showToast(text, kind) {
+    clearTimeout(this.#toastTimer);
+    this.#toastTimer = setTimeout(() => (this.#toastTimer = null), TOAST_MS);
     showNotice(text, kind);
   }
 
-  /** Remove news and errors. */
+  /** Remove the toast. */
   clear() {
-    clearTimeout(this.#newsTimer);
-    this.#newsTimer = null;
+    clearTimeout(this.#toastTimer);
+    this.#toastTimer = null;
     this.showHint("");
   }
 
-  /** Show a hint unless news is shown; "" shows no hint. */
+  /** Show a hint unless a toast is shown; "" shows no hint. */
   showHint(text) {
-    if (this.#newsTimer === null) showNotice(text, "hint");
+    if (this.#toastTimer === null) showNotice(text, "hint");
   }
 }
 

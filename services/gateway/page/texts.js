@@ -47,7 +47,7 @@ export const TEXTS = {
     en: "Close other programs, and other windows that show this page.",
     zh: "请关闭其他程序，以及显示本页的其他窗口。",
   },
-  fewerPictures: { en: "Lower the frame rate", zh: "降低帧率" },
+  lowerFrameRate: { en: "Lower the frame rate", zh: "降低帧率" },
   useLightModel: { en: "Use the light model", zh: "使用轻量模型" },
   gatewayStopped: {
     en: "The gateway has stopped. Start it with “kouxing run”; this page reconnects by itself.",
@@ -111,7 +111,7 @@ export const TEXTS = {
     en: "No graphics card was found, so the head is drawn with fewer triangles and pixels: {size}",
     zh: "没有找到显卡，因此用较少的三角形和像素绘制头像：{size}",
   },
-  allPictures: { en: "Restore the full frame rate", zh: "恢复完整帧率" },
+  restoreFrameRate: { en: "Restore the full frame rate", zh: "恢复完整帧率" },
   lightModel: { en: "light model", zh: "轻量模型" },
   useFullModel: { en: "Use the full model", zh: "使用完整模型" },
   lips: { en: "Lips", zh: "口型" },
@@ -160,37 +160,37 @@ export const TEXTS = {
   "expression.disgust": { en: "disgust", zh: "厌恶" },
 
   // Learn my mouth
-  lessonIntro: {
+  learnIntro: {
     en: "Read a text aloud in front of your camera for 40 seconds. From then on, when you use the microphone, the head moves its lips as you do.",
     zh: "对着摄像头朗读一段文字 40 秒。之后你用麦克风时，头像就会像你一样动嘴唇。",
   },
-  lessonPrivacy: {
+  learnPrivacy: {
     en: "No camera image leaves this browser. The gateway receives your voice and the positions of 43 points on your face, and deletes both after learning.",
     zh: "摄像头的图像不会离开浏览器。网关只收到你的声音和脸上 43 个点的位置，学完即删除。",
   },
-  lessonLearned: {
+  learnedOn: {
     en: "Your mouth was learned on {day}. Similarity of the opening: {before} → {after}.",
     zh: "{day} 学会了你的口型。张口幅度的相似度：{before} → {after}。",
   },
-  lessonForget: { en: "Forget it", zh: "删除" },
-  lessonText: { en: "Text", zh: "文本" },
+  learnForget: { en: "Forget it", zh: "删除" },
+  learnText: { en: "Text", zh: "文本" },
   close: { en: "Close", zh: "关闭" },
   cancel: { en: "Cancel", zh: "取消" },
   secondsLeft: { en: "seconds left", zh: "剩余秒数" },
   time: { en: "time", zh: "时间" },
-  lessonFinish: { en: "I'm done reading", zh: "读完了" },
-  lessonLearning: { en: "Learning your mouth. This takes a few seconds …", zh: "正在学习你的口型，需要几秒钟…" },
-  lessonTracking: {
+  learnFinish: { en: "I'm done reading", zh: "读完了" },
+  learnProgress: { en: "Learning your mouth. This takes a few seconds …", zh: "正在学习你的口型，需要几秒钟…" },
+  learnTracking: {
     en: "You can stop reading. This computer is slow, so it is analyzing the recorded images now: {percent} %.",
     zh: "可以停止朗读了。这台电脑较慢，正在查找画面中的嘴唇：{percent} %。",
   },
   learning: { en: "learning", zh: "学习中" },
-  lessonCurves: { en: "lip opening over time", zh: "张口幅度随时间的变化" },
+  resultCurves: { en: "lip opening over time", zh: "张口幅度随时间的变化" },
   yourLips: { en: "your lips", zh: "你的嘴唇" },
   before: { en: "before", zh: "之前" },
   after: { en: "after", zh: "之后" },
-  lessonSimilarity: { en: "How closely the head's lips follow yours (1 = exactly)", zh: "与你的相似度（1 为完全一致）" },
-  lessonHeldOut: {
+  resultSimilarity: { en: "How closely the head's lips follow yours (1 = exactly)", zh: "与你的相似度（1 为完全一致）" },
+  resultHeldOut: {
     en: "Measured on the last quarter of your reading, which was not used for learning.",
     zh: "用朗读的最后四分之一测得，这部分没有用于学习。",
   },
@@ -198,19 +198,19 @@ export const TEXTS = {
   keep: { en: "Keep", zh: "保留" },
   recordAgain: { en: "Record again", zh: "重录" },
   sendAgain: { en: "Send again", zh: "重发" },
-  lessonStarting: {
+  learnStarting: {
     en: "Starting camera, microphone and face tracking. On a slow computer or connection, this takes up to a minute. Closing other programs helps.",
     zh: "正在启动摄像头、麦克风和面部跟踪。电脑或网络较慢时最多需要一分钟，可关闭其他程序。",
   },
-  lessonShowFace: { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" },
-  lessonLipsClosed: { en: "Keep your lips closed …", zh: "请先闭上嘴…" },
-  lessonRead: { en: "Read aloud. Repeat the text if there is time left.", zh: "请朗读，读完可重复。" },
+  learnShowFace: { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" },
+  learnLipsClosed: { en: "Keep your lips closed …", zh: "请先闭上嘴…" },
+  learnRead: { en: "Read aloud. Repeat the text if there is time left.", zh: "请朗读，读完可重复。" },
   "measure.opening": { en: "Opening", zh: "张口幅度" },
   "measure.width": { en: "Width", zh: "宽度" },
   "measure.jaw": { en: "Jaw", zh: "下颌" },
-  lessonBetter: { en: "The head's lips now follow yours more closely.", zh: "现在头像的口型更像你了。" },
-  lessonSame: { en: "The head's lips follow yours about as well as before.", zh: "头像的口型与你的相似程度和以前差不多。" },
-  lessonWorse: {
+  resultBetter: { en: "The head's lips now follow yours more closely.", zh: "现在头像的口型更像你了。" },
+  resultSame: { en: "The head's lips follow yours about as well as before.", zh: "头像的口型与你的相似程度和以前差不多。" },
+  resultWorse: {
     en: "The head's lips do not follow yours. Discard the result and try again, with light on your face and no other voices.",
     zh: "头像的口型不像你。请放弃结果，在脸部有光、没有其他人说话的地方再试。",
   },

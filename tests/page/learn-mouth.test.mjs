@@ -93,9 +93,9 @@ test("a verdict summarizes the correlations", () => {
     ["measure.width", "0.41", "0.41"],
     ["measure.jaw", "–", "–"],
   ]);
-  assert.equal(verdict(withOpening(0.6)), "lessonBetter");
-  assert.equal(verdict(withOpening(0.51)), "lessonSame");
-  assert.equal(verdict(withOpening(0.4)), "lessonWorse");
+  assert.equal(verdict(withOpening(0.6)), "resultBetter");
+  assert.equal(verdict(withOpening(0.51)), "resultSame");
+  assert.equal(verdict(withOpening(0.4)), "resultWorse");
   const poor = { opening: 0.1, width: 0.1, jaw: 0 };
-  assert.equal(verdict({ before: poor, after: { ...poor, opening: 0.3 } }), "lessonWorse");
+  assert.equal(verdict({ before: poor, after: { ...poor, opening: 0.3 } }), "resultWorse");
 });
