@@ -84,6 +84,8 @@ export interface SpeakerOptions {
   /** language of the speech: "auto", or a code such as "zh" or "de"; default: the recognizer's language */
   language?: string;
   token?: string;
+  /** called with each error, such as an unreadable mouth profile; the session may continue */
+  error?(error: Error): void;
   /** called when the session has ended; null: without an error */
   closed?(error: Error | null): void;
 }

@@ -5,6 +5,7 @@ import { checkWebSocket, socketUrl } from "./viewer.js";
 const MESSAGE_BYTES = 32000;
 const MAX_BUFFERED_BYTES = 1 << 18; // above it, push() waits
 const POLL_MS = 10;
+const REFUSED_CODE = 1008; // the last error has ended the session
 
 /** A session that this program feeds with audio. */
 export class Speaker {
@@ -14,16 +15,19 @@ export class Speaker {
   #closed; // a promise
 
   /** Use Speaker.open instead. */
-  constructor(socket, session, encoding, onClosed) {
+  constructor(socket, session, encoding, onError, onClosed) {
     this.#socket = socket;
     this.#encoding = encoding;
     this.session = session;
+    let lastError = null;
     socket.onmessage = ({ data }) => {
       const { type, text } = JSON.parse(data);
-      if (type === "error" || type === "closed") this.#failure = new Error(text);
+      if (type === "closed") this.#failure = new Error(text);
+      if (type === "error") onError((lastError = new Error(text)));
     };
     this.#closed = new Promise((resolve) => {
-      socket.onclose = () => {
+      socket.onclose = ({ code }) => {
+        if (code === REFUSED_CODE) this.#failure = lastError;
         onClosed(this.#failure);
         resolve();
       };
@@ -35,13 +39,14 @@ export class Speaker {
    *
    * @param gateway address of the gateway
    * @param options { sampleRateHz, numChannels, encoding: "s16le" or "f32le", ahead: whether audio may
-   *   come faster than real time, mouthProfile: in base64, language, token, closed: called with an
-   *   error or null when the session has ended }
+   *   come faster than real time, mouthProfile: in base64, language, token, error: called with each
+   *   error, after which the session may continue, closed: called with an error or null when the
+   *   session has ended }
    * @returns a promise of a Speaker; it is rejected if the gateway is not running or refuses the session
    */
   static async open(gateway, options = {}) {
     const { sampleRateHz = 16000, numChannels = 1, encoding = "s16le", token = "" } = options;
-    const { ahead = false, mouthProfile, language, closed = () => {} } = options;
+    const { ahead = false, mouthProfile, language, error = () => {}, closed = () => {} } = options;
     const format = { sample_rate_hz: sampleRateHz, num_channels: numChannels, encoding };
     checkWebSocket();
     const socket = new WebSocket(socketUrl(gateway, "/microphone", { token }));
@@ -49,7 +54,7 @@ export class Speaker {
       socket.onopen = () => socket.send(JSON.stringify({ ...format, ahead, mouth_profile: mouthProfile, language }));
       socket.onmessage = ({ data }) => {
         const { type, session, text } = JSON.parse(data);
-        if (type === "opened") resolve(new Speaker(socket, session, encoding, closed));
+        if (type === "opened") resolve(new Speaker(socket, session, encoding, error, closed));
         else reject(new Error(text));
       };
       // Node 22 reports a failed connection only as an error.

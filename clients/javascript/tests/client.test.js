@@ -58,6 +58,45 @@ test("a refused session is rejected with the reason", async () => {
   await assert.rejects(Speaker.open("http://127.0.0.1:1"), /no gateway at .*kouxing run/);
 });
 
+test("a session continues after an error, unless the gateway closes the connection", async () => {
+  const { WebSocket } = globalThis;
+  let socket = null;
+  globalThis.WebSocket = class {
+    static OPEN = 1;
+    readyState = 1;
+    bufferedAmount = 0;
+    sent = [];
+    constructor() {
+      socket = this;
+    }
+    send(data) {
+      this.sent.push(data);
+    }
+    receive(message) {
+      this.onmessage({ data: JSON.stringify(message) });
+    }
+  };
+  try {
+    const texts = [];
+    const opening = Speaker.open(GATEWAY, {
+      error: ({ message }) => texts.push(message),
+      closed: ({ message }) => texts.push(`closed: ${message}`),
+    });
+    socket.receive({ type: "opened", session: "voice" });
+    const speaker = await opening;
+    socket.receive({ type: "error", code: "bad-mouth-profile", text: "unreadable" });
+    await speaker.push(new Int16Array(4));
+    assert.equal(socket.sent.length, 1);
+    socket.receive({ type: "error", code: "refused", text: "this is JSON" });
+    socket.readyState = 3;
+    socket.onclose({ code: 1008 });
+    await assert.rejects(speaker.push(new Int16Array(4)), /this is JSON/);
+    assert.deepEqual(texts, ["unreadable", "this is JSON", "closed: this is JSON"]);
+  } finally {
+    globalThis.WebSocket = WebSocket;
+  }
+});
+
 test("older versions of Node get an error", async () => {
   const { WebSocket } = globalThis;
   try {
