@@ -41,12 +41,13 @@ class AudioInput:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Forward queued audio while the context is open."""
+        """Forward queued audio while the context is open, then drop the rest."""
         task = asyncio.create_task(self._queue.run())
         try:
             yield
         finally:
             task.cancel()
+            self._queue.clear()
 
     async def push(self, pcm: bytes) -> None:
         """Forward the audio of a binary message of any length; return when more may be read.

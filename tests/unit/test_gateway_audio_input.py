@@ -137,6 +137,19 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
     run(speak())
 
 
+def test_no_task_waits_for_audio_that_a_disconnected_client_left() -> None:
+    async def speak() -> None:
+        audio_input = AudioInput(FakeSession(), PCM16, is_ahead=True)  # type: ignore[arg-type]
+        async with audio_input.running():
+            await audio_input.push(bytes(32000))
+            await audio_input.end()
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(1.0)
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    run(speak())
+
+
 def test_the_rate_limit_allows_a_burst_and_then_real_time() -> None:
     async def flood() -> None:
         limit = RealTimeLimit()
