@@ -20,7 +20,8 @@ class SessionService(Service):
     def start_session(self, start: StartSession) -> bool:
         """Serve a session. Return False if ``session_started`` is called later.
 
-        Raises ``Rejected`` if this service cannot serve the session; control then rejects it.
+        Raises ``Rejected`` if this service cannot serve the session, or ``UserError`` if it cannot
+        load the models of the session's language. Control then rejects the session.
         """
         return True
 
@@ -72,15 +73,19 @@ class SessionService(Service):
                 self.session_started(start)
         except Rejected as rejection:
             LOG.info(rejection.text, extra={"session": start.session})
-            self.send_to_control(
-                Error(
-                    session=start.session,
-                    request=start.request,
-                    code=rejection.code,
-                    text=rejection.text,
-                    retry_after_s=rejection.retry_after_s,
-                )
-            )
+            self._reject(start, rejection)
         except UserError as error:
             self.warn("start", str(error), start.session)
-            self.publish_event(EventName.ERROR, start.session, f"{ErrorCode.TIMEOUT}: {error}")
+            self.publish_event(EventName.ERROR, start.session, f"{ErrorCode.BAD_LANGUAGE}: {error}")
+            self._reject(start, Rejected(ErrorCode.BAD_LANGUAGE, str(error)))
+
+    def _reject(self, start: StartSession, rejection: Rejected) -> None:
+        self.send_to_control(
+            Error(
+                session=start.session,
+                request=start.request,
+                code=rejection.code,
+                text=rejection.text,
+                retry_after_s=rejection.retry_after_s,
+            )
+        )

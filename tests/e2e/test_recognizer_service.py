@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 from kouxing_client.field_types import MAX_AUDIO_BYTES
-from kouxing_client.messages import SessionFacts
+from kouxing_client.messages import Message, SessionFacts
 
 from kouxing.services.recognizer import pending_sessions
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -21,7 +21,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.session import AudioChunk
+from kouxing.shared.wire.session import AudioChunk, Error
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
 from tests.samples import with_opening
@@ -187,14 +187,20 @@ def test_other_sessions_continue_while_a_model_is_loaded(
     assert service._sessions["later"].stream.media_time > 0
 
 
-def test_reports_a_model_that_cannot_be_loaded(
+def test_a_session_is_rejected_if_its_model_cannot_be_loaded(
     service: Recognizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(language: str) -> AcousticModel:
         raise UserError(f"no model for {language}")
 
+    sent = list[Message]()
     monkeypatch.setattr(pending_sessions, "load_model_for_language", fail)
+    monkeypatch.setattr(service, "send_to_control", sent.append)
     service._on_start_session(replace(UNPACED, facts=SessionFacts(language="german")), Peer())
     wait_until(lambda: service.warned, step=lambda: service.step(0.01))
     assert service.warned == [("start", "no model for german")]
+    (error,) = sent
+    assert isinstance(error, Error)
+    assert (error.session, error.request) == (UNPACED.session, UNPACED.request)
+    assert (error.code, error.text) == ("bad-language", "no model for german")
     assert not service._sessions
