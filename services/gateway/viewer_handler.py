@@ -219,6 +219,7 @@ class ViewerHandler:
 
     def _execute(self, viewer: Viewer, command: ViewerCommand) -> None:
         lip_model = command.face.lip_model if command.face is not None else None
+        _check_single(command, lip_model)
         if command.play is not None:
             self._sample.play(lip_model or "", self._on_sample_end)
             viewer.chosen_session = self._sample.session
@@ -303,6 +304,21 @@ class ViewerHandler:
 
     def _status(self) -> str:
         return browser_messages.text("status", missing=self._missing)
+
+
+def _check_single(command: ViewerCommand, lip_model: str | None) -> None:
+    """Raise ``UserError`` if a command has more than one effect."""
+    effects = (
+        command.follow is not None,
+        command.play is not None or lip_model is not None,
+        command.avatar is not None,
+        command.face not in (None, FaceSettings(lip_model=lip_model)),
+    )
+    if sum(effects) > 1:
+        raise UserError(
+            "follow, play (with lip_model), avatar and other settings of the face cannot be"
+            " combined; send a message for each"
+        )
 
 
 def _rest_due_s(viewer: Viewer) -> float:

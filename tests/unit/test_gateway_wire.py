@@ -241,6 +241,9 @@ def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
         ({"play": "song"}, "play must be sample"),
         ({"lip_model": ""}, "the message contains no command; send one of follow, play, avatar, "),
         ({}, "the message contains no command; send one of follow, play, avatar, "),
+        ({"follow": "a", "expressions": {"joy": 1}}, "follow, play (with lip_model), avatar and "),
+        ({"play": "sample", "lip_model": "learned", "feeling": 1}, "follow, play (with lip_mod"),
+        ({"lip_model": "learned", "expressiveness": 2}, "follow, play (with lip_model), avatar"),
     ],
 )
 def test_answers_commands_of_viewers_without_effect(command: dict[str, object], error: str) -> None:
