@@ -32,11 +32,14 @@ export class LipSync extends EventTarget {
   readonly current: LipFrame | null;
   /** Return the face at a time of the session, seconds; null before the first frame. */
   at(timeS: number): LipFrame | null;
-  /** Follow the microphone. Rejects with a message for the user if it cannot be opened. */
+  /**
+   * Follow the microphone. Rejects with a message for the user if it cannot be opened, and with an AbortError as
+   * listenTo().
+   */
   listenToMicrophone(constraints?: MediaTrackConstraints): Promise<void>;
   /**
    * Follow a source. AudioBuffers and media elements are also played, in sync with the face.
-   * Rejects with an AbortError if another source is opened first.
+   * Rejects with an AbortError if another source is chosen, or stop() or close() is called, while it opens.
    */
   listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;
   /** Start a session for push(). */

@@ -30,6 +30,7 @@ export class LipSync extends EventTarget {
   #session = 0; // number of the newest
   #track = new FrameTrack();
   #source = null; // { node, release() }
+  #choice = 0; // number of the newest choice of a source, or of none
   #startS = null; // start of the session on the context's clock; null before the first sound, and for push()
   #isPlayed = false; // whether the page plays the sound
   #pending = null; // the request that the worker has not answered: { answer, resolve, reject }
@@ -66,6 +67,7 @@ export class LipSync extends EventTarget {
   async listenToMicrophone(constraints = {}) {
     if (!navigator.mediaDevices) throw new Error(TEXTS.insecure);
     const audio = { channelCount: 1, echoCancellation: true, autoGainControl: true, ...constraints };
+    const choice = ++this.#choice;
     let stream;
     try {
       stream = await navigator.mediaDevices.getUserMedia({ audio });
@@ -73,23 +75,22 @@ export class LipSync extends EventTarget {
       throw new Error(TEXTS[error.name] ?? `the microphone cannot be opened: ${error.message}`, { cause: error });
     }
     const [track] = stream.getAudioTracks();
-    if (track.getSettings().sampleRate <= TELEPHONE_HZ) this.#report(TEXTS.telephone);
-    track.onended = () => {
-      this.stop();
-      this.#report(TEXTS.unplugged);
-    };
-    try {
-      await this.listenTo(stream);
-    } catch (error) {
-      track.stop();
-      throw error;
-    }
-    const { release } = this.#source;
-    this.#source.release = () => {
-      release();
+    const end = () => {
       track.onended = null;
       track.stop();
     };
+    try {
+      this.#check(choice);
+      if (track.getSettings().sampleRate <= TELEPHONE_HZ) this.#report(TEXTS.telephone);
+      track.onended = () => {
+        this.stop();
+        this.#report(TEXTS.unplugged);
+      };
+      await this.#follow(stream, choice, end);
+    } catch (error) {
+      end();
+      throw error;
+    }
   }
 
   /**
@@ -97,35 +98,7 @@ export class LipSync extends EventTarget {
    * Buffers and elements are also played, delayed like the face.
    */
   async listenTo(source) {
-    const context = this.context;
-    await context.audioWorklet.addModule(new URL("worklet.js", import.meta.url));
-    this.stop();
-    const node = sourceNode(context, source);
-    const { port1, port2 } = new MessageChannel();
-    await this.#open({ sampleRateHz: context.sampleRate }, port1);
-    const input = new AudioWorkletNode(context, "kouxing-lips", { channelCount: 1, channelCountMode: "explicit", numberOfOutputs: 0 });
-    this.#isPlayed = node.isPlayed;
-    const delay = node.isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
-    node.connect(input);
-    if (delay) node.connect(delay).connect(context.destination);
-    this.#source = {
-      node,
-      release() {
-        input.port.postMessage(null);
-        node.disconnect(input);
-        if (delay) {
-          node.disconnect(delay);
-          delay.disconnect();
-        }
-        if (source instanceof AudioBuffer) node.stop();
-      },
-    };
-    input.port.postMessage(port2, [port2]);
-    if (source instanceof AudioBuffer) {
-      node.start();
-      node.onended = () => this.dispatchEvent(new Event("ended"));
-    }
-    await this.resume();
+    await this.#follow(source, ++this.#choice);
   }
 
   /** Start a session for push(). Its times count from the first sample. */
@@ -188,10 +161,8 @@ export class LipSync extends EventTarget {
 
   /** Stop following the sound. The face returns to rest. */
   stop() {
-    if (this.#source === null) return;
-    this.#source.release();
-    this.#source = null;
-    this.#worker.postMessage({ type: "finish", session: this.#session });
+    this.#choice++;
+    this.#release();
   }
 
   /** Stop, and release all resources. */
@@ -202,6 +173,57 @@ export class LipSync extends EventTarget {
     this.#worker.terminate();
     this.#context?.removeEventListener("statechange", this.#onContextState);
     if (this.#ownsContext) this.#context?.close();
+  }
+
+  /** Follow the source of a choice. onRelease is called when it is no longer followed. */
+  async #follow(source, choice, onRelease = () => {}) {
+    const context = this.context;
+    await context.audioWorklet.addModule(new URL("worklet.js", import.meta.url));
+    this.#check(choice);
+    this.#release();
+    const node = sourceNode(context, source);
+    const { port1, port2 } = new MessageChannel();
+    await this.#open({ sampleRateHz: context.sampleRate }, port1);
+    this.#check(choice);
+    const input = new AudioWorkletNode(context, "kouxing-lips", { channelCount: 1, channelCountMode: "explicit", numberOfOutputs: 0 });
+    this.#isPlayed = node.isPlayed;
+    const delay = node.isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
+    node.connect(input);
+    if (delay) node.connect(delay).connect(context.destination);
+    this.#source = {
+      node,
+      release() {
+        input.port.postMessage(null);
+        node.disconnect(input);
+        if (delay) {
+          node.disconnect(delay);
+          delay.disconnect();
+        }
+        if (source instanceof AudioBuffer) {
+          node.onended = null;
+          node.stop();
+        }
+        onRelease();
+      },
+    };
+    input.port.postMessage(port2, [port2]);
+    if (source instanceof AudioBuffer) {
+      node.start();
+      node.onended = () => this.dispatchEvent(new Event("ended"));
+    }
+    await this.resume();
+  }
+
+  /** Throw an AbortError if another source was chosen, or none. The caller can ignore it. */
+  #check(choice) {
+    if (choice !== this.#choice) throw abortError();
+  }
+
+  #release() {
+    if (this.#source === null) return;
+    this.#source.release();
+    this.#source = null;
+    this.#worker.postMessage({ type: "finish", session: this.#session });
   }
 
   async #open(options, input = null) {
@@ -223,7 +245,7 @@ export class LipSync extends EventTarget {
 
   /** Reject the unanswered request. Its caller can ignore an AbortError. */
   #supersede() {
-    this.#pending?.reject(new DOMException("another source was opened, or lip sync was closed", "AbortError"));
+    this.#pending?.reject(abortError());
     this.#pending = null;
   }
 
@@ -284,6 +306,10 @@ export class LipSync extends EventTarget {
   #report(text) {
     this.dispatchEvent(new CustomEvent("notice", { detail: text }));
   }
+}
+
+function abortError() {
+  return new DOMException("another source was opened, or lip sync was stopped or closed", "AbortError");
 }
 
 const elementNodes = new WeakMap(); // an element allows only one node

@@ -1,0 +1,179 @@
+// Sources that are stopped, closed or replaced while they open. The browser's parts are fakes.
+
+import assert from "node:assert/strict";
+import test from "node:test";
+import { LipSync } from "../index.js";
+
+class FakeWorker {
+  static newest = null;
+  messages = [];
+  constructor() {
+    FakeWorker.newest = this;
+  }
+  postMessage(message) {
+    this.messages.push(message);
+    if (message.type === "load") this.answer("loaded");
+  }
+  /** Answer the newest request after the current call. */
+  answer(type) {
+    const { session } = this.messages.at(-1);
+    queueMicrotask(() => this.onmessage({ data: { type, session, names: {} } }));
+  }
+  terminate() {}
+}
+
+class FakeNode {
+  port = { postMessage() {} };
+  connect(node) {
+    return node;
+  }
+  disconnect() {}
+  start() {}
+  stop() {}
+}
+
+class FakeBuffer {}
+
+class FakeContext extends EventTarget {
+  state = "running";
+  sampleRate = 48000;
+  currentTime = 0;
+  audioWorklet = { addModule: async () => {} };
+  async resume() {}
+}
+
+class FakeTrack {
+  isLive = true;
+  getSettings = () => ({ sampleRate: 48000 });
+  stop() {
+    this.isLive = false;
+  }
+}
+
+class FakeStream {
+  track = new FakeTrack();
+  getAudioTracks = () => [this.track];
+}
+
+let answerPrompt; // the user allows the microphone
+let stream;
+let context;
+
+test.beforeEach(() => {
+  stream = new FakeStream();
+  context = new FakeContext();
+  const getUserMedia = () => new Promise((resolve) => (answerPrompt = () => resolve(stream)));
+  Object.defineProperty(globalThis, "navigator", { value: { mediaDevices: { getUserMedia } }, configurable: true });
+  Object.assign(globalThis, {
+    document: new EventTarget(),
+    location: { href: "http://localhost/" },
+    Worker: FakeWorker,
+    AudioNode: class {},
+    AudioBuffer: FakeBuffer,
+    HTMLMediaElement: class {},
+    MediaStreamTrack: FakeTrack,
+    MediaStream: FakeStream,
+    AudioWorkletNode: FakeNode,
+    MediaStreamAudioSourceNode: FakeNode,
+    AudioBufferSourceNode: FakeNode,
+    DelayNode: FakeNode,
+    MessageChannel: class {},
+  });
+});
+
+/** Wait until the worker has received a request to open a session. */
+async function opening() {
+  while (FakeWorker.newest.messages.at(-1).type !== "open") await Promise.resolve();
+}
+
+/** Answer the request to open a session. */
+async function open() {
+  await opening();
+  FakeWorker.newest.answer("opened");
+}
+
+const aborted = { name: "AbortError" };
+
+test("stop() releases the microphone", async () => {
+  const lips = await LipSync.create({ context });
+  const listening = lips.listenToMicrophone();
+  answerPrompt();
+  await open();
+  await listening;
+  assert.ok(stream.track.isLive);
+  lips.stop();
+  assert.ok(!stream.track.isLive);
+});
+
+test("stop() also works while the user is asked for the microphone", async () => {
+  const lips = await LipSync.create({ context });
+  const listening = lips.listenToMicrophone();
+  lips.stop();
+  answerPrompt();
+  await assert.rejects(listening, aborted);
+  assert.ok(!stream.track.isLive);
+  assert.equal(lips.node, null);
+});
+
+test("stop() also works while the worker opens the session", async () => {
+  const lips = await LipSync.create({ context });
+  const listening = lips.listenToMicrophone();
+  answerPrompt();
+  await opening();
+  lips.stop();
+  FakeWorker.newest.answer("opened");
+  await assert.rejects(listening, aborted);
+  assert.ok(!stream.track.isLive);
+  assert.equal(lips.node, null);
+});
+
+test("stop() also works while the sound starts", async () => {
+  const lips = await LipSync.create({ context });
+  context.state = "suspended";
+  context.resume = async () => lips.stop();
+  const listening = lips.listenToMicrophone();
+  answerPrompt();
+  await open();
+  await listening;
+  assert.ok(!stream.track.isLive);
+});
+
+test("close() also works while the user is asked for the microphone", async () => {
+  const lips = await LipSync.create({ context });
+  const listening = lips.listenToMicrophone();
+  lips.close();
+  answerPrompt();
+  await assert.rejects(listening, aborted);
+  assert.ok(!stream.track.isLive);
+});
+
+test("the source that was chosen last is followed, though an earlier one takes longer to open", async () => {
+  const lips = await LipSync.create({ context });
+  const first = lips.listenToMicrophone();
+  const second = lips.listenTo(new FakeBuffer());
+  await open();
+  await second;
+  const { node } = lips;
+  answerPrompt();
+  await assert.rejects(first, aborted);
+  assert.ok(!stream.track.isLive);
+  assert.equal(lips.node, node);
+});
+
+test("a buffer that is replaced does not report its end", async () => {
+  const lips = await LipSync.create({ context });
+  let numEnded = 0;
+  lips.addEventListener("ended", () => numEnded++);
+  const first = lips.listenTo(new FakeBuffer());
+  await open();
+  await first;
+  const { node } = lips;
+  const second = lips.listenTo(new FakeBuffer());
+  await opening();
+  node.onended?.(); // browsers report it after node.stop()
+  assert.equal(numEnded, 0);
+  FakeWorker.newest.answer("opened");
+  await second;
+  lips.node.onended();
+  assert.equal(numEnded, 1);
+});
