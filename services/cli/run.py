@@ -89,8 +89,9 @@ def run(
     for kind in KINDS.values():
         settings.load(kind.config_type)  # if a key is wrong, nothing starts
     out = Path(settings.load(DriverConfig).out)
-    sample = None if play is None else _open_sample(play, track, out / f"{_SAMPLE_SESSION}.mp4")
     with lock_output_folder(out), contextlib.ExitStack() as startup:
+        video = out / f"{_SAMPLE_SESSION}.mp4"
+        sample = None if play is None else _open_sample(play, track, video)
         startup.enter_context(
             lock_startup(lambda: print_message("waiting until another kouxing has started"))
         )
@@ -241,7 +242,7 @@ def _open_sample(path: Path, track: int | None, video: Path) -> AudioSource:
     """Open the file to play, and remove the video of the last one."""
     from kouxing.shared.audio_file import open_audio
 
-    if video.exists() and video.samefile(path):
+    if path.exists() and video.exists() and video.samefile(path):
         raise UserError(f"{path}: the video would overwrite this file; rename it first")
     sample = open_audio(path, track=track)
     video.unlink(missing_ok=True)

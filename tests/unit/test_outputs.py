@@ -16,11 +16,13 @@ from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS, FrameStream
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
+from kouxing.services.cli.running_system import lock_output_folder
 from kouxing.services.driver.video.film import TimedFaps
 from kouxing.services.driver.video.video_writer import PictureSequence, check_name
 from kouxing.shared.errors import UserError
 from kouxing.shared.output_file import open_output
 from kouxing.shared.terminal import check_output
+from tests.system import VOWELS_FILE
 
 
 def test_an_existing_output_needs_force(tmp_path: Path) -> None:
@@ -68,6 +70,39 @@ def test_no_option_of_a_command_is_overwritten(
             Path(argument).touch()
     with pytest.raises(UserError, match="the output is also an input"):
         app([*arguments.split(), "--force"], standalone_mode=False)
+
+
+@pytest.fixture
+def old_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    video = Path("out/demo.mp4")
+    video.parent.mkdir()
+    video.write_bytes(b"mine")
+    return video
+
+
+@pytest.mark.parametrize(
+    ("played", "message"),
+    [
+        ("missing.wav", r"missing\.wav: no such file"),
+        ("out/demo.mp4", "the video would overwrite this file"),
+    ],
+)
+def test_run_keeps_the_last_video_if_the_sound_cannot_be_played(
+    old_video: Path, played: str, message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        app(["run", "--play", played], standalone_mode=False)
+    assert old_video.read_bytes() == b"mine"
+
+
+def test_run_keeps_the_video_of_another_running_system(old_video: Path) -> None:
+    with (
+        lock_output_folder(old_video.parent),
+        pytest.raises(UserError, match="another kouxing writes its logs and videos"),
+    ):
+        app(["run", "--play", str(VOWELS_FILE)], standalone_mode=False)
+    assert old_video.read_bytes() == b"mine"
 
 
 def test_pictures_of_heads_are_not_overwritten(tmp_path: Path) -> None:
