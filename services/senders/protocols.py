@@ -5,7 +5,7 @@ from urllib.parse import parse_qsl, urlsplit
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import OscConnection
-from kouxing.services.senders.target import Target, parse_delay_s
+from kouxing.services.senders.target import Target, is_host, parse_delay_s
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.endpoints import is_loopback
@@ -35,19 +35,20 @@ def parse_target(url: str) -> Target:
     """
     try:
         parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
+        host, port = parts.hostname or LOOPBACK, parts.port
     except ValueError:
         raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}") from None
     protocol = PROTOCOLS.get(parts.scheme)
     is_bare = parts.path in ("", "/") and not parts.fragment and parts.username is None
-    if protocol is None or not is_bare or port == 0 or not url.isprintable() or " " in url:
+    is_readable = url.isprintable() and " " not in url
+    if protocol is None or not is_bare or port == 0 or not is_readable or not is_host(host):
         raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}")
     options = _parse_options(url, parts.query, protocol)
     try:
         target = Target(
             url=url,
             protocol=parts.scheme,
-            host=host or LOOPBACK,
+            host=host,
             port=port or protocol.default_port,
             options=options,
             delay_s=parse_delay_s(options["delay"]),

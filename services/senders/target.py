@@ -63,13 +63,23 @@ class Target:
         return parse_camera(option) if option else None
 
 
+def is_host(text: str) -> bool:
+    """Return whether a text can be a host: no part of a name is empty or longer than 63 bytes."""
+    try:
+        text.encode("idna")  # as when the name is resolved
+    except UnicodeError:
+        return False
+    return True
+
+
 def parse_camera(option: str) -> tuple[str, int]:
     """Return the address and port of ``PORT`` (this machine only) or ``ADDRESS:PORT``.
 
-    Raises ``UserError`` if the port is not a number from 1 to 65535.
+    Raises ``UserError`` if the port is not a number from 1 to 65535, or the address is invalid.
     """
     host, _, port = option.rpartition(":")
-    if not (port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16):
+    is_port = port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16
+    if not (is_port and is_host(host)):
         raise UserError(f"camera must be a port such as 39541, or ADDRESS:PORT, not {option!r}")
     return host or "127.0.0.1", int(port)
 

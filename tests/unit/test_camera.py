@@ -135,8 +135,8 @@ def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
     assert len(forwarded) == 600
 
 
-@pytest.mark.parametrize("camera", ["0", "65536", "phone", "1.2.3.4:", "-1"])
-def test_rejects_an_invalid_port(camera: str) -> None:
+@pytest.mark.parametrize("camera", ["0", "65536", "phone", "1.2.3.4:", "-1", "a..b:1"])
+def test_rejects_an_invalid_address_of_a_tracker(camera: str) -> None:
     with pytest.raises(UserError, match="camera must be a port"):
         parse_target(f"vmc://?camera={camera}")
 

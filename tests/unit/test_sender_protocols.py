@@ -165,6 +165,8 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
         ("vmc://me@host", "write vmc://HOST"),
         ("vmc://host:99999", "write vmc://HOST"),
         ("vmc://host:0", "write vmc://HOST"),
+        ("vmc://a..b", "write vmc://HOST"),
+        (f"vts://{'a' * 64}", "write vmc://HOST"),
         ("vmc://?delai=3", "use delay"),
         ("vmc://?shapes=fap", "vrm or arkit"),
         ("vts://?shapes=vrm", "unknown option"),
