@@ -54,6 +54,7 @@ PREFIX = "KOUXING_"
 _MAX_FILE_BYTES = 64 << 10
 _MAX_DOTS = 1000  # per line; tomllib's memory grows with the square of a key's parts
 COMMON = "common"  # table of the keys of all services
+_OWN_KEYS = {"instance"}  # keys of every service that [common] lacks: no two values may be equal
 _DEFAULT = "default"  # origin of a value that no source sets
 
 
@@ -171,7 +172,7 @@ class ServiceConfig(BaseModel):
     log_level: LogLevel = "info"
     """Lowest level of log messages to write."""
     instance: Annotated[str, Field(max_length=128), ValueHint("up to 128 characters")] = ""
-    """Name of this process. If empty, a name is generated."""
+    """Name of this process, different for each process. If empty, a name is generated."""
     metrics: Annotated[
         str, AfterValidator(_check_metrics), ValueHint("HOST:PORT such as 127.0.0.1:9100, or empty")
     ] = ""
@@ -288,13 +289,13 @@ class Settings:
                 allowed=describe_allowed_values(field),
                 meaning=meanings.get(key, ""),
             )
-            for key, field in config_type.model_fields.items()
+            for key, field in _fields(self._table(config_type), config_type).items()
         ]
 
     def _resolve(
         self, config_type: type[Config], overrides: Mapping[str, str]
     ) -> tuple[Config, dict[str, _RawValue]]:
-        table = next((n for n, known in self._tables.items() if known is config_type), COMMON)
+        table = self._table(config_type)
         assigned = self._command_line_layer(
             {f"{table}.{key}": text for key, text in overrides.items()}
         )
@@ -313,8 +314,11 @@ class Settings:
         _check_hosts(table, config)
         return config, values
 
+    def _table(self, config_type: type[ServiceConfig]) -> str:
+        return next((n for n, known in self._tables.items() if known is config_type), COMMON)
+
     def _keys(self, table: str) -> Mapping[str, FieldInfo]:
-        return self._tables[table].model_fields
+        return _fields(table, self._tables[table])
 
     def _command_line_layer(self, values: Mapping[str, str]) -> Layer:
         return _make_layer(values, self._names, "--set")
@@ -347,6 +351,12 @@ class Settings:
             f"{table}.{key}: {value.text!r} (from {value.origin}) is not"
             f" {describe_allowed_values(field)}{hint}"
         )
+
+
+def _fields(table: str, config_type: type[ServiceConfig]) -> Mapping[str, FieldInfo]:
+    """Return the keys of a table."""
+    fields = config_type.model_fields
+    return {key: field for key, field in fields.items() if table != COMMON or key not in _OWN_KEYS}
 
 
 def variable_name(table: str, key: str) -> str:

@@ -160,6 +160,7 @@ def test_an_error_in_a_file_is_located(tmp_path: Path, text: str, message: str) 
     [
         ({"KOUXING_VIEW": "1"}, {}, r"\$KOUXING_VIEW: .* the nearest is KOUXING_DRIVER_VIEW;"),
         ({"KOUXING_CONTROLL": "1"}, {}, "the nearest is KOUXING_CONTROL;"),
+        ({"KOUXING_INSTANCE": "a"}, {}, "the nearest is KOUXING_.*_INSTANCE;"),
         ({}, {"recognizer.acustic": "gmm"}, "--set: .*; the nearest is .*acoustic;"),
     ],
 )
