@@ -111,17 +111,19 @@ def running_systems() -> list[RunningSystem]:
     folder = _own_folder()
     paths = [] if folder is None else folder.iterdir()
     systems = []
-    for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
+    for path in paths:
+        # another system may end, and remove its file, at any time
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 control, _, keys = os.fsdecode(file.read()).partition("\n")
                 if control:  # else not yet written
-                    systems.append(RunningSystem(control, keys))
+                    started_s = os.fstat(file.fileno()).st_mtime
+                    systems.append((started_s, RunningSystem(control, keys)))
                 continue
             path.unlink()  # the system has ended
-    return systems
+    return [system for _, system in sorted(systems, reverse=True)]
 
 
 def _key_folder() -> str:

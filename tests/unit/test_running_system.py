@@ -44,6 +44,16 @@ def test_finds_the_newest_running_system_even_if_others_were_killed(
     assert find_control() == ""
 
 
+def test_a_system_that_ends_during_the_search_is_not_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with announce_system("tcp://127.0.0.1:1"):
+        (folder,) = tmp_path.iterdir()
+        paths = [*folder.iterdir(), folder / "2"]  # the second one has just been removed
+        monkeypatch.setattr(Path, "iterdir", lambda _: iter(paths))
+        assert find_control() == "tcp://127.0.0.1:1"
+
+
 def control_address(address: str) -> str:
     with find_control_address(address) as endpoint:
         return endpoint
