@@ -235,6 +235,8 @@ def express(
     control: Control = "",
 ) -> None:
     """Show expressions on a face; without expressions, clear the current ones."""
+    from kouxing_client import Refused
+
     from kouxing.shared.client_connection import connect_client
 
     words = list(arguments or ())
@@ -258,7 +260,12 @@ def express(
                 + (f", and write {session}=0.4" if session in set(ExpressionName) else "")
             )
         for name in [session] if session else ["", *all_sessions]:
-            client.set_face(name, expressions=strengths, hold_s=hold_s)
+            try:
+                client.set_face(name, expressions=strengths, hold_s=hold_s)
+            except Refused as refusal:
+                if session or refusal.code != "unknown-session":
+                    raise
+                all_sessions.remove(name)  # it has just closed
     faces = [session] if session else [*all_sessions, "the face at rest"]
     shown = ", ".join(f"{name} {strength:g}" for name, strength in strengths.items())
     action = f"showing {shown} for {hold_s:g} s" if shown else "cleared the expressions"
