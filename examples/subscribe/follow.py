@@ -21,8 +21,10 @@ def wait_for_session(client, name):
     while True:
         try:
             return client.follow(name)
-        except Refused:  # there is no such session yet
-            time.sleep(0.5)
+        except Refused as refusal:
+            if refusal.code != "unknown-session":
+                raise
+            time.sleep(0.5)  # there is no such session yet
 
 
 name, address = (*sys.argv[1:], "", "")[:2]
