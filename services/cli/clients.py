@@ -118,7 +118,7 @@ def speak(
     elif source == "monitor":
         audio = open_monitor(device)
     else:
-        raw_format = RawFormat(rate or 16_000, channels or 1)
+        raw_format = RawFormat(16_000 if rate is None else rate, channels or 1)
         audio = open_audio(Path(source), track=track, raw=raw_format if raw else None)
     with find_control_address(control) as endpoint:
         summary = stream(

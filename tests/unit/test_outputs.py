@@ -166,6 +166,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
     [
         ("speak a.wav --rate 8000", "--rate applies to raw samples; add --raw"),
         ("speak a.wav --raw --track 2", "--track does not apply to raw samples"),
+        ("speak a.wav --raw --rate 0", "0 Hz is too low for speech"),
         ("speak a.wav --device USB", "speak mic --device NAME"),
         ("speak mic --fast", "--fast does not apply to mic"),
         ("speak monitor --raw", "--raw does not apply to monitor"),
