@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; exit with status 1 after an error."""
     options = _parser().parse_args(arguments)
     try:
+        _check_frame_rate(options)
         _report(options, "start", f"reading {options.input}", file=options.input)
         motion = _animate(options)
         _report(options, "progress", "finished", value=1.0)
@@ -45,7 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             write_text(options.output, result)
     except UserError as error:
         if options.logFile is not None:
-            write_text(options.logFile, f"[Fatal] {error}\n")
+            try:
+                write_text(options.logFile, f"[Fatal] {error}\n")
+            except UserError as log_error:
+                _report(options, "log", str(log_error))
         _report(options, "failure", str(error), reason=str(error))
         sys.exit(1)
     _report(options, "success", "finished")
@@ -74,6 +78,12 @@ def _parser() -> argparse.ArgumentParser:
     for names in (("-r", "--recognizer"), ("--consoleLevel",), ("--logLevel",), ("--threads",)):
         add(*names, help="ignored; accepted for compatibility")
     return parser
+
+
+def _check_frame_rate(options: argparse.Namespace) -> None:
+    rate_hz = options.datFrameRate
+    if options.exportFormat == "dat" and not 10.0 <= rate_hz <= 100.0:
+        raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 images per second")
 
 
 def _animate(options: argparse.Namespace) -> FaceMotion:
@@ -119,8 +129,6 @@ def _moho_switches(cues: Iterable[Cue], rate_hz: float, names: dict[str, str]) -
 
     If several mouths start in a frame, the last one counts.
     """
-    if not 10.0 <= rate_hz <= 100.0:
-        raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 images per second")
     mouths = {1 + int(rate_hz * start_s): names.get(mouth, mouth) for start_s, mouth in cues}
     return "MohoSwitch1\n" + "".join(f"{frame} {mouth}\n" for frame, mouth in mouths.items())
 

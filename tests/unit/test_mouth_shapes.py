@@ -121,6 +121,25 @@ def test_errors_equal_rhubarbs(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "no such file" in failure["reason"]
 
 
+def test_a_wrong_frame_rate_is_reported_before_the_recording_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing = str(tmp_path / "no.wav")
+    with pytest.raises(SystemExit, match="1"):
+        rhubarb.main(["-f", "dat", "--datFrameRate", "5", missing])
+    assert "--datFrameRate 5: choose 10 to 100" in capsys.readouterr().err
+
+
+def test_a_log_that_cannot_be_written_does_not_hide_the_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, missing = str(tmp_path / "no" / "log.txt"), str(tmp_path / "no.wav")
+    with pytest.raises(SystemExit, match="1"):
+        rhubarb.main(["--logFile", log, missing])
+    problems = capsys.readouterr().err.splitlines()[1:]
+    assert ["log.txt" in problems[0], "no such file" in problems[1]] == [True, True]
+
+
 class StatusStream(io.StringIO):
     """Standard error that notes the size of a file whenever a status is printed."""
 
