@@ -15,6 +15,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
+COMPILED := .venv/compiled
 HEADS := $(PAGE)/head.glb
 HEAD_SOURCES := $(wildcard services/driver/head/assets/* services/driver/head/*.py) \
 	services/driver/render/shaders.py
@@ -48,6 +49,8 @@ PIP := $(BIN)/python $(INSTALL)
 PIP_LOCK := $(PIP) --require-hashes --requirement
 NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --no-audit --no-fund --loglevel=error --prefix
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# The tests start hundreds of Python processes; with bytecode files, only the first ones compile the modules.
+unexport PYTHONDONTWRITEBYTECODE
 
 TEST_STAGES := test-python test-page test-lips
 CHECK_STAGES := $(addprefix check-,ruff format types imports godot page mos javascript compose docker)
@@ -73,7 +76,7 @@ wheel: .venv/installed $(PAGE)/node_modules/.package-lock.json
 		rm -rf build $(PAGE)/vendor; exit $$status
 	ls -l dist
 
-test: .venv/installed-dev setup $(LIPS_MODELS) \
+test: .venv/installed-dev setup $(COMPILED) $(LIPS_MODELS) \
 		$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR))
 	$(STAGES) $(TEST_STAGES)
 
@@ -205,6 +208,12 @@ $(RIVALS)/.venv/installed: $(RIVALS)/requirements.lock
 $(BLENDER)/installed: $(BLENDER_LOCK)
 	$(PYTHON) -m venv $(BLENDER)
 	$(BLENDER)/bin/python $(INSTALL) --require-hashes --requirement $(BLENDER_LOCK)
+	touch $@
+
+# Fills Numba's cache. Otherwise all services that start at the same time compile the same functions.
+$(COMPILED): $(wildcard services/recognizer/front_end/*.py services/recognizer/search/*.py) | .venv/installed
+	$(BIN)/python -c "from kouxing.services.recognizer.acoustic.load import load_model; \
+		from kouxing.services.recognizer.recognizer import Recognizer; Recognizer(load_model()).warm_up()"
 	touch $@
 
 $(HEADS): $(HEAD_SOURCES) | .venv/installed
