@@ -22,9 +22,9 @@ from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.shared import audio_file
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import as_integers
 
 _FORMAT = "4"  # increase it when the front end's log-mel stage changes
-_FULL_SCALE = 32768.0
 
 
 def cache_folder() -> Path:
@@ -75,18 +75,6 @@ def log_mel_of(
 def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:
     """Return the samples of every utterance, 16 kHz; empty if the audio cannot be read."""
     return _cached(utterances, "samples", np.empty(0, dtype=np.int16), as_integers)
-
-
-def as_floats(samples: NDArray[np.int16]) -> NDArray[np.float32]:
-    """Convert cached samples to floats in [-1, 1]."""
-    return samples.astype(np.float32) / np.float32(_FULL_SCALE)
-
-
-def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Convert samples in [-1, 1] to 16-bit integers, as in the cache."""
-    scaled = np.clip(np.rint(samples * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1)
-    integers: NDArray[np.int16] = scaled.astype(np.int16)
-    return integers
 
 
 def _cached(

@@ -30,6 +30,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_columns
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
@@ -37,7 +38,6 @@ from kouxing.shared.user_file import check_content, parse_json, read_text, split
 
 Array = NDArray[np.float64]
 
-SAMPLE_RATE_HZ = 16_000
 _MAX_BYTES = 64 << 20  # limit for a table
 _MAX_ROWS = 1_000_000
 _FULL_PERCENTILE = 98.0
@@ -105,7 +105,7 @@ class LipClip:
     @property
     def minutes(self) -> float:
         """Duration of the audio."""
-        return len(self.samples) / SAMPLE_RATE_HZ / 60
+        return len(self.samples) / MEDIA_RATE_HZ / 60
 
     def filmed_speech(self) -> FilmedSpeech:
         """Return the clip as input for learning a mouth profile."""

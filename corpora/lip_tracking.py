@@ -11,13 +11,13 @@ import soundfile
 from numpy.typing import NDArray
 
 from kouxing.corpora.face_mesh import FaceMesh
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
 from kouxing.services.driver import picture
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels
 from kouxing.shared.audio_file import MAX_FILE_BYTES, check_video
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.media_file import OPTIONS, start_of
@@ -101,7 +101,7 @@ def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tupl
     faps[has_face] = compute_mouth_faps(
         landmarks, np.interp(time_s[has_face], levels[:, 0], levels[:, 1])
     )
-    soundfile.write(clip.with_suffix(".flac"), samples, SAMPLE_RATE_HZ)
+    soundfile.write(clip.with_suffix(".flac"), samples, MEDIA_RATE_HZ)
     _write_tracks(clip.with_suffix(".csv"), time_s, faps)
     metadata = {
         "clip": clip.stem,

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.feature_cache import as_integers, read_audio
+from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.corpora.tables import read_rows
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import as_integers
 
 _HELD_OUT_BY_FILE = ("music", "noise")
 _BACKGROUNDS = ("music", "noise", "babble")

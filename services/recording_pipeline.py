@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.features import frame_time_s
-from kouxing.services.recognizer.front_end.pcm import SliceMeter
+from kouxing.services.recognizer.front_end.slices import SliceMeter
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.offline_recognition import WithProgress

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import FULL_SCALE
 from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, find_sound_start
 
 Array = NDArray[np.float64]
@@ -20,7 +21,6 @@ _MAX_BLOCKS = 60  # non-silent blocks after which the check ends
 _MAX_REFUSED = 2  # non-PCM blocks after which the data is rejected
 _MIN_SOUND = 3  # blocks of sound that end the check
 _SEGMENT = 200  # samples of a spectrum
-_FULL_SCALE = 32768
 _MAX_SAMPLE = 1.5  # largest plausible sample in another encoding
 _SILENCE, _QUIET, _AUDIBLE = 0.01, 0.003, 0.05  # root mean square, of full scale
 # Ranges of misread data, and of the reading with the right encoding.
@@ -36,14 +36,14 @@ _MAX_LOW_BYTE_SHARE = 0.3  # of the most frequent low byte; more in clipped and 
 def _decode_mulaw(data: NDArray[np.uint8]) -> Array:
     code = (~data).astype(np.int64)
     size = (((code & 15) << 3) + 132 << ((code >> 4) & 7)) - 132
-    return np.where(code & 128, -size, size) / _FULL_SCALE
+    return np.where(code & 128, -size, size) / FULL_SCALE
 
 
 def _decode_alaw(data: NDArray[np.uint8]) -> Array:
     code = (data ^ 0x55).astype(np.int64)
     exponent, mantissa = (code >> 4) & 7, ((code & 15) << 4) + 8
     size = np.where(exponent == 0, mantissa, mantissa + 256 << np.maximum(exponent - 1, 0))
-    return np.where(code & 128, size, -size) / _FULL_SCALE
+    return np.where(code & 128, size, -size) / FULL_SCALE
 
 
 def _decode_24_bit(data: NDArray[np.uint8]) -> Array:
@@ -51,7 +51,7 @@ def _decode_24_bit(data: NDArray[np.uint8]) -> Array:
 
 
 _WIDE: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.floating]]] = {
-    "16-bit big-endian samples": lambda data: data.view(">i2") / _FULL_SCALE,
+    "16-bit big-endian samples": lambda data: data.view(">i2") / FULL_SCALE,
     "24-bit samples": _decode_24_bit,
     "32-bit samples": lambda data: data.view("<i4") / 2**31,
     "32-bit float samples": lambda data: data.view("<f4"),
@@ -98,7 +98,7 @@ class EncodingCheck:
             self._judge(np.frombuffer(block, np.uint8))
 
     def _judge(self, data: NDArray[np.uint8]) -> None:
-        channels = (data.view("<i2") / _FULL_SCALE).reshape(-1, self._num_channels).T
+        channels = (data.view("<i2") / FULL_SCALE).reshape(-1, self._num_channels).T
         measures = [_measure(channel) for channel in channels]
         flatness, correlation, rms = max(measures, key=lambda measure: measure[2])
         if rms < _SILENCE:

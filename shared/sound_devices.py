@@ -11,11 +11,11 @@ from types import ModuleType
 from typing import Any
 
 from kouxing.shared.audio_file import AudioSource, raw_audio
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.media_file import RawFormat
 from kouxing.shared.phase_cancellation import Samples
 
-_RATE_HZ = 16_000
 _LATENCY_MS = 20  # latency of recordings of outputs and programs
 _TIMEOUT_S = 5.0
 _NO_SOUND_SERVER = (
@@ -57,10 +57,10 @@ def open_microphone(name: str) -> AudioSource:
     try:
         stream = sounddevice.InputStream(
             device=name or None,
-            samplerate=_RATE_HZ,
+            samplerate=MEDIA_RATE_HZ,
             channels=1,
             dtype="float32",
-            blocksize=_RATE_HZ // 50,
+            blocksize=MEDIA_RATE_HZ // 50,
             callback=lambda data, *_: recorded.put(data.copy()),
         )
     except (sounddevice.PortAudioError, ValueError) as error:
@@ -73,7 +73,7 @@ def open_microphone(name: str) -> AudioSource:
             while True:
                 yield recorded.get()
 
-    return AudioSource(name or "microphone", _RATE_HZ, 1, None, blocks(), is_live=True)
+    return AudioSource(name or "microphone", MEDIA_RATE_HZ, 1, None, blocks(), is_live=True)
 
 
 def open_monitor(name: str = "") -> AudioSource:
@@ -87,7 +87,7 @@ def open_monitor(name: str = "") -> AudioSource:
     device = _choose(name, devices) if name else None
     target = device.target if device else "--device=@DEFAULT_MONITOR@"
     command = ["parec", target, "--client-name=kouxing", f"--latency-msec={_LATENCY_MS}"]
-    command += ["--format=s16le", f"--rate={_RATE_HZ}", "--channels=1"]
+    command += ["--format=s16le", f"--rate={MEDIA_RATE_HZ}", "--channels=1"]
     if shutil.which(command[0]) is None:
         raise UserError(_NO_SOUND_SERVER)
 
@@ -98,7 +98,7 @@ def open_monitor(name: str = "") -> AudioSource:
         ):
             try:
                 has_audio = False
-                for block in raw_audio(parec.stdout, RawFormat(_RATE_HZ), "monitor").blocks:  # type: ignore[arg-type]
+                for block in raw_audio(parec.stdout, RawFormat(MEDIA_RATE_HZ), "monitor").blocks:  # type: ignore[arg-type]
                     has_audio = True
                     yield block
                 if not has_audio:
@@ -108,7 +108,7 @@ def open_monitor(name: str = "") -> AudioSource:
                 parec.terminate()
 
     return AudioSource(
-        device.name if device else "monitor", _RATE_HZ, 1, None, blocks(), is_live=True
+        device.name if device else "monitor", MEDIA_RATE_HZ, 1, None, blocks(), is_live=True
     )
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, split_of
+from kouxing.corpora.lip_clips import split_of
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from tests.system import DEMO, VOWELS_FILE, samples_of_file
 
 FRAME_S = 0.04
@@ -24,8 +25,8 @@ def write_held_out_clip(folder: Path) -> None:
 
 def write_training_clip(folder: Path, name: str, speaker: str, license_name: str) -> None:
     """Write a clip of 2 s in which all tracked points move."""
-    samples = samples_of_file(VOWELS_FILE)[: 2 * SAMPLE_RATE_HZ]
-    soundfile.write(folder / f"{name}.flac", samples, SAMPLE_RATE_HZ)
+    samples = samples_of_file(VOWELS_FILE)[: 2 * MEDIA_RATE_HZ]
+    soundfile.write(folder / f"{name}.flac", samples, MEDIA_RATE_HZ)
     about = {"speaker": speaker, "licence": license_name, "language": "en"}
     (folder / f"{name}.json").write_text(json.dumps(about))
     rows = [

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
+from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.agreement import moments
 from kouxing.evaluation.lips.curve_tables import CurveTable, fap_conversion, read_tables
 from kouxing.evaluation.lips.linear_map import fit_map
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
+from kouxing.shared.clock import MEDIA_RATE_HZ
 
 Array = NDArray[np.float64]
 MouthFunction = Callable[[LipClip], Mouth]
@@ -91,5 +92,5 @@ def _mouths_of(
 
 
 def _frames_s(clip: LipClip) -> Array:
-    duration_s = max(float(clip.time_s[-1]), len(clip.samples) / SAMPLE_RATE_HZ)
+    duration_s = max(float(clip.time_s[-1]), len(clip.samples) / MEDIA_RATE_HZ)
     return np.arange(int((duration_s + _TAIL_S) * FRAME_RATE_HZ)) / FRAME_RATE_HZ

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips, training_clips
+from kouxing.corpora.lip_clips import LipClip, read_clips, training_clips
 from kouxing.corpora.scoring import final_hypothesis
 from kouxing.evaluation.lips.curves import is_near
 from kouxing.evaluation.lips.mouths import CURVES, Mouth, clip_mouth, real_faps
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import training_clip_names
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -91,7 +92,7 @@ class Reference:
 
     def quietest_times(self, phones: Sequence[Phone]) -> Array:
         """Return when each phone is quietest, seconds."""
-        hop = round(_POWER_STEP_S * SAMPLE_RATE_HZ)
+        hop = round(_POWER_STEP_S * MEDIA_RATE_HZ)
         samples = self.clip.samples
         power = np.square(samples[: len(samples) // hop * hop], dtype=float)
         level = power.reshape(-1, hop).mean(axis=1)

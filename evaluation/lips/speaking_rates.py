@@ -35,7 +35,7 @@ from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
-from kouxing.services.recognizer.front_end.pcm import measure_slices
+from kouxing.services.recognizer.front_end.slices import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps

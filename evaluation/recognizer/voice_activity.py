@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.sounds import Sound, held_out
 from kouxing.evaluation.recognizer import synthetic_sounds
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
@@ -26,8 +25,9 @@ from kouxing.evaluation.recognizer.disturbances import Disturb, add_sound
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.front_end.pcm import SLICE, split_slices
+from kouxing.services.recognizer.front_end.slices import SLICE, split_slices
 from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.pcm import as_floats
 from kouxing.shared.phones.events import Phone, Progress, SpeechChange
 from kouxing.shared.terminal import CONSOLE
 

@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.signal import resample_poly
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
+from kouxing.corpora.lip_clips import LipClip, label_clip
 from kouxing.evaluation.lips.curve_tables import read_table
 from kouxing.evaluation.lips.references import read_parts
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ _NUM_CEPSTRA = 12
 _PROFILE_EVERY = 4  # training clips, because means need few
 _WINDOW = 1024  # samples at 16 kHz
 _PROFILE = {
-    "targetSampleRate": SAMPLE_RATE_HZ,
+    "targetSampleRate": MEDIA_RATE_HZ,
     "sampleCount": _WINDOW,
     "melFilterBankChannels": 30,
     "compareMethod": 1,  # Euclidean
@@ -88,7 +89,7 @@ def _run(program: str, clips: Sequence[LipClip], tables: Path, profile: Any = No
         sounds.mkdir()
         settings.write_text(json.dumps(profile), encoding="utf-8")
         for clip in clips:
-            sound = resample_poly(clip.samples, _RATE_HZ // SAMPLE_RATE_HZ, 1)
+            sound = resample_poly(clip.samples, _RATE_HZ // MEDIA_RATE_HZ, 1)
             sound.astype("<f4").tofile(sounds / f"{clip.name}.f32")
         arguments = [program, str(sounds), str(tables.resolve())]
         if program in NODE_PROGRAMS:
@@ -126,7 +127,7 @@ def _wlipsync_profile(clips: Sequence[LipClip]) -> dict[str, Any]:
         _run("wlipsync", clips, Path(name), blank)
         for clip in track(clips, description="profile of wLipSync", transient=True):
             table = read_table(Path(name) / f"{clip.name}.csv")
-            middle_s = table.time_s - _WINDOW / SAMPLE_RATE_HZ / 2.0
+            middle_s = table.time_s - _WINDOW / MEDIA_RATE_HZ / 2.0
             for phone in label_clip(model, clip):
                 (viseme, weight), *_ = model.inventory.visemes[phone.symbol]
                 distance_s = np.abs(middle_s - phone.onset_s - phone.duration_s / 2.0)
@@ -143,12 +144,12 @@ def _profile(cepstra: dict[str, Array]) -> dict[str, Any]:
 
 
 def _write_loudness(clip: LipClip, path: Path) -> None:
-    hop = round(_STEP_S * SAMPLE_RATE_HZ)
+    hop = round(_STEP_S * MEDIA_RATE_HZ)
     energy = np.append(0.0, np.cumsum(np.square(clip.samples, dtype=float)))
     ends = np.arange(0, len(energy), hop)
     power = (energy[ends] - energy[np.maximum(ends - 2 * hop, 0)]) / (2 * hop)
     level_db = 10.0 * np.log10(power + 1e-10)
     loudness = (level_db - np.percentile(level_db, 95)) / _LOUDNESS_RANGE_DB + 1.0
-    rows = zip(ends / SAMPLE_RATE_HZ, np.clip(loudness, 0.0, 1.0), strict=True)
+    rows = zip(ends / MEDIA_RATE_HZ, np.clip(loudness, 0.0, 1.0), strict=True)
     lines = ["t,opening", *(f"{time_s:.4f},{value:.4f}" for time_s, value in rows)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
+from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
@@ -38,6 +38,7 @@ from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone, write_wav
 from kouxing.services.cli.web_model import web_model
 from kouxing.shared.audio_file import read_audio
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 
@@ -209,7 +210,7 @@ def _with_accuracy(
     with site.open_page([page.name for page in pages]) as browser:
         browser.wait_for("window.play !== undefined")
         for number, clip in enumerate(track(clips, description="clips", transient=True)):
-            write_wav(site.folder / f"{number}.wav", clip.samples[:, np.newaxis], SAMPLE_RATE_HZ)
+            write_wav(site.folder / f"{number}.wav", clip.samples[:, np.newaxis], MEDIA_RATE_HZ)
             browser.evaluate(f"window.rows = null; window.play('{number}.wav'); 1")
             browser.wait_for("window.rows !== null", 60.0 * clip.minutes + _LIMIT_S)
             rows = np.array(browser.evaluate("window.rows"))

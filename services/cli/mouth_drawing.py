@@ -23,7 +23,7 @@ from kouxing.services.driver.video.video_writer import VideoWriter, write_pictur
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
-from kouxing.services.recognizer.front_end.pcm import measure_slices
+from kouxing.services.recognizer.front_end.slices import measure_slices
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.offline_recognition import WithProgress, recognize_recording
 from kouxing.services.recognizer.transcriber import Transcriber

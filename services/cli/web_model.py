@@ -38,7 +38,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.light import parse_light_model
 from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
-from kouxing.services.recognizer.front_end import pcm, resample, vad, whisper_mel
+from kouxing.services.recognizer.front_end import resample, slices, vad, whisper_mel
 from kouxing.services.recognizer.search import frame_search
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.services.synthesizer import face_animator
@@ -94,7 +94,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         nonverbal,
         "_HOLD_S _LEAD_S _LAUGH_EASE_S _LOUDNESS_DB _FORGET_DB_S _BREATH _SMILING _LOUD_NOTE",
     ),
-    "pcm": (pcm, "MEDIA_RATE_HZ SLICE"),
+    "pcm": (slices, "MEDIA_RATE_HZ SLICE"),
     "resample": (resample, "SAMPLE_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA"),
     "rest": (
         resting_lips,

@@ -22,6 +22,7 @@ from kouxing.services.driver.render.scene import open_renderer
 from kouxing.services.driver.video.video_renderer import VideoRenderer
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG, configure
+from kouxing.shared.pcm import as_floats
 
 MAX_QUEUED_FRAMES = 180_000  # per video: an hour at 50 frames per second, 75 MB
 MAX_COMMANDS = 500  # commands handled before the next image
@@ -70,7 +71,7 @@ class Recorder:
     def add_sound(self, number: int, media_time: int, pcm: bytes) -> None:
         """Add 16-bit sound, 16 kHz, unless the video has ended."""
         if self._is_open(number):
-            samples = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(32768)
+            samples = as_floats(np.frombuffer(pcm, "<i2"))
             with self._reports_failure(number):
                 self._videos[number].add_sound(media_time, samples)
 

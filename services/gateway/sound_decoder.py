@@ -5,10 +5,9 @@ import sys
 import wave
 from pathlib import Path
 
-import numpy as np
-
 from kouxing.shared.audio_file import clipping_warnings, count_clipped, limited_blocks, open_audio
 from kouxing.shared.errors import USER_ERROR, UserError
+from kouxing.shared.pcm import as_integers
 
 MAX_DURATION_S = 3600
 MAX_CPU_S = 60
@@ -27,8 +26,7 @@ def decode(path: Path) -> None:
         for block in limited_blocks(source, MAX_DURATION_S):
             num_samples += len(block)
             clipped += count_clipped(block)
-            mono = np.rint(block.mean(axis=1) * 32768).clip(-32768, 32767)
-            output.writeframes(mono.astype("<i2").tobytes())
+            output.writeframes(as_integers(block.mean(axis=1)).tobytes())
     clipped_fraction = clipped / max(1, num_samples * source.num_channels)
     for warning in (
         *source.notices,

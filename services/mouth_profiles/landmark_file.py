@@ -20,6 +20,7 @@ from kouxing.services.mouth_profiles.lip_tracks import measure_levels, select_li
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import as_floats
 from kouxing.shared.user_file import parse_json
 
 SUFFIX = ".landmarks"
@@ -73,7 +74,7 @@ def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], ND
         raise ValueError("its times do not increase from 0")
     if not (np.abs(landmarks) <= _MAX_PIXEL).all():  # false for NaN
         raise ValueError("its landmarks are not pixels")
-    samples = to_16_khz(pcm.astype(np.float32) / np.float32(32768), rate_hz)
+    samples = to_16_khz(as_floats(pcm), rate_hz)
     if len(samples) < MEDIA_RATE_HZ:
         raise ValueError("it has less than a second of audio")
     return time_s, landmarks.reshape(num_frames, num_points, 3), samples

@@ -8,7 +8,6 @@ from typing import TypeVar
 from kouxing_client.messages import Message
 
 from kouxing.services.recognizer.audio_queue import AudioQueue
-from kouxing.services.recognizer.front_end.pcm import decode_pcm
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
@@ -21,6 +20,7 @@ from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
+from kouxing.shared.pcm import decode_pcm
 from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange
 from kouxing.shared.replaying_publisher import ReplayingPublisher
 from kouxing.shared.sockets import Socket

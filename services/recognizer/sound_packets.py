@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from kouxing_client.messages import Sound
 
-from kouxing.services.recognizer.front_end.pcm import encode_pcm16
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
+from kouxing.shared.pcm import as_integers
 from kouxing.shared.phones.events import EndOfSound, SoundEvent, Waveform
 
 PACKET_S = 0.04  # duration of a message; less if the face has a shorter delay
@@ -35,6 +35,6 @@ class SoundPackets:
 
     def _take(self) -> Iterator[Sound]:
         if len(self._samples):
-            yield Sound(media_time=self._start, pcm=encode_pcm16(self._samples))
+            yield Sound(media_time=self._start, pcm=as_integers(self._samples).tobytes())
             self._start += len(self._samples)
             self._samples = self._samples[:0]

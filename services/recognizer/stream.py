@@ -12,8 +12,8 @@ from collections.abc import Iterable
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.front_end.features import frame_at
-from kouxing.services.recognizer.front_end.pcm import SliceMeter
 from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.services.recognizer.front_end.slices import SliceMeter
 from kouxing.services.recognizer.lip_frames import LipFrameModel, choose_delay
 from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig

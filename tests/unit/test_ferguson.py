@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.front_end.pcm import measure_slices
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.front_end.slices import measure_slices
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps

@@ -22,7 +22,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats, as_integers, load_or_compute
+from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors
@@ -34,6 +34,7 @@ from kouxing.services.recognizer.acoustic.model_file import (
     parse_topology,
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, count_frames
+from kouxing.shared.pcm import as_floats, as_integers
 from kouxing.shared.terminal import print_message
 from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, BatchSource
 from kouxing.training.blocks.export import export_onnx

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kouxing.corpora.feature_cache import as_integers, read_audio
+from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.lip_clips import (
     LipClip,
     label_clips,
@@ -32,6 +32,7 @@ from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.encoder import VoiceKind
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import as_integers
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.device import DEVICE, mixed_precision

@@ -29,11 +29,12 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats, as_integers, load_or_compute
+from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.encoder import VoiceKind
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import as_floats, as_integers
 from kouxing.shared.terminal import write_text
 from kouxing.training.encoder.lip_teacher import LipTeacher, TeacherFeatures
 from kouxing.training.encoder.singing import sing

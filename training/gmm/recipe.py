@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
 from kouxing.services.recognizer.front_end.features import (
@@ -14,6 +13,7 @@ from kouxing.services.recognizer.front_end.features import (
     LogMel,
     compute_cepstra_batch,
 )
+from kouxing.shared.pcm import as_floats
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.terminal import print_message
 from kouxing.training.gmm.estimation import (

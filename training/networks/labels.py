@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.feature_cache import as_floats
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import (
@@ -31,6 +30,7 @@ from kouxing.services.recognizer.search.forced_path import (
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import as_floats
 from kouxing.training.durations import PhoneDurations
 from kouxing.training.networks.batches import FrameTargets, LabeledRecording
 from kouxing.training.networks.teacher import WholeEncoder, train_teacher

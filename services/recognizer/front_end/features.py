@@ -31,7 +31,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-SAMPLE_RATE_HZ = 16_000
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.pcm import FULL_SCALE
+
+SAMPLE_RATE_HZ = MEDIA_RATE_HZ
 WINDOW_S = 0.025
 HOP_S = 0.010
 WINDOW_SAMPLES = round(WINDOW_S * SAMPLE_RATE_HZ)
@@ -43,7 +46,6 @@ NUM_FEATURES = 3 * NUM_STATIC
 LOWEST_HZ, HIGHEST_HZ = 40.0, 7600.0  # edges of the filter bank
 MELS, MEL_KNEE_HZ = 1127.0, 700.0  # mel = 1127 ln(1 + f / 700)
 
-_FULL_SCALE = 32768.0  # the filter bank expects the scale of 16-bit samples
 LOG_FLOOR = 6.0  # a few decibels above the noise of the least significant bit
 _MEAN_MEMORY_FRAMES = 1500.0  # the live mean forgets older speech
 _PRIOR_FRAMES = 100.0  # weight of the prior mean
@@ -122,7 +124,8 @@ class LogMel:
 
         Returns the new feature frames, shape (frames, 41): log energy, 40 log-mel bands.
         """
-        self._bank.accept_waveform(SAMPLE_RATE_HZ, (samples * _FULL_SCALE).tolist())
+        # the filter bank expects the scale of 16-bit samples
+        self._bank.accept_waveform(SAMPLE_RATE_HZ, (samples * FULL_SCALE).tolist())
         num_ready = self._bank.num_frames_ready
         rows = np.empty((num_ready - self._num_read, 1 + NUM_BANDS), dtype=np.float32)
         for row in range(len(rows)):

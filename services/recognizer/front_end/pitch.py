@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.pcm import FULL_SCALE
 
 _SLICE_MS = 20.0
 _PITCH_STEP = 0.01  # ratio of neighboring pitches minus 1; half of Kaldi's takes twice the time
-_FULL_SCALE = 32768.0  # Kaldi's samples are 16-bit integers
 # Kaldi's feature (1.0001 - NCCF)^0.15 - 1, doubled: the normalized cross-correlation is over 0.8
 _VOICED = -0.43
 # Kaldi's tracker keeps all its input, 250 kB a second. A new tracker replaces it after this number
@@ -54,7 +54,7 @@ class PitchTracker:
 
         The pitch is measured about 10 ms before the end.
         """
-        scaled = (samples * _FULL_SCALE).tolist()
+        scaled = (samples * FULL_SCALE).tolist()  # Kaldi expects 16-bit samples
         if self._num_slices % _REPLACE_AFTER == _REPLACE_AFTER - _START_BEFORE:
             self._trackers.append(self._new_tracker())
         for tracker in self._trackers:

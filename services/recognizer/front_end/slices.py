@@ -1,4 +1,4 @@
-"""Conversion of audio bytes to samples and back, and the level and pitch of 20 ms slices."""
+"""Slices of 20 ms, and their level and pitch."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -8,33 +8,9 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
-from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Progress
 
-SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
-FULL_SCALE = 32768.0
 SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
-
-
-def decode_pcm(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
-    """Convert bytes to samples, shape (n, channels), clipped to [-1, 1].
-
-    Raises ``UserError`` if the bytes are not a whole number of sample frames, or a sample is not
-    finite.
-    """
-    frame_bytes = SAMPLE_BYTES[encoding] * num_channels
-    if len(pcm) % frame_bytes:
-        raise UserError(
-            f"{len(pcm)} bytes are not a multiple of {frame_bytes} bytes ({encoding}, channels: "
-            f"{num_channels}); send the encoding and channels that the session was opened with"
-        )
-    if encoding == "s16le":
-        scaled = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(FULL_SCALE)
-        return scaled.reshape(-1, num_channels)
-    samples = np.frombuffer(pcm, "<f4").astype(np.float32)
-    if not np.isfinite(samples).all():
-        raise UserError("the chunk was dropped: it contains NaN or infinite samples")
-    return np.clip(samples, -1.0, 1.0).reshape(-1, num_channels)
 
 
 def split_slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
@@ -44,12 +20,6 @@ def split_slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDAr
         end = begin + SLICE - (num_before + begin) % SLICE
         yield samples[begin:end]
         begin = end
-
-
-def encode_pcm16(samples: NDArray[np.float32]) -> bytes:
-    """Convert mono samples in [-1, 1] to little-endian int16 bytes."""
-    scaled = np.clip(np.rint(samples * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
-    return bytes(scaled.astype("<i2").tobytes())
 
 
 def level_db(samples: NDArray[np.float32]) -> float:
