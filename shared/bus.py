@@ -5,6 +5,7 @@ linger. Connections are encrypted and both ends are authenticated (CURVE), unles
 key. The endpoint of a bound socket with a key includes the public key: ``tcp://HOST:PORT KEY``.
 """
 
+import errno
 import secrets
 from collections.abc import Callable, Iterable
 from enum import Enum
@@ -31,6 +32,14 @@ COMMANDS = SocketLimits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
 PHONES = SocketLimits(part_bytes=4 * KIB, queue_length=64)
 # most of the cost is for the handshake
 SUBSCRIPTIONS = SocketLimits(part_bytes=512, queue_length=32, cost=1.0)
+
+
+def _bind_problem(error: zmq.ZMQError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return "the port is in use; stop the program that uses it, or choose another port"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return "this host has no such address; use one of its addresses, or 0.0.0.0"
+    return f"{error.strerror or error}; use an address of this host"
 
 
 class ProbeResult(Enum):
@@ -177,10 +186,7 @@ class Bus:
             raw.bind(endpoint)
         except zmq.ZMQError as error:
             raw.close(linger=0)
-            raise UserError(
-                f"{key}: cannot bind {endpoint}: {error.strerror or error}; "
-                "stop any other system, and use an address of this host"
-            ) from None
+            raise UserError(f"{key}: cannot bind {endpoint}: {_bind_problem(error)}") from None
         limited.port = int(raw.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
         socket = Socket(
             raw,

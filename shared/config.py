@@ -407,14 +407,20 @@ def parse_assignments(assignments: Iterable[str], service: str = "") -> dict[str
     """Split the values of ``--set`` into keys and values.
 
     The name of ``service`` before a key is removed. Raises ``UserError`` if an assignment is not
-    ``KEY=VALUE``.
+    ``KEY=VALUE``, or sets a key of another service than ``service``.
     """
     values = {}
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
         if not equals:
             raise UserError(f"--set {assignment}: write --set KEY=VALUE")
-        values[key.removeprefix(f"{service}.")] = value
+        key = key.removeprefix(f"{service}.")
+        if service and "." in key:
+            raise UserError(
+                f"--set {assignment}: this command has only the keys of {service}, and not the key"
+                f" {key}"
+            )
+        values[key] = value
     return values
 
 
@@ -449,7 +455,9 @@ def _key_docstrings(config_type: type[ServiceConfig]) -> dict[str, str]:
 
 
 def _hint(name: str, known: Iterable[str]) -> str:
-    (nearest,) = difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)
+    _, dot, key = name.rpartition(".")
+    same_key = [other for other in known if dot and other.endswith(f".{key}")]
+    (nearest,) = difflib.get_close_matches(name, same_key or [*known], n=1, cutoff=0.0)
     return f"the nearest is {nearest}; 'kouxing config' lists all"
 
 

@@ -188,6 +188,7 @@ class Service(MessageLoop):
                 host.strip("[]"), int(port), self.metrics, self.name, is_alive=self.check_health
             )
         self._warn_if_open_to_others()
+        self._warn_if_closed_to_others()
         self._send_heartbeat()
         if self.control is None:
             self._log_ready()
@@ -272,6 +273,19 @@ class Service(MessageLoop):
         bound = [endpoint for endpoint in self.endpoints.values() if endpoint.startswith("tcp://")]
         if not all(is_loopback(split_endpoint(endpoint, "")[0]) for endpoint in bound):
             LOG.warning("insecure = true: anyone who can reach %s has full access", " ".join(bound))
+
+    def _warn_if_closed_to_others(self) -> None:
+        if is_loopback(split_endpoint(self.config.control, "")[0]):
+            return
+        for key, endpoint in self.endpoints.items():
+            address = endpoint.partition(" ")[0]
+            if address.startswith("tcp://") and is_loopback(split_endpoint(address, "")[0]):
+                LOG.warning(
+                    "other hosts cannot connect to %s at %s; to change this, set this key to"
+                    " tcp://0.0.0.0:PORT",
+                    key,
+                    address,
+                )
 
     # --- control -------------------------------------------------------------------------------
 

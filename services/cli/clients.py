@@ -377,7 +377,9 @@ def find_control_address(address: str) -> Iterator[str]:
 
 def _not_running_text(others: Sequence[RunningSystem]) -> str:
     text = "your kouxing is not running on this machine; start it with 'kouxing run'"
-    if others:
+    if not others:
+        text += ", or set --control or KOUXING_CONTROL to the address of control"
+    else:
         listed = ", ".join(f"{system.address} (keys: {system.keys})" for system in others)
         text += (
             f". A system with other keys runs at {listed}; to use it, set XDG_STATE_HOME to the"

@@ -15,7 +15,7 @@ from kouxing.services.cli.running_system import running_systems
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.client_connection import connect_client
-from kouxing.shared.endpoints import split_endpoint, with_key
+from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT, CLIENT_ROLES, load_local_keys, load_user_key, rejection_hint
 from kouxing.shared.terminal import plural
@@ -69,10 +69,11 @@ def run_checks(address: str) -> Iterator[CheckResult]:
     except UserError as error:
         yield CheckResult("status", "control does not answer", str(error))
         return
+    is_one_host = is_loopback(split_endpoint(endpoint_address, "control")[0])
     with contextlib.ExitStack() as stack:
         buses = {name: stack.enter_context(Bus(key)) for name, key in accepted.items()}
         for service in services:
-            yield from _check_service(service, buses)
+            yield from _check_service(service, buses, is_one_host=is_one_host)
     for name in REQUIRED_SERVICES:
         if name not in {service.service for service in services}:
             yield CheckResult(
@@ -108,7 +109,9 @@ def _default_roles(name: str) -> Collection[str]:
     return KINDS[name].key_roles if name in KINDS else CLIENT_ROLES
 
 
-def _check_service(service: ServiceState, buses: Mapping[str, Bus]) -> Iterator[CheckResult]:
+def _check_service(
+    service: ServiceState, buses: Mapping[str, Bus], *, is_one_host: bool
+) -> Iterator[CheckResult]:
     problems = []
     if service.age_s > MAX_AGE_S:
         problems.append(f"silent for {service.age_s:.0f} s; look at its log")
@@ -124,19 +127,26 @@ def _check_service(service: ServiceState, buses: Mapping[str, Bus]) -> Iterator[
         )
     for name, endpoint in service.endpoints.items():
         address = endpoint.partition(" ")[0]
-        if problem := _endpoint_problem(name, endpoint, buses):
+        if problem := _endpoint_problem(name, endpoint, buses, is_one_host=is_one_host):
             problems.append(f"{name} at {address}: {problem}")
     endpoints = plural(len(service.endpoints), "endpoint")
     about = f"{endpoints}, clock {service.clock_offset_ms:+z.0f} ms"
     yield CheckResult(service.instance, about, "\n".join(problems))
 
 
-def _endpoint_problem(name: str, endpoint: str, buses: Mapping[str, Bus]) -> str:
+def _endpoint_problem(
+    name: str, endpoint: str, buses: Mapping[str, Bus], *, is_one_host: bool
+) -> str:
     if endpoint.startswith("http"):
         page = urlsplit(endpoint)
         default = 443 if page.scheme == "https" else 80
         return reach_error(page.hostname or "", str(page.port or default))
-    if reason := reach_error(*split_endpoint(endpoint.partition(" ")[0], name), is_zeromq=True):
+    host, port = split_endpoint(endpoint.partition(" ")[0], name)
+    if reason := reach_error(host, port, is_zeromq=True):
+        if is_loopback(host) and not is_one_host:
+            return (
+                "only its own host can connect; set this key of the service to tcp://0.0.0.0:PORT"
+            )
         return reason
     is_publisher = name in PUBLISHERS
     for key_name, bus in buses.items():

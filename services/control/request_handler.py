@@ -8,7 +8,7 @@ from kouxing_client.messages import Message
 
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import Rejected
-from kouxing.shared.keys import Peer
+from kouxing.shared.keys import Grant, Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Socket
@@ -91,15 +91,24 @@ class RequestHandler:
         Raises ``Rejected`` if the key lacks these roles.
         """
         if roles and not self.has_role(sender.key, *roles):
-            text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
+            grant = self._find_grant(sender.key)
+            name = grant.name if grant else "(revoked)"
+            text = (
+                f"the key {name} has no role {' or '.join(roles)}; on"
+                " control's machine, 'kouxing keys list' shows the roles, and 'kouxing keys add'"
+                " creates another key"
+            )
             raise Rejected(ErrorCode.NOT_ALLOWED, text)
 
     def has_role(self, key: str, *roles: str) -> bool:
         """Return whether a key has one of ``roles``; True if ``insecure``."""
         if self._bus.zap is None:
             return True
-        grant = self._bus.zap.grants.get(key)
+        grant = self._find_grant(key)
         return grant is not None and not set(roles).isdisjoint(grant.roles)
+
+    def _find_grant(self, key: str) -> Grant | None:
+        return None if self._bus.zap is None else self._bus.zap.grants.get(key)
 
     def may_see_token(self, sender: Peer) -> bool:
         """Return whether a sender may have the page's token: a client or a service."""

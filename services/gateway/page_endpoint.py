@@ -9,7 +9,7 @@ from urllib.parse import quote
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.certificate import load_tls_context
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, local_address
+from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
 
     Raises ``UserError`` if the certificate can neither be read nor created.
     """
-    host = config.advertise or (local_address() if config.host in WILDCARDS else config.host)
+    host = config.advertise or (config.advertised_host if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
     local_name = socket.gethostname()
     names = {host, local_name, f"{local_name}.local", *config.names}

@@ -89,6 +89,19 @@ class ServiceWithKey(Service):
     kind = ServiceKind(name="keyed", role="worker")
 
 
+@pytest.mark.parametrize(("control", "warns"), [("10.0.0.1", True), ("127.0.0.1", False)])
+def test_warns_if_only_this_host_can_connect_but_control_is_for_others(
+    control: str, warns: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = ServiceConfig(control=f"tcp://{control}:5550", insecure=True)
+    service = ServiceWithKey(config, has_control=False)
+    service.endpoints = {"audio": "tcp://127.0.0.1:5560", "phones": "tcp://10.0.0.2:5561"}
+    service.startup()
+    service.bus.close()
+    assert ("cannot connect to audio at tcp://127.0.0.1:5560" in caplog.text) is warns
+    assert "connect to phones" not in caplog.text
+
+
 @pytest.fixture
 def slow(clock: Clock) -> Iterator[SlowService]:
     service = SlowService(clock)

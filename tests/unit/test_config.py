@@ -16,7 +16,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES
 from kouxing.services.service_kinds import CONFIG_TYPES, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.config import KnownNames, ServiceConfig, Settings
+from kouxing.shared.config import KnownNames, ServiceConfig, Settings, parse_assignments
 from kouxing.shared.errors import UserError
 from tests.documents import code_blocks
 from tests.system import ROOT
@@ -142,6 +142,7 @@ def test_names_may_have_capitals() -> None:
         ("common = 1\n", r"unknown table \[common\]"),
         ("[recognizer]\nspeed = 1\n", "unknown key recognizer.speed; the nearest is recognizer."),
         ("[common]\nmin_confidence = 1\n", "the nearest is recognizer.min_confidence"),
+        ("[control]\nlips = 'learned'\n", "the nearest is synthesizer.lips"),
         ("[driver]\nout = ['a']\n", "driver.out: .* is not text"),
         ("[gateway]\nsenders = 'vmc://'\n", "gateway.senders: .* is not a list"),
         ("[recognizer]\naudio = 5560\n", r"audio: '5560' \(from .*kouxing.toml"),
@@ -254,3 +255,5 @@ def test_an_unknown_service_or_key_is_an_error() -> None:
         config("listener")
     with pytest.raises(UserError, match=r"--set: .* key port; the nearest is gateway.port"):
         config(assignments=["port=1"])
+    with pytest.raises(UserError, match="only the keys of control, and not the key gateway"):
+        parse_assignments(["lost_after_s=2", "gateway.port=1"], "control")

@@ -66,7 +66,8 @@ const CHINESE = {
   "the limit of control.max_sessions is reached: {count}": "会话数已达上限 control.max_sessions：{count}",
   "your key has {count} open sessions, the maximum; close one first": "此密钥已有 {count} 个会话，达到上限，请先关闭一个",
   "too many services are registered; stop some": "服务太多，请先停止一些",
-  "the key has no role {roles}; see 'kouxing keys list'": "网关的密钥没有权限（{roles}），见 kouxing keys list",
+  "the key {name} has no role {roles}; on control's machine, 'kouxing keys list' shows the roles, and 'kouxing keys add' creates another key":
+    "网关的密钥 {name} 没有权限（{roles}）；在运行控制服务的机器上，kouxing keys list 显示权限，kouxing keys add 创建另一个密钥",
   "no {kind} has the language {language}; choose another one": "没有 {kind} 能识别语言 {language}，请在“设置”中选择其他语言",
   "{missing}; {start} (or everything with 'kouxing run')": "{missing}，{start}（或用 kouxing run 启动全部服务）",
   "no {kind} is running": "没有运行 {kind}",
