@@ -261,11 +261,14 @@ class VTubeStudioConnection(TargetConnection):
     async def _write(
         self, vtube_studio: aiohttp.ClientWebSocketResponse, protocol: VTubeStudioProtocol
     ) -> None:
-        while True:
-            frame = await self._newest.get()
-            message = protocol.frame_message(frame, is_mouth_only=self.target.is_mouth_only)
-            async with asyncio.timeout(TIMEOUT_S):
-                await vtube_studio.send_str(message)
+        try:
+            while True:
+                frame = await self._newest.get()
+                message = protocol.frame_message(frame, is_mouth_only=self.target.is_mouth_only)
+                async with asyncio.timeout(TIMEOUT_S):
+                    await vtube_studio.send_str(message)
+        except TimeoutError:  # VTube Studio hangs, or its computer sleeps
+            await vtube_studio.close()
 
     def _save_token(self, token: str) -> None:
         _write_tokens({**_read_tokens(), self._address: token})
