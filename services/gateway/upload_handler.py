@@ -82,7 +82,7 @@ class UploadHandler(ABC):
         exchange = asyncio.create_task(process.communicate(content))
         end_s = asyncio.get_running_loop().time() + limit_s
         try:
-            while not exchange.done():
+            while not exchange.done() and not self._is_closing:
                 await asyncio.wait({exchange}, timeout=PRESENCE_CHECK_S)
                 if asyncio.get_running_loop().time() > end_s:
                     raise TimeoutError

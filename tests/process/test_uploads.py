@@ -56,8 +56,9 @@ async def serve(uploads: UploadHandler) -> AsyncIterator[Post]:
     address = f"http://127.0.0.1:{runner.addresses[0][1]}/upload"
     async with aiohttp.ClientSession() as http, asyncio.timeout(200):
 
-        async def post(data: bytes = b"abc", name: str = "") -> Answer:
-            async with http.post(address, params={"name": name}, data=io.BytesIO(data)) as answer:
+        async def post(data: bytes | AsyncIterator[bytes] = b"abc", name: str = "") -> Answer:
+            body = io.BytesIO(data) if isinstance(data, bytes) else data
+            async with http.post(address, params={"name": name}, data=body) as answer:
                 warnings = unquote(answer.headers.get(REMARKS_HEADER, ""))
                 return answer.status, await answer.read(), warnings
 
@@ -132,6 +133,21 @@ async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
         await wait_until_ended(process)
         assert not hanging.is_running
         assert await post() == error(503, "the gateway is stopping")
+
+
+@async_test
+async def test_does_not_learn_from_a_recording_that_arrives_after_close(tmp_path: Path) -> None:
+    hanging = fake_learner(HANG)
+
+    async def record() -> AsyncIterator[bytes]:
+        yield str(tmp_path / "process").encode()
+        while not hanging._is_busy:
+            await asyncio.sleep(0.02)
+        hanging.close()
+
+    async with serve(hanging) as post:
+        assert await post(record()) == error(422, "the gateway is stopping")
+        assert not hanging.is_running
 
 
 @async_test
