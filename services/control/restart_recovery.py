@@ -23,6 +23,9 @@ class RestartRecovery:
         audio = self._registry[instance].heartbeat.endpoints.get("audio")
         if not self.is_active or audio is None or start.endpoints.get("audio") != audio:
             return False
+        known = self._reported.get(start.session)
+        if known is not None and known.epoch > start.epoch:
+            return False  # the session has moved away from this recognizer, which was stalled
         self._reported[start.session] = start
         return True
 

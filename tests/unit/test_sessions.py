@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import pytest
 from kouxing_client.messages import SessionFacts
 
+from kouxing.services.control.restart_recovery import RestartRecovery
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
@@ -288,3 +289,17 @@ def test_a_heartbeat_without_sessions_may_be_older(cluster: Cluster) -> None:
     assert cluster.registry.next_overdue_s() == pytest.approx(3.75)
     assert cluster.registry.overdue_services(3.7) == []
     assert cluster.registry.overdue_services(3.8) == ["synthesizer-1"]
+
+
+def test_restores_a_session_from_its_newest_recognizer(cluster: Cluster) -> None:
+    record = cluster.open("demo")
+    stalled = record.start_message(0.0)
+    cluster.lose("recognizer-1")
+    cluster.add(worker("recognizer", "recognizer-2"))
+    assert cluster.sessions.move(record, 1.0)
+    cluster.add(worker("recognizer", "recognizer-1"))
+    recovery = RestartRecovery(cluster.registry, 2.0)
+    assert recovery.add(record.start_message(2.0), "recognizer-2")
+    recovery.add(stalled, "recognizer-1")
+    (start,) = recovery.pop_complete()
+    assert start.epoch == 2
