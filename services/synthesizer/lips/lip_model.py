@@ -5,6 +5,7 @@ model, add a package like ``dynamic_visemes`` whose ``__init__`` defines ``LIP_M
 ``services.lip_models``.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -25,11 +26,23 @@ class Articulation(Protocol):
         """Return the usual level of the speech at a time, relative to the speaker's mean."""
 
 
+@dataclass(frozen=True, slots=True)
+class SyllableArticulation:
+    """Syllable onsets without usual levels; implements ``Articulation``."""
+
+    syllable_onsets_s: NDArray[np.float64]
+
+    def usual_level_db(self, time_s: float) -> float | None:
+        """Return None (unknown)."""
+        del time_s
+        return None
+
+
 class MouthFrame(Record, frozen=True):
     """The mouth at one time."""
 
     faps: NDArray[np.float64]  # (num_mouth_faps,) FAP units, in the order of MOUTH_FAPS
-    articulation: Articulation
+    articulation: Articulation = SyllableArticulation(np.zeros(0))  # unknown
 
 
 class LipStream(Protocol):

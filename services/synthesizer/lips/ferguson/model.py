@@ -35,7 +35,7 @@ from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
     SyllableSegmenter,
 )
 from kouxing.services.synthesizer.lips.known_phones import KnownPhones
-from kouxing.services.synthesizer.lips.lip_model import MouthFrame
+from kouxing.services.synthesizer.lips.lip_model import MouthFrame, SyllableArticulation
 from kouxing.services.synthesizer.lips.trajectory import (
     NO_TRANSITION,
     FapState,
@@ -87,18 +87,6 @@ class FergusonLips:
             )
             for is_initial, phones in kinds.items()
         }
-
-
-@dataclass(frozen=True, slots=True)
-class SyllableArticulation:
-    """Syllable onsets without usual levels; implements ``Articulation``."""
-
-    syllable_onsets_s: Array
-
-    def usual_level_db(self, time_s: float) -> float | None:
-        """Return None (unknown)."""
-        del time_s
-        return None
 
 
 class FergusonStream:
