@@ -173,15 +173,15 @@ def animate(
         events = recording.events
     spoken = [event for event in events if isinstance(event, Phone) and event.is_spoken]
     return FaceMotion(
-        faces[0] if len(faces) == 1 else film.stack_faces(faces),
-        settings[0].frame_rate_hz,
-        _IMAGE_RATE_HZ,
-        samples,
-        spoken,
-        write_syllables(spoken, transcript, model.inventory),
-        source,
-        language,
-        has_wrong_text,
+        frames=faces[0] if len(faces) == 1 else film.stack_faces(faces),
+        frame_rate_hz=settings[0].frame_rate_hz,
+        image_rate_hz=_IMAGE_RATE_HZ,
+        samples=samples,
+        phones=spoken,
+        syllables=write_syllables(spoken, transcript, model.inventory),
+        source=source,
+        language=language,
+        has_wrong_text=has_wrong_text,
     )
 
 
