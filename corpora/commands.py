@@ -50,7 +50,7 @@ def adapt(
         (measure, *("-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures))
         for measure, *figures in zip(MEASURES, learned.gain.before, learned.gain.after, strict=True)
     ]
-    print_table(Console(), "", columns, rows)
+    print_table(Console(), columns, rows)
     write_json(json_file, learned.figures())
     print_message(
         f"wrote {output}, learned from {learned.speech_s:.0f} s of speech; the table compares the "

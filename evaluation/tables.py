@@ -25,7 +25,7 @@ def show_results(json_file: Path | None, results: object, *tables: Table) -> Non
     """Print the tables of a command. Write its results to the JSON file, if there is one."""
     console = Console()
     for table in tables:
-        print_table(console, table.title, table.columns, table.rows)
+        print_table(console, table.columns, table.rows, title=table.title)
     write_json(json_file, results)
 
 

@@ -57,7 +57,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def print_table(
-    console: Console, title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
+    console: Console, columns: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = ""
 ) -> None:
     """Print a table; a row may lack its last cells.
 

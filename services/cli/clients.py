@@ -301,7 +301,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
             if name.endswith(("_p50", "_p95")) or name in SHOWN_METRICS or _is_drop_counter(name)
         )
         services.append((service.instance, service.state, f"{service.age_s:.1f} s ago", metrics))
-    print_table(out, "", ("service", "state", "last seen", "metrics"), services)
+    print_table(out, ("service", "state", "last seen", "metrics"), services)
     if not report.sessions:
         out.print("no session is open")
     else:
@@ -318,7 +318,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
         ]
         lateness = "late: p50, p95, worst"
         columns = ("session", "state", "open for", lateness, "skipped", "workers")
-        print_table(out, "", columns, sessions)
+        print_table(out, columns, sessions)
     write_json(json_file, msgspec.to_builtins(report))
 
 

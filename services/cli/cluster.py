@@ -39,4 +39,4 @@ def cluster(
     if not hosts:
         typer.echo("no workers are running on this cluster")
         return
-    print_table(Console(), "", ("worker", "host"), hosts.items())
+    print_table(Console(), ("worker", "host"), hosts.items())

@@ -67,7 +67,7 @@ def list_keys() -> None:
     """List the allowed keys with their roles."""
     grants = sorted(read_grants().items(), key=lambda item: item[1].name)
     rows = ((grant.name, ", ".join(grant.roles), public) for public, grant in grants)
-    print_table(Console(), "", ("name", "roles", "public key"), rows)
+    print_table(Console(), ("name", "roles", "public key"), rows)
 
 
 @app.command()

@@ -15,7 +15,6 @@ from aiohttp import web, web_fileresponse
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
-from kouxing.services.gateway.config import ADDRESS_SHARE
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG, RateLimit
 from kouxing.shared.metrics import trim_heap
@@ -196,10 +195,7 @@ class WebServer:
     """
 
     def __init__(
-        self,
-        listener: socket.socket,
-        tls: ssl.SSLContext | None,
-        address_share: float = ADDRESS_SHARE,
+        self, listener: socket.socket, tls: ssl.SSLContext | None, address_share: float
     ) -> None:
         self._listener = listener
         self._tls = tls

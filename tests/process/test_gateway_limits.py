@@ -17,6 +17,7 @@ from aiohttp.test_utils import TestServer
 from aiohttp.typedefs import Handler
 
 from kouxing.services.gateway import microphone_handler, viewer_handler, web_server, whip_handler
+from kouxing.services.gateway.config import ADDRESS_SHARE
 from kouxing.services.gateway.microphone_handler import MicrophoneHandler
 from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.web_application import OpenWebSockets
@@ -97,7 +98,7 @@ async def serve(
     bound = bound or web_server.bind_port("127.0.0.1", 0)
     limited = LimitedServer(bound.getsockname())
     monkeypatch.setattr(web_server, "time", SimpleNamespace(monotonic=lambda: limited.now_s))
-    http_server = WebServer(bound, None)
+    http_server = WebServer(bound, None, ADDRESS_SHARE)
     application = web.Application()
     application.add_routes(
         [

@@ -20,7 +20,7 @@ ROWS = [
 @pytest.mark.parametrize("width", [120, 80, 40])
 def test_a_table_fits_and_keeps_words_whole(width: int) -> None:
     text = StringIO()
-    print_table(Console(file=text, width=width), "mean opinion scores", COLUMNS, ROWS)
+    print_table(Console(file=text, width=width), COLUMNS, ROWS, title="mean opinion scores")
     printed = text.getvalue()
     words = {word for cell in itertools.chain(COLUMNS, *ROWS) for word in cell.split()}
     assert words <= set(re.split(r"[\s:]+", printed))
