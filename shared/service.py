@@ -68,20 +68,17 @@ class Service(MessageLoop):
     """Base class of all services.
 
     A subclass sets ``kind``, fills in ``endpoints`` and ``facts``, registers handlers for its own
-    sockets, and overrides the methods of the first section below. Only control itself has no
-    connection to control (``has_control``).
+    sockets, and overrides the methods of the first section below.
     """
 
     kind: ClassVar[ServiceKind]
+    connects_to_control: ClassVar[bool] = True  # False: it is control
 
-    def __init__(
-        self, config: ServiceConfig, *, has_control: bool = True, extra_connections: int = 0
-    ) -> None:
+    def __init__(self, config: ServiceConfig, *, extra_connections: int = 0) -> None:
         self.config = config
         self.name = self.kind.name
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
         self.has_new_key = False  # True: the process must restart
-        self._has_control = has_control
         self.key = None if config.insecure else self._load_key()
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
         super().__init__(Bus(self.key, extra_connections=extra_connections))
@@ -103,7 +100,7 @@ class Service(MessageLoop):
         self._control_instance = ""
         self.load_meter = LoadMeter(LOAD_PERIOD_S, time.monotonic())
         self._metrics_server: MetricsServer | None = None
-        self.control = self._connect_to_control() if has_control else None
+        self.control = self._connect_to_control() if self.connects_to_control else None
 
     # --- for subclasses to override ------------------------------------------------------------
 
@@ -313,7 +310,7 @@ class Service(MessageLoop):
             self.handle_messages(self.control)
 
     def _load_key(self) -> Key:
-        control = self.config.control if self._has_control else ""
+        control = self.config.control if self.connects_to_control else ""
         return load_key(self.name, self.kind.key_roles, control=control)
 
     def _connect_to_control(self) -> Socket:

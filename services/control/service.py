@@ -61,9 +61,10 @@ class ControlService(Service):
     """The control process."""
 
     kind = KINDS["control"]
+    connects_to_control = False
 
     def __init__(self, config: ControlConfig) -> None:
-        super().__init__(config, has_control=False, extra_connections=config.max_sessions)
+        super().__init__(config, extra_connections=config.max_sessions)
         now_s = time.monotonic()
         self._registry = ServiceRegistry(config.lost_after_s)
         placement = Placement(self._registry, config.max_load)

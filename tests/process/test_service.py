@@ -64,9 +64,10 @@ class SlowService(Service):
     """Takes 5 ms for a message; counts ticks, heartbeats and messages."""
 
     kind = ServiceKind(name="slow", role="worker")
+    connects_to_control = False
 
     def __init__(self, clock: Clock) -> None:
-        super().__init__(ServiceConfig(insecure=True), has_control=False)
+        super().__init__(ServiceConfig(insecure=True))
         self.clock = clock
         self.num_ticks = self.num_beats = self.num_handled = 0
         self.tick_due_s = math.inf
