@@ -38,6 +38,7 @@ MAX_SHOWN = 40  # characters of a client's text in an error
 FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
 _FORMAT_FIELDS = PcmFormat.__struct_fields__
 COMMANDS = ("skip", "flush", "last", *FACE_SETTINGS)  # of a microphone
+CHANNEL_COMMANDS = ("flush", *FACE_SETTINGS)  # of a WebRTC client
 VIEWER_COMMANDS = ("follow", "play", "avatar", "format", *FACE_SETTINGS)
 FORMATS = ("binary", "json", "msgpack")  # of blendshapes
 # names in version 0.1.0, which are still accepted
@@ -90,8 +91,10 @@ class MicrophoneCommand(Struct, frozen=True, kw_only=True):
     problem: str = ""  # error about unknown fields, which are ignored
 
 
-def parse_command(message: str, pcm_format: PcmFormat | None = None) -> MicrophoneCommand:
-    """Parse a later text message of a microphone.
+def parse_command(
+    message: str, pcm_format: PcmFormat | None = None, known: Collection[str] = COMMANDS
+) -> MicrophoneCommand:
+    """Parse a later text message of a microphone, in which the fields ``known`` are allowed.
 
     Raises ``UserError`` if the message is not a JSON object, a field is out of range, or it
     describes audio of another format than ``pcm_format``.
@@ -101,7 +104,7 @@ def parse_command(message: str, pcm_format: PcmFormat | None = None) -> Micropho
     for name in _FORMAT_FIELDS:
         if name in fields and pcm_format and fields[name] != getattr(pcm_format, name):
             raise UserError(f"{name} cannot change during a session; open another connection")
-    problem = find_unknown([name for name in fields if name not in _FORMAT_FIELDS], COMMANDS)
+    problem = find_unknown([name for name in fields if name not in _FORMAT_FIELDS], known)
     settings = parse_face_settings(fields)
     face = {name: getattr(settings, name) for name in FACE_SETTINGS} if settings else {}
     return _convert({**fields, "face": face, "problem": problem}, MicrophoneCommand)

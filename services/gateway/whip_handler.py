@@ -1,7 +1,7 @@
 """WHIP (RFC 9725): a WebRTC client connects with one POST request.
 
 The client's audio track streams into a separate session. Its data channel receives the messages
-of a viewer of that session, except the sound, and accepts a microphone's commands.
+of a viewer of that session, except the sound, and accepts ``CHANNEL_COMMANDS``.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from kouxing_client import KouxingError, Refused
 
 from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.audio_sessions import AudioClient, AudioSession, error_text
+from kouxing.services.gateway.browser_messages import CHANNEL_COMMANDS
 from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_handler import ViewerHandler
@@ -37,6 +38,10 @@ SDP = "application/sdp"
 MAX_COMMANDS = 100  # limit of queued commands of one client
 MAX_BUFFERED_BYTES = 16 * 1024  # limit for a data channel; more messages stay in the viewer's queue
 BUFFER_CHECK_S = 0.02
+DROPPED = (
+    f"the command is dropped: {MAX_COMMANDS} commands are queued; send at most"
+    f" {1 / COMMAND_S:g} per second"
+)
 NO_WEBRTC = (
     "this gateway has no WebRTC; install it where the gateway runs: pip install 'kouxing[webrtc]'\n"
 )
@@ -148,11 +153,14 @@ class WhipHandler:
         """Stream a client's sound into its session until it disconnects, then close the stack."""
         async with stack:
             LOG.info("a WebRTC client is streaming", extra={"session": session.name})
-            async for num_lost, pcm, num_frames in peer.receive_audio():
-                session.skip(num_lost)
-                session.send(pcm, num_frames)
-                for error in session.take_errors():
-                    self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
+            try:
+                async for num_lost, pcm, num_frames in peer.receive_audio():
+                    session.skip(num_lost)
+                    session.send(pcm, num_frames)
+                    for error in session.take_errors():
+                        self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
+            except KouxingError as error:  # the session is over
+                self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
             client.is_ending = True
 
     async def _remove(self, name: str) -> None:
@@ -169,8 +177,10 @@ class WhipHandler:
         commands: asyncio.Queue[str | bytes] = asyncio.Queue(MAX_COMMANDS)
 
         def enqueue(message: str | bytes) -> None:
-            with contextlib.suppress(asyncio.QueueFull):
+            try:
                 commands.put_nowait(message)
+            except asyncio.QueueFull:
+                _send_error(channel, UserError(DROPPED))
 
         channel.on("message", enqueue)
         client.tasks |= {
@@ -202,7 +212,7 @@ class WhipHandler:
             try:
                 if isinstance(message, bytes):
                     raise UserError("expected a JSON object in a text message")
-                command = browser_messages.parse_command(message)
+                command = browser_messages.parse_command(message, known=CHANNEL_COMMANDS)
                 if command.flush:
                     await session.flush()
                 if command.face:
@@ -210,6 +220,11 @@ class WhipHandler:
                 if command.problem:
                     raise UserError(command.problem)
             except (UserError, KouxingError) as error:
-                if channel.readyState == "open":
-                    channel.send(error_text(error))
+                _send_error(channel, error)
             await rate_limit.wait(COMMAND_S)
+
+
+def _send_error(channel: RTCDataChannel, error: UserError | KouxingError) -> None:
+    """Send an error, unless the client does not read its messages."""
+    if channel.readyState == "open" and channel.bufferedAmount <= MAX_BUFFERED_BYTES:
+        channel.send(error_text(error))

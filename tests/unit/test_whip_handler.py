@@ -1,0 +1,124 @@
+"""Sessions and data channels of WebRTC clients."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable
+from typing import Any, cast
+
+import pytest
+from kouxing_client import KouxingError, Refused
+
+from kouxing.services.gateway.audio_sessions import AudioClient
+from kouxing.services.gateway.sample_sentence import SampleSentence
+from kouxing.services.gateway.viewer_handler import ViewerHandler
+from kouxing.services.gateway.web_application import OpenWebSockets
+from kouxing.services.gateway.whip_handler import MAX_COMMANDS, WhipHandler, _Client
+from kouxing.shared.metrics import Metrics
+from tests.fake_time import run
+
+UNUSED = cast("Any", None)
+
+
+class FakeSession:
+    """Counts interruptions; ``error`` is raised when audio is sent."""
+
+    name = "s"
+    is_closed = False
+
+    def __init__(self, error: KouxingError | None = None) -> None:
+        self.num_flushes = 0
+        self._error = error
+
+    def skip(self, num_frames: int) -> None:
+        pass
+
+    def send(self, pcm: bytes, num_frames: int) -> None:
+        if self._error is not None:
+            raise self._error
+
+    async def flush(self) -> None:
+        self.num_flushes += 1
+
+
+class FakeChannel:
+    """A data channel; ``on_message`` is called with the client's messages."""
+
+    readyState = "open"  # noqa: N815 - as in aiortc
+    bufferedAmount = 0  # noqa: N815
+
+    def __init__(self) -> None:
+        self.errors: list[str] = []
+        self.on_message: Callable[[str], None] = UNUSED
+
+    def on(self, event: str, handler: Callable[[str], None]) -> None:
+        assert event == "message"
+        self.on_message = handler
+
+    def send(self, message: str) -> None:
+        fields = json.loads(message)
+        self.errors += [fields["text"]] if fields["type"] == "error" else []
+
+
+class FakePeer:
+    """A connection that ends after one packet."""
+
+    async def receive_audio(self) -> AsyncIterator[tuple[int, bytes, int]]:
+        yield 0, bytes(4), 1
+
+
+@pytest.fixture
+def viewers() -> ViewerHandler:
+    return ViewerHandler(
+        OpenWebSockets(), 1.0, Metrics(), SampleSentence(UNUSED), UNUSED, lambda: None
+    )
+
+
+@pytest.fixture
+def handler(viewers: ViewerHandler) -> WhipHandler:
+    return WhipHandler(1.0, cast("AudioClient", None), viewers, [])
+
+
+def test_the_session_can_end_before_the_connection(
+    handler: WhipHandler, viewers: ViewerHandler
+) -> None:
+    async def stream() -> None:
+        viewers.add_session("s", 1, "")
+        session = cast("Any", FakeSession(Refused("unknown-session", "it has ended")))
+        client = _Client(None, session=session)
+        with viewers.connect_viewer("s", None) as viewer:
+            await handler._stream(
+                client, cast("Any", FakePeer()), session, contextlib.AsyncExitStack()
+            )
+            messages = [str(await viewer.queue.get()) for _ in range(len(viewer.queue))]
+        assert json.loads(messages[-1])["text"] == "it has ended"
+        assert client.is_ending
+
+    run(stream())
+
+
+def test_a_data_channel_rejects_what_it_does_not_execute(handler: WhipHandler) -> None:
+    async def command() -> None:
+        session, channel = FakeSession(), FakeChannel()
+        client = _Client(None, session=cast("Any", session))
+        handler._on_channel(client, cast("Any", channel))
+        channel.on_message('{"skip": 960, "flush": true}')
+        channel.on_message('{"last": true}')
+        await asyncio.sleep(1.0)
+        assert session.num_flushes == 1
+        assert [error.partition(";")[0] for error in channel.errors] == [
+            "unknown field skip",
+            "unknown field last",
+        ]
+        channel.errors.clear()
+        for _ in range(MAX_COMMANDS + 2):
+            channel.on_message('{"flush": true}')
+        await asyncio.sleep(100.0)
+        assert session.num_flushes == 1 + MAX_COMMANDS
+        assert [error.partition(":")[0] for error in channel.errors] == [
+            "the command is dropped"
+        ] * 2
+        for task in client.tasks:
+            task.cancel()
+
+    run(command())
