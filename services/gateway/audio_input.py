@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from collections import deque
 from collections.abc import AsyncIterator
 
 from aiohttp import WSMessage, WSMsgType, web
@@ -76,6 +77,10 @@ class AudioInput:
             self._session.send(pcm, num_frames)
             await self._rate_limit.wait(duration_s)
 
+    def skip(self, num_frames: int) -> None:
+        """Skip audio of the client after its audio so far: media time advances."""
+        self._queue.skip(num_frames)
+
     async def flush(self) -> None:
         """Interrupt: drop queued audio, and audio whose face is not shown yet."""
         self._incomplete = b""
@@ -115,6 +120,8 @@ class RealTimeQueue:
         self._chunk_bytes = round(CHUNK_S * pcm_format.sample_rate_hz) * pcm_format.frame_bytes
         self._keep_alive_s = KEEP_ALIVE_S if keep_alive else None
         self._queued = bytearray()
+        self._num_forwarded = 0  # bytes
+        self._gaps = deque[tuple[int, int]]()  # bytes before skipped samples, number of samples
         self._not_empty = asyncio.Event()
 
     @property
@@ -129,9 +136,15 @@ class RealTimeQueue:
         self._queued += pcm
         self._not_empty.set()
 
+    def skip(self, num_frames: int) -> None:
+        """Skip audio after the queued audio."""
+        self._gaps.append((self._num_forwarded + len(self._queued), num_frames))
+        self._skip_due()
+
     def clear(self) -> None:
         """Drop queued audio."""
         self._queued.clear()
+        self._gaps.clear()
 
     async def wait_until_empty(self) -> None:
         """Return once all audio is forwarded."""
@@ -146,14 +159,23 @@ class RealTimeQueue:
             if not self._queued:
                 await self._wait_for_audio()
                 due_s = loop.time()
-            piece = bytes(self._queued[: self._chunk_bytes])
-            del self._queued[: self._chunk_bytes]
+            end = self._chunk_bytes
+            if self._gaps:
+                end = min(end, self._gaps[0][0] - self._num_forwarded)
+            piece = bytes(self._queued[:end])
+            del self._queued[:end]
+            self._num_forwarded += len(piece)
             try:
                 self._session.send(piece, len(piece) // self._format.frame_bytes)
+                self._skip_due()
             except KouxingError:  # the session is over; its errors are reported elsewhere
-                self._queued.clear()
+                self.clear()
             due_s += len(piece) / self._format.frame_bytes / self._format.sample_rate_hz
             await asyncio.sleep(due_s - loop.time())
+
+    def _skip_due(self) -> None:
+        while self._gaps and self._gaps[0][0] <= self._num_forwarded:
+            self._session.skip(self._gaps.popleft()[1])
 
     async def _wait_for_audio(self) -> None:
         """Return once audio is queued. After a long pause, queue a piece of silence."""

@@ -101,7 +101,8 @@ class MicrophoneHandler:
                 command = browser_messages.parse_command(message.data, pcm_format)
                 if command.problem:
                     await browser.send_str(browser_messages.error_text(command.problem))
-                session.skip(command.skip)
+                if command.skip:
+                    audio_input.skip(command.skip)
                 if command.flush:
                     await audio_input.flush()
                 if command.face:

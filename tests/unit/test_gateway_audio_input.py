@@ -92,6 +92,9 @@ class FakeSession:
         assert len(pcm) == self._frame_bytes * num_frames
         self.pcm += pcm
 
+    def skip(self, num_frames: int) -> None:
+        self.pcm += b"gap" * num_frames
+
     async def flush(self) -> None:
         self.num_flushes += 1
 
@@ -133,6 +136,41 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
             await audio_input.push(b"\2\0" * 320)
             await asyncio.sleep(1.0)
         assert session.pcm[num_before:] == b"\2\0" * 320
+
+    run(speak())
+
+
+@pytest.mark.parametrize("is_ahead", [False, True])
+def test_skipped_audio_stays_between_the_audio_before_and_after_it(*, is_ahead: bool) -> None:
+    async def speak() -> None:
+        session = FakeSession()
+        audio_input = AudioInput(session, PCM16, is_ahead=is_ahead)  # type: ignore[arg-type]
+        async with audio_input.running():
+            audio_input.skip(1)
+            await audio_input.push(b"\1\0" * 20_000)
+            audio_input.skip(2)
+            audio_input.skip(1)
+            await audio_input.push(b"\2\0" * 1000)
+            audio_input.skip(4)
+            await audio_input.end()
+            await asyncio.sleep(5.0)
+        expected = b"gap", b"\1\0" * 20_000, b"gap" * 3, b"\2\0" * 1000, b"gap" * 4
+        assert session.pcm == b"".join(expected)
+
+    run(speak())
+
+
+def test_a_flush_also_drops_queued_gaps() -> None:
+    async def speak() -> None:
+        session = FakeSession()
+        audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
+        async with audio_input.running():
+            await audio_input.push(bytes(320))
+            audio_input.skip(1)
+            await audio_input.flush()
+            await audio_input.push(b"\2\0" * 1000)
+            await asyncio.sleep(1.0)
+        assert session.pcm == b"\2\0" * 1000
 
     run(speak())
 
