@@ -18,7 +18,7 @@ const MAX_STEP_S = 0.1; // longest time step of the hair physics
 
 /** The custom element; README.md lists its attributes. */
 export class KouxingFace extends HTMLElement {
-  static observedAttributes = ["src", "gateway", "session", "token", "recording", "local", "phones"];
+  static observedAttributes = ["src", "gateway", "session", "token", "recording", "local", "phones", "manual"];
   #renderer = null;
   #note = Object.assign(document.createElement("p"), { part: "note" }); // the last error
   #drawRate = null;
@@ -66,6 +66,7 @@ export class KouxingFace extends HTMLElement {
     this.#drawRate = new DrawRate(ratio, ratio, drawsInSoftware(gl));
     this.#images = new ImageQueue(gl, this.#drawRate);
     this.#resizeObserver.observe(this);
+    if (this.#sound.isWanted) this.turnSoundOn().catch((error) => this.#showError(error, error.message));
     this.#animationFrame = requestAnimationFrame((nowMs) => this.#draw(nowMs));
     this.#load();
   }
@@ -76,6 +77,7 @@ export class KouxingFace extends HTMLElement {
     this.#resizeObserver.disconnect();
     this.#disconnect();
     this.#closeLips();
+    this.#sound.close();
     this.#renderer?.dispose();
     this.#renderer = null;
   }

@@ -315,5 +315,17 @@ def test_the_web_component_shows_and_plays_a_session(faces: Browser, system: Sys
         faces.wait_for("sessions.includes('seen')")  # it has reconnected
         faces.evaluate("own.setAttribute('src', 'arkit.glb')")
         faces.wait_for("own.set === 'arkit' && own.shown?.jawOpen > 0.1")
+        faces.evaluate("own.setAttribute('manual', '')")
+        assert faces.evaluate("own.shown") is None
+        faces.evaluate("own.removeAttribute('manual')")
+        faces.wait_for("own.shown?.jawOpen > 0.1")
+        faces.evaluate(
+            "const { close } = AudioContext.prototype; AudioContext.prototype.close = function () {"
+            " window.isHeard = false; return close.call(this); };"
+            "const face = own; const { parentElement, nextSibling } = face; face.remove();"
+            "window.wasClosed = !window.isHeard; parentElement.insertBefore(face, nextSibling)"
+        )
+        assert faces.evaluate("window.wasClosed")
+        faces.wait_for("window.isHeard")  # sound continues after the face was moved
     driver = "GL Driver Message"  # the processor draws
     assert [text for text in faces.page_errors if driver not in text] == []

@@ -240,5 +240,5 @@ document.body.dataset.view = query.get("view") ?? "";
 if (query.has("background")) document.documentElement.style.background = query.get("background");
 showMouthProfile();
 requestAnimationFrame(draw);
-sound.turnOn();
+speech.turnSoundOn();
 await stage.load(element("heads").value);

@@ -12,6 +12,7 @@ const CLOCK_MS = 1000; // window for the sound card's clock; one reading is off 
 export class Sound {
   numPlayed = 0; // samples
   isWanted = false;
+  #opening = null; // a promise of #open()
   #context = null;
   #node = null;
   #anchor = null; // media time - context frame, as played
@@ -37,35 +38,51 @@ export class Sound {
     return this.#node !== null && this.#context.state === "running";
   }
 
-  /** Turn sound on. Without a click the browser may leave it blocked. */
+  /** Turn sound on. Without a click the browser may leave it blocked. Rejected if it cannot be opened. */
   async turnOn() {
     this.isWanted = true;
     await this.#run();
   }
 
   async #run() {
-    if (this.#context === null) {
-      this.#context = new AudioContext({ sampleRate: RATE_HZ, latencyHint: "interactive" });
-      await this.#context.audioWorklet.addModule(new URL("sound-worklet.js", import.meta.url));
-      const node = new AudioWorkletNode(this.#context, "sound-player", {
-        numberOfInputs: 0,
-        outputChannelCount: [1],
-      });
-      node.port.onmessage = ({ data }) => {
-        this.numPlayed = data.numPlayed;
-        this.#anchor = data.anchor;
-      };
-      this.#speaker = new GainNode(this.#context);
-      node.connect(this.#speaker).connect(this.#context.destination);
-      this.#node = node;
-      this.#context.onstatechange = () => {
-        this.#starts.reset();
-        this.#onChange();
-      };
-    }
+    this.#opening ??= this.#open();
+    await this.#opening;
     // Do not wait: without a click, resume() neither succeeds nor fails.
-    if (this.isWanted || this.#tap) this.#context.resume().catch(() => {});
+    if (this.isWanted || this.#tap) this.#context?.resume().catch(() => {});
     if (this.#speaker) this.#speaker.gain.value = this.isWanted ? 1 : 0;
+    this.#onChange();
+  }
+
+  async #open() {
+    const context = new AudioContext({ sampleRate: RATE_HZ, latencyHint: "interactive" });
+    this.#context = context;
+    try {
+      await context.audioWorklet.addModule(new URL("sound-worklet.js", import.meta.url));
+    } catch (error) {
+      if (this.#context === context) this.close();
+      throw error;
+    }
+    if (this.#context !== context) return; // closed in the meantime
+    this.#node = new AudioWorkletNode(context, "sound-player", { numberOfInputs: 0, outputChannelCount: [1] });
+    this.#node.port.onmessage = ({ data }) => {
+      this.numPlayed = data.numPlayed;
+      this.#anchor = data.anchor;
+    };
+    this.#speaker = new GainNode(context);
+    this.#node.connect(this.#speaker).connect(context.destination);
+    context.onstatechange = () => {
+      this.#starts.reset();
+      this.#onChange();
+    };
+  }
+
+  /** Release the sound card. turnOn() opens it again. */
+  close() {
+    if (this.#context === null) return;
+    this.#context.onstatechange = null;
+    this.#context.close();
+    this.#context = this.#opening = this.#node = this.#speaker = this.#anchor = null;
+    this.#starts.reset();
     this.#onChange();
   }
 
@@ -95,6 +112,7 @@ export class Sound {
   }
 
   untap() {
+    if (this.#tap === null) return;
     this.#node.disconnect(this.#tap);
     this.#tap = null;
     if (!this.isWanted) this.#suspend();

@@ -1,6 +1,7 @@
 // The buttons that make the face speak or silence it: microphone, file and sound.
 
 import { element, setTextKey } from "./elements.js";
+import { translate } from "./language.js";
 import { Microphone } from "./microphone.js";
 
 export class SpeechControls {
@@ -45,7 +46,7 @@ export class SpeechControls {
     };
     element("sound").onclick = () => {
       if (sound.state === "on") sound.turnOff();
-      else sound.turnOn();
+      else this.turnSoundOn();
     };
   }
 
@@ -64,12 +65,21 @@ export class SpeechControls {
 
   /** Undo the muting of pause(). */
   resume() {
-    if (this.#wasSoundWanted) this.#sound.turnOn();
+    if (this.#wasSoundWanted) this.turnSoundOn();
   }
 
   /** Turn sound on if the browser blocked it before the user's first click. */
   unblockSound() {
-    if (this.#sound.state === "blocked") this.#sound.turnOn();
+    if (this.#sound.state === "blocked") this.turnSoundOn();
+  }
+
+  /** Turn the session's sound on; show an error if it fails. */
+  async turnSoundOn() {
+    try {
+      await this.#sound.turnOn();
+    } catch (error) {
+      this.#handlers.error({ code: "sound", text: translate("soundFailed", { reason: error.message }) });
+    }
   }
 
   /** Show the state of the sound on its button. */

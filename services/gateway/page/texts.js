@@ -22,6 +22,7 @@ export const TEXTS = {
   learn: { en: "Learn my mouth", zh: "学我的口型" },
   learnHelp: { en: "Teach the head to move its lips like yours", zh: "让头像学会你的口型" },
   sound: { en: "Sound", zh: "声音" },
+  soundFailed: { en: "The sound could not be turned on: {reason}. Reload the page.", zh: "无法打开声音：{reason}。请重新加载页面。" },
   turnOnSound: { en: "Turn on sound", zh: "打开声音" },
 
   // Status
