@@ -31,6 +31,13 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
         "window.saved = null; const make = URL.createObjectURL; URL.createObjectURL = (blob) =>"
         " (blob.type.startsWith('video') && (window.saved = blob), make(blob))"
     )
+    page.evaluate(
+        "const { start } = MediaRecorder.prototype; MediaRecorder.prototype.start = () => {"
+        " MediaRecorder.prototype.start = start; throw new Error('no encoder'); }"
+    )
+    page.click("record")
+    page.wait_for(f"{NOTICE}.includes('could not be recorded: no encoder')")
+    assert not page.evaluate(f"{STATE}.recording")
     page.click("record")
     page.wait_for(f"{STATE}.recording")
     canvas = "document.getElementById('head')"

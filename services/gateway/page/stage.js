@@ -4,11 +4,9 @@ import { element, setText } from "./elements.js";
 import { Head } from "./head.js";
 import { UserError, translate } from "./language.js";
 import { drawingText, turnText } from "./status.js";
+import { VideoRecorder } from "./video-recorder.js";
 
 const BACKGROUND = "#e9e8ea"; // the page's own background is not on the canvas
-const VIDEO_RATE_HZ = 30;
-// The first type that the browser supports is used. Other codecs in MP4 play in fewer programs.
-const VIDEO_TYPES = ["video/mp4;codecs=avc1.42E01F,mp4a.40.2", "video/webm"];
 const TURN_DEGREES = {
   ArrowLeft: [10, 0],
   ArrowRight: [-10, 0],
@@ -16,32 +14,6 @@ const TURN_DEGREES = {
   ArrowDown: [0, -10],
   Home: [], // to the front
 };
-
-/** Records the canvas and the sound with the browser's recorder. */
-class VideoRecorder {
-  #recorder = null;
-
-  get isRecording() {
-    return this.#recorder !== null;
-  }
-
-  /** Start recording a canvas and an audio stream; onVideo(blob) receives the video. */
-  start(canvas, sound, onVideo) {
-    const mimeType = VIDEO_TYPES.find((type) => MediaRecorder.isTypeSupported(type));
-    const tracks = [...canvas.captureStream(VIDEO_RATE_HZ).getTracks(), ...sound.getTracks()];
-    this.#recorder = new MediaRecorder(new MediaStream(tracks), { mimeType });
-    const chunks = [];
-    this.#recorder.ondataavailable = ({ data }) => chunks.push(data);
-    this.#recorder.onstop = () => onVideo(new Blob(chunks, { type: mimeType }));
-    this.#recorder.start(1000);
-  }
-
-  /** Stop recording. */
-  stop() {
-    this.#recorder.stop();
-    this.#recorder = null;
-  }
-}
 
 /** Save a video as a download; return its name. */
 function save(video) {
@@ -59,8 +31,7 @@ export class Stage {
   #loading = Promise.resolve(); // done when the head that was chosen last is loaded
   #faps;
   #handlers;
-  #recorder = new VideoRecorder();
-  #sound;
+  #recorder;
 
   /**
    * @param faps 68 values that are updated before each call of draw
@@ -69,7 +40,7 @@ export class Stage {
    */
   constructor(faps, sound, handlers) {
     this.#faps = faps;
-    this.#sound = sound;
+    this.#recorder = new VideoRecorder(sound);
     this.#handlers = handlers;
     element("record").onclick = () => this.#toggleRecording();
     element("lower-frame-rate").onclick = () => this.#changeDrawRate((drawRate) => drawRate.halve());
@@ -144,14 +115,18 @@ export class Stage {
   async #toggleRecording() {
     if (this.#recorder.isRecording) {
       this.#recorder.stop();
-      this.#sound.untap();
       this.#head.film(null);
     } else if (this.#head !== null) {
       this.#head.film(BACKGROUND);
-      this.#recorder.start(element("head"), await this.#sound.tap(), (video) => {
-        const file = save(video);
-        this.#handlers.toast(translate(file.endsWith(".mp4") ? "videoSaved" : "webmSaved", { file }));
-      });
+      try {
+        await this.#recorder.start(element("head"), (video) => {
+          const file = save(video);
+          this.#handlers.toast(translate(file.endsWith(".mp4") ? "videoSaved" : "webmSaved", { file }));
+        });
+      } catch (error) {
+        this.#head.film(null);
+        this.#handlers.failed(translate("recordingFailed", { reason: error.message }));
+      }
     }
     element("record").setAttribute("aria-pressed", this.#recorder.isRecording);
   }

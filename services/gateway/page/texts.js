@@ -19,6 +19,7 @@ export const TEXTS = {
     en: "Saved {file}. This browser records only WebM, which VLC and browsers play but QuickTime does not. To convert it: ffmpeg -i {file} face.mp4",
     zh: "已保存 {file}。此浏览器只能录制 WebM，QuickTime 无法播放；可用 VLC 或浏览器播放，或转换：ffmpeg -i {file} face.mp4",
   },
+  recordingFailed: { en: "The video could not be recorded: {reason}. Reload the page, or try another browser.", zh: "无法录制视频：{reason}。请重新加载页面，或换一个浏览器。" },
   learn: { en: "Learn my mouth", zh: "学我的口型" },
   learnHelp: { en: "Teach the head to move its lips like yours", zh: "让头像学会你的口型" },
   sound: { en: "Sound", zh: "声音" },
