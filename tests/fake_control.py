@@ -219,7 +219,7 @@ class FakeControl:
         self.commands.send(opened, to=self._clients[session])
 
     def _start_message(
-        self, session: str, *, epoch: int = EPOCH, record: bool = False
+        self, session: str, *, epoch: int = EPOCH, record: bool = False, token: str = TOKEN
     ) -> StartSession:
         face = FaceSettings(lip_model="dynamic-visemes")
         return replace(
@@ -227,7 +227,7 @@ class FakeControl:
             session=session,
             epoch=epoch,
             request=f"start-{session}-{epoch}",
-            token=TOKEN,
+            token=token,
             facts=FACTS,
             endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
         )

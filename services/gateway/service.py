@@ -195,6 +195,9 @@ class GatewayService(SessionService):
     def start_session(self, start: StartSession) -> bool:
         """Subscribe to a session for a viewer or sender; confirm when this is in effect."""
         session = self._sessions.get(start.session)
+        if session is not None and session.follower.session_start.token != start.token:
+            self.stop_session(start.session)  # a different session with the same name
+            session = None
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)
         session.follower.session_start = start
