@@ -3,6 +3,8 @@
 import contextlib
 import errno
 import os
+import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,23 +14,33 @@ from kouxing.shared.errors import UserError
 
 @contextlib.contextmanager
 def open_output(path: Path, *, keep_on_error: bool = False) -> Iterator[BinaryIO]:
-    """Open a file for writing.
+    """Open a file for writing. Once it is complete, it gets its name, and replaces an older file.
 
-    If an error or Ctrl-C interrupts the writing, the file is deleted unless ``keep_on_error``.
+    If an error or Ctrl-C interrupts the writing, an older file stays as it was. Links, devices and
+    pipes are written directly. With ``keep_on_error``, files are also written directly, and keep
+    what was written before an error.
 
     Raises ``UserError`` if the file cannot be written.
     """
     try:
-        with path.open("wb") as file:
-            try:
+        with contextlib.ExitStack() as stack:
+            is_direct = keep_on_error or not _can_replace(path)
+            written = path if is_direct else path.with_name(f".{secrets.token_hex(8)}.part")
+            if not is_direct:
+                stack.callback(written.unlink, missing_ok=True)
+            with written.open("wb") as file:
                 yield file
-                file.flush()
-            except BaseException:
-                if path.is_file() and not keep_on_error:  # not a device
-                    path.unlink()
-                raise
+            if not is_direct:
+                if path.exists():
+                    shutil.copymode(path, written)
+                written.replace(path)
     except OSError as error:
         raise write_error(path, error) from error
+
+
+def _can_replace(path: Path) -> bool:
+    is_special = path.is_symlink() or (path.exists() and not path.is_file())
+    return not is_special and os.access(path.parent, os.W_OK)
 
 
 def write_private(path: Path, content: bytes) -> None:

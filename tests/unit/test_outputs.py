@@ -1,6 +1,7 @@
 """Outputs are complete or absent; commands refuse useless options, and overwrite no input."""
 
 import errno
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -21,7 +22,7 @@ from kouxing.services.driver.video.film import TimedFaps
 from kouxing.services.driver.video.video_writer import PictureSequence, check_name
 from kouxing.shared.errors import UserError
 from kouxing.shared.output_file import open_output
-from kouxing.shared.terminal import check_output
+from kouxing.shared.terminal import check_output, write_text
 from tests.system import VOWELS_FILE
 
 
@@ -229,11 +230,41 @@ def test_an_interrupted_table_is_deleted(tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
-def test_an_old_output_is_kept_if_writing_has_not_begun(tmp_path: Path) -> None:
-    output = tmp_path / "face.fap"
+@pytest.mark.parametrize("name", ["face.fap", "face.csv"])
+def test_an_interrupted_command_keeps_an_old_output(tmp_path: Path, name: str) -> None:
+    output = tmp_path / name
     output.write_text("old")
     interrupt_export(output)
     assert output.read_text() == "old"
+    assert [*tmp_path.iterdir()] == [output]
+
+
+def test_a_new_file_has_the_permissions_of_the_old_one(tmp_path: Path) -> None:
+    output = tmp_path / "face.csv"
+    output.write_text("old")
+    output.chmod(0o640)
+    write_text(output, "new")
+    assert (output.read_text(), output.stat().st_mode & 0o777) == ("new", 0o640)
+
+
+def test_links_and_pipes_are_written_directly(tmp_path: Path) -> None:
+    link, target, pipe = tmp_path / "link.csv", tmp_path / "face.csv", tmp_path / "pipe.csv"
+    link.symlink_to(target)
+    write_text(link, "new")
+    assert (link.is_symlink(), target.read_text()) == (True, "new")
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    with os.fdopen(reader, encoding="utf-8") as text:
+        write_text(pipe, "new")
+        assert (pipe.is_fifo(), text.read()) == (True, "new")
+
+
+def test_an_error_removes_neither_a_link_nor_its_target(tmp_path: Path) -> None:
+    link, target = tmp_path / "link.glb", tmp_path / "head.glb"
+    link.symlink_to(target)
+    with pytest.raises(UserError, match="the disk is full"):
+        fill_the_disk(link)
+    assert (link.is_symlink(), target.exists()) == (True, True)
 
 
 def test_an_interrupted_live_table_keeps_its_frames(tmp_path: Path) -> None:
