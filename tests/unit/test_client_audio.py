@@ -65,6 +65,8 @@ INTEGERS = array("h", [0, 16384, -32767, 32767])
     [
         INTEGERS.tobytes(),
         INTEGERS,
+        list(INTEGERS),
+        iter(INTEGERS),
         FLOATS,
         np.array(FLOATS, np.float32).reshape(2, 2),
         np.array(INTEGERS, np.int16),
@@ -80,7 +82,7 @@ def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
 @pytest.mark.parametrize(
     "audio",
     [
-        [0, -16384, 32767],
+        [0, -16384, 32768],
         np.array([0, 16384], np.int32),
         np.array([0.0, -900.0], np.float32),
         np.array([np.nan, 0.5], np.float32),
@@ -88,9 +90,20 @@ def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
     ],
 )
 def test_rejects_numbers_far_beyond_1(audio: object, encoding: str) -> None:
-    """They are usually 16-bit samples in a list or in an array of another type."""
+    """They are usually 16-bit samples in an array of another type."""
     with pytest.raises(KouxingError, match=r"16-bit integers .*, or floats within ±1, not "):
         to_pcm(audio, encoding)
+
+
+@pytest.mark.parametrize("kind", [">i2", ">f4", "f2", "c8"])
+def test_rejects_an_array_of_another_format(kind: str) -> None:
+    with pytest.raises(KouxingError, match=r"16-bit integers .* byte order, not the format"):
+        to_pcm(np.zeros(2, kind), "s16le")
+
+
+def test_small_integers_in_a_list_are_quiet() -> None:
+    assert to_pcm([0, 1, -1], "s16le") == array("h", [0, 1, -1]).tobytes()
+    assert to_pcm([0, 1, -1], "f32le") == array("f", [0, 1 / 32767, -1 / 32767]).tobytes()
 
 
 def test_rejects_an_array_with_another_number_of_channels() -> None:

@@ -15,6 +15,7 @@ from kouxing_client.messages import MEDIA_RATE_HZ, Fields
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 _CODES = {"s16le": "h", "f32le": "f"}
 _FULL_SCALE = 32767
+_EXPECTED = "audio must be 16-bit integers (array type int16), or floats within ±1"
 _MAX_FLOAT = 8.0  # smaller values beyond 1 are clipped
 # Audio before the newest acknowledgement that is kept in case another recognizer needs it
 RESEND_S = 10.0
@@ -43,26 +44,40 @@ def to_pcm(audio: Any, encoding: str) -> bytes:
     The audio is PCM bytes in that encoding, or numbers (16-bit integers, or floats within ±1) in an
     iterable or a buffer, of shape ``(n,)`` or ``(n, channels)``.
 
-    Raises ``KouxingError`` if floats are not finite or far beyond ±1.
+    Raises ``KouxingError`` if floats are not finite or far beyond ±1, or an array has another type.
     """
     try:
         view = memoryview(audio)
     except TypeError:
-        return _pack(array("d", audio), encoding)
+        view = memoryview(_to_array(audio))
     flat = memoryview(view.tobytes())  # a view with any number of dimensions is flattened
     if view.format in ("B", "b", "c"):
         return flat.tobytes()
-    return _pack(flat.cast(view.format), encoding)  # type: ignore[call-overload]
+    try:
+        numbers = flat.cast(view.format)  # type: ignore[call-overload]
+    except ValueError:  # such as the other byte order, or complex numbers
+        raise KouxingError(
+            f"{_EXPECTED}, in this machine's byte order, not the format {view.format!r}"
+        ) from None
+    return _pack(numbers, encoding)
 
 
-def _pack(numbers: memoryview[Any] | array[float], encoding: str) -> bytes:
-    is_integer = isinstance(numbers, memoryview) and numbers.format == "h"
+def _to_array(numbers: Iterable[float]) -> array[int] | array[float]:
+    listed = list(numbers)
+    try:
+        return array("h", listed)
+    except (TypeError, OverflowError):  # floats, or larger integers
+        return array("d", listed)
+
+
+def _pack(numbers: memoryview[Any], encoding: str) -> bytes:
+    is_integer = numbers.format == "h"
     if len(numbers) and not is_integer:
         lowest, highest = min(numbers), max(numbers)
         is_finite = isfinite(sum(numbers))  # the sum finds every NaN
         if not (is_finite and -_MAX_FLOAT <= lowest <= highest <= _MAX_FLOAT):
             raise KouxingError(
-                "audio must be 16-bit integers (array type int16), or floats within ±1, not "
+                f"{_EXPECTED}, not "
                 + (f"{lowest:g} to {highest:g}" if is_finite else "NaN or infinity")
             )
     scaled: Iterable[float] = numbers
