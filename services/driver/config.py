@@ -11,7 +11,7 @@ from kouxing.shared.config import KnownNames, Switch, ValueHint
 from kouxing.shared.name_rules import NAME
 
 COLORS = {
-    "black": "#000000", "white": "#ffffff", "grey": "#808080", "green": "#00b140",
+    "black": "#000000", "white": "#ffffff", "gray": "#808080", "green": "#00b140",
     "blue": "#0047bb",
 }  # fmt: skip
 
@@ -67,7 +67,7 @@ class DriverConfig(HeadConfig):
     """Maximum number of videos that are written at the same time. One key can use at most three
     quarters."""
     background: Annotated[
-        str, KnownNames(lambda: ("studio", *COLORS), "#?[0-9a-fA-F]{6}", ", or #rrggbb")
+        str, KnownNames(lambda: ("studio", *COLORS), "#?[0-9a-fA-F]{6}|(?i:grey)", ", or #rrggbb")
     ] = "studio"
     """Background of windows and videos."""
     camera: Framing = Framing.FACE

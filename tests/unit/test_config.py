@@ -131,6 +131,7 @@ def test_names_may_have_capitals() -> None:
         "ferguson",
     ]
     assert settings().load(DriverConfig, {"background": "Green"}).background == "green"
+    assert settings().load(DriverConfig, {"background": "grey"}).background == "grey"
     assert settings().load(GatewayConfig, {"https": "Proxy"}).is_behind_proxy
 
 

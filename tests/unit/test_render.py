@@ -65,6 +65,7 @@ def test_parses_backgrounds_and_rejects_others() -> None:
     assert parse_background("transparent") is None
     assert parse_background("#Ff8000") == ((1.0, 128 / 255, 0.0),) * 2
     assert parse_background("white") == ((1.0, 1.0, 1.0),) * 2
+    assert parse_background("gray") == parse_background("Grey") == ((128 / 255,) * 3,) * 2
     for text in ("", "pink-ish", "#12345", "#gggggg"):
         with pytest.raises(UserError, match="write studio, transparent, #rrggbb"):
             parse_background(text)

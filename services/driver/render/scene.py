@@ -66,7 +66,7 @@ def parse_background(text: str) -> Background:
         return BACKGROUND
     if word == "transparent":
         return None
-    code = COLORS.get(word, word).removeprefix("#")
+    code = COLORS.get("gray" if word == "grey" else word, word).removeprefix("#")
     if not re.fullmatch(r"[0-9a-f]{6}", code):
         raise UserError(
             f"unknown background {text!r}; write studio, transparent, #rrggbb, or one of"
