@@ -75,8 +75,10 @@ class Metrics:
 
 
 def percentile(ordered: Sequence[float], percent: int) -> float:
-    """Return the nearest-rank percentile of sorted, non-empty values."""
-    return ordered[percent * (len(ordered) - 1) // 100]
+    """Return a percentile of sorted, non-empty values, interpolated between the nearest two."""
+    index, hundredths = divmod(percent * (len(ordered) - 1), 100)
+    lower, upper = ordered[index], ordered[min(index + 1, len(ordered) - 1)]
+    return lower + hundredths / 100 * (upper - lower)
 
 
 def memory_mb() -> float:

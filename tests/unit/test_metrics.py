@@ -1,8 +1,9 @@
 """Snapshots of metrics, their page for Prometheus, and the busy load of a loop."""
 
+import numpy as np
 import pytest
 
-from kouxing.shared.metrics import WINDOW, LoadMeter, Metrics
+from kouxing.shared.metrics import WINDOW, LoadMeter, Metrics, percentile
 
 
 def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
@@ -54,3 +55,9 @@ def test_the_busy_load_includes_added_work(added_s: float, load: float) -> None:
     busy.start_waiting(0.6)
     busy.add(added_s)
     assert busy.load(1.0) == pytest.approx(load)
+
+
+@pytest.mark.parametrize("values", [[7.0], [1.0, 100.0], [*range(10)], [0.5, 0.7, 3.0]])
+@pytest.mark.parametrize("percent", [1, 50, 95, 100])
+def test_percentiles_equal_numpys(values: list[float], percent: int) -> None:
+    assert percentile(values, percent) == pytest.approx(np.percentile(values, percent))
