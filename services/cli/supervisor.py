@@ -118,13 +118,17 @@ class Supervisor:
                 time.sleep(0.1)
         raise UserError(f"the services did not start; see their logs in {self._log_folder}")
 
-    @staticmethod
-    def page_address(control: str) -> str:
-        """Return the address of the gateway's page, including its token."""
+    def page_address(self, control: str) -> str:
+        """Return the address of the gateway's page, including its token.
+
+        Raises ``UserError`` if the gateway has stopped.
+        """
         with connect_client(control) as client:
             services = client.status().services
-        gateway = next(service for service in services if service.service == "gateway")
-        return gateway.endpoints["page"].removesuffix("/")
+        for service in services:
+            if service.service == "gateway":
+                return service.endpoints["page"].removesuffix("/")
+        raise UserError(f"the gateway stopped; see {self._log_path('gateway')}")
 
     def watch(self) -> None:
         """Restart crashed services from now on, in a thread; see also ``wait``."""
