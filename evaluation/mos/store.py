@@ -17,6 +17,7 @@ from kouxing.shared.user_file import check_content, parse_json, read_text
 FILE_NAME = "answers.jsonl"
 MAX_JUDGES = 10_000
 _MAX_BYTES = 256 << 20
+_CONTENT = "a file of listening-test answers"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +54,13 @@ class AnswerStore:
             ) from None
         self.judges: dict[str, int] = {}  # number by token
         self.last_places: dict[int, int] = {}  # newest place that each judge has scored
-        for line in _read_lines(path):
-            self._index_line(line)
+        try:
+            with check_content(path, _CONTENT):
+                for line in _read_lines(path):
+                    self._index_line(line)
+        except UserError:
+            self._file.close()
+            raise
         self._file.write("\n")  # ends a line that a crash has cut
 
     def close(self) -> None:
@@ -90,7 +96,7 @@ class AnswerStore:
 def read_answers(folder: Path) -> list[Answer]:
     """Read all answers; raises ``UserError`` if the file cannot be read."""
     path = folder / FILE_NAME
-    with check_content(path, "a file of listening-test answers"):
+    with check_content(path, _CONTENT):
         return [Answer(**line) for line in _read_lines(path) if "token" not in line]
 
 

@@ -98,6 +98,13 @@ def test_the_file_is_private_and_has_one_writer(tmp_path: Path) -> None:
     AnswerStore(tmp_path).close()
 
 
+@pytest.mark.parametrize("line", ['{"token": "a"}', '{"judge": 0}', "[]", "5"])
+def test_an_edited_answer_is_an_error_in_the_file(tmp_path: Path, line: str) -> None:
+    (tmp_path / ANSWERS).write_text(f"{line}\n")
+    with pytest.raises(UserError, match=f"{ANSWERS}: the file is damaged"):
+        AnswerStore(tmp_path)
+
+
 def scores_of(*by_judge: list[int]) -> dict[tuple[int, str], int]:
     return {
         (judge, SENTENCES[number]): score
