@@ -76,6 +76,7 @@ class FakeControl:
         self.name = "control-1"
         self.running = ["recognizer", "synthesizer"]
         self.refuse = False
+        self.is_silent = False  # whether it answers nothing
         self.stops: list[str] = []
         self.service = NO_PEER
         self.heartbeats: list[Heartbeat] = []
@@ -153,6 +154,8 @@ class FakeControl:
 
     def on_message(self, message: Message, sender: Peer) -> None:
         """Handle a message to control."""
+        if self.is_silent:
+            return
         match message:
             case Heartbeat():
                 self._on_heartbeat(message, sender)

@@ -30,7 +30,7 @@ from kouxing_client.messages import EndOfFaps, Event
 
 from kouxing.shared.keys import add_key, load_user_key
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.session import CloseSession, Error
+from kouxing.shared.wire.session import CloseSession, Error, OpenSession
 from tests.fake_control import FakeControl
 from tests.system import wait_until
 
@@ -299,3 +299,28 @@ def test_the_client_reports_why_control_does_not_answer(
         ):
             client.status()
     assert str(failure.value).startswith(f"control at {control} does not answer: ")
+
+
+def test_a_session_disconnects_though_control_does_not_answer(control: FakeControl) -> None:
+    with Client(control.address, insecure=True, timeout_s=0.5) as client:
+        session = client.open_session("s")
+        frames = session.frames()
+        control.is_silent = True
+        with pytest.raises(KouxingError, match="does not answer"):
+            session.close()
+        assert frames.has_ended
+
+
+def test_a_session_closes_if_its_opening_is_cancelled(control: FakeControl) -> None:
+    async def run() -> None:
+        async with AsyncClient(control.address, insecure=True) as client:
+            control.is_silent = True
+            opening = asyncio.create_task(client.open_session("s"))
+            await asyncio.to_thread(wait_until, lambda: control.messages_of(OpenSession))
+            opening.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await opening
+            control.is_silent = False  # it answers the repeated request
+            await asyncio.to_thread(wait_until, lambda: control.sessions_of(CloseSession) == ["s"])
+
+    asyncio.run(run())

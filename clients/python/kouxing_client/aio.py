@@ -39,7 +39,11 @@ class AsyncClient(BaseClient):
         """Open a session, as ``Client.open_session``."""
         fields = open_fields(name, options)
         opened = self._thread.submit(lambda core: core.open_session(fields))
-        return AsyncSession(self._thread, await asyncio.wrap_future(opened), fields)
+        try:
+            return AsyncSession(self._thread, await asyncio.wrap_future(opened), fields)
+        except asyncio.CancelledError:
+            opened.add_done_callback(self._close_unused)
+            raise
 
     async def follow(self, name: str = "", *, paced: bool = True) -> AsyncSession:
         """Follow another program's session, as ``Client.follow``."""
@@ -92,12 +96,15 @@ class AsyncSession(BaseSession):
         """Close the session, as ``Session.close``."""
         if self._core.is_over:
             return
-        if self._options is not None:
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._signal.wait_async(self._is_delivered), LAST_ANSWER_S)
-            with contextlib.suppress(Refused):  # already closed
-                await asyncio.wrap_future(self._close())
-        await asyncio.wrap_future(self._thread.forget(self._core))
+        try:
+            if self._options is not None:
+                delivered = self._signal.wait_async(self._is_delivered)
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(delivered, LAST_ANSWER_S)
+                with contextlib.suppress(Refused):  # already closed
+                    await asyncio.wrap_future(self._close())
+        finally:
+            await asyncio.wrap_future(self._thread.forget(self._core))
 
     async def frames(self) -> AsyncResults[FapFrame]:
         """Subscribe to FAP frames, as ``Session.frames``."""

@@ -73,6 +73,13 @@ class BaseClient:
         check_name(session)
         return self._thread.submit(lambda core: core.request(kind, session, **fields))
 
+    def _close_unused(self, opened: Future[SessionCore]) -> None:
+        """Close a session that has opened although its opening was cancelled."""
+        if opened.exception() is None:
+            core = opened.result()
+            BaseSession(self._thread, core, None)._close()
+            self._thread.forget(core)
+
 
 class BaseSession:
     """One session. Any program can receive its results; the program that opened it sends audio.

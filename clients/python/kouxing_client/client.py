@@ -125,11 +125,13 @@ class Session(BaseSession):
         """Close the connections of the session, and the session if this program opened it."""
         if self._core.is_over:
             return
-        if self._options is not None:
-            self._signal.wait(self._is_delivered, LAST_ANSWER_S)
-            with contextlib.suppress(Refused):  # already closed
-                self._close().result()
-        self._thread.forget(self._core).result()
+        try:
+            if self._options is not None:
+                self._signal.wait(self._is_delivered, LAST_ANSWER_S)
+                with contextlib.suppress(Refused):  # already closed
+                    self._close().result()
+        finally:
+            self._thread.forget(self._core).result()
 
     def frames(self) -> Results[FapFrame]:
         """Subscribe to FAP frames. Raises ``KouxingError`` if the session has ended."""
