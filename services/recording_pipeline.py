@@ -42,6 +42,7 @@ from kouxing.shared.phones.events import (
     Phone,
     SoundEvent,
     SpeechChange,
+    time_of,
 )
 
 # Tuned on the same held-out clips as the rule of the live pipeline, except ``vowel``: no clip has
@@ -136,11 +137,7 @@ def animate_recording(
     end = EndOfSound(time_s=recording.duration_s + MAX_DELAY_S)
     frames = [
         frame
-        for event in with_progress([*sorted(recording.events, key=_time_of), end])
+        for event in with_progress([*sorted(recording.events, key=time_of), end])
         for frame in face.process(event)
     ]
     return [frame for frame in frames if frame[0] <= recording.duration_s + REST_S]
-
-
-def _time_of(event: SoundEvent) -> float:
-    return event.onset_s if isinstance(event, Phone) else event.time_s

@@ -42,6 +42,7 @@ from kouxing.shared.phones.events import (
     Progress,
     SoundEvent,
     SpeechChange,
+    time_of,
 )
 
 Faps: TypeAlias = NDArray[np.float64]  # (68,)
@@ -140,7 +141,7 @@ class FaceAnimator:
 
     def iter_frames(self, event: SoundEvent) -> Iterator[Frame]:
         """Yield the frames of ``process`` one by one; exhaust this before the next event."""
-        time_s = _time_of(event)
+        time_s = time_of(event)
         if time_s - self._event_s > MAX_GAP_S and not isinstance(event, AudioSkipped):
             self._start_at(self._frame_number(max(0.0, time_s - self._delay_s)))
         self._event_s = time_s
@@ -268,7 +269,7 @@ class FaceAnimator:
     def _pass_to_lips(self, event: SoundEvent) -> None:
         self._lip_stream.add_event(event)
         self._recent.append(event)
-        while _time_of(self._recent[0]) < self._event_s - _RECENT_S:
+        while time_of(self._recent[0]) < self._event_s - _RECENT_S:
             self._recent.popleft()
 
     def _withdraw_phones(self) -> None:
@@ -370,7 +371,3 @@ class FaceAnimator:
         for modifier in self._modifiers:
             modifier.apply(faps, context)
         return faps
-
-
-def _time_of(event: SoundEvent) -> float:
-    return event.onset_s if isinstance(event, Phone) else event.time_s

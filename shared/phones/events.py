@@ -106,3 +106,8 @@ class Waveform(Record, frozen=True, kw_only=True):
 
 
 SoundEvent = Phone | LipPositions | SpeechChange | Progress | AudioSkipped | EndOfSound
+
+
+def time_of(event: SoundEvent) -> float:
+    """Return the media time of an event, seconds; of a phone, its onset."""
+    return event.onset_s if isinstance(event, Phone) else event.time_s
