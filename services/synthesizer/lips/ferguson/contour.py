@@ -113,7 +113,7 @@ def _line(name: str) -> LipLine:
     )
 
 
-def contour(openings: ArrayLike, num_points: int = 41) -> Array:
+def contour(openings: ArrayLike, num_points: int) -> Array:
     """Return the lip contour for openings R (num_frames,), 0 to 5.
 
     The result has shape (num_frames, 4, num_points, 2): lines as in ``LINES``, and x, y in mouth
@@ -127,7 +127,7 @@ def contour(openings: ArrayLike, num_points: int = 41) -> Array:
     return points
 
 
-def compute_rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int = 41) -> Array:
+def compute_rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int) -> Array:
     """Return the lip contour for openings R and widths (num_frames,), like :func:`contour`.
 
     A width is the distance of the corners relative to the mouth at rest. If they approach each
