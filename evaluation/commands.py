@@ -397,7 +397,7 @@ def schemes(
     if videos:
         written = write_videos(recognized, recognizers, names, videos, tables or ())
         print_message(f"wrote {plural(len(written), 'video')} to {videos}")
-        unaligned = [one.sentence.clip.name for one in recognized if one.aligned is None]
+        unaligned = [item.sentence.clip.name for item in recognized if item.aligned is None]
         if unaligned:
             print_message(f"no videos of scheme 1: no usable text for {', '.join(unaligned)}")
 

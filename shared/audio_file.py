@@ -292,12 +292,14 @@ def raw_audio(
     def pieces() -> Iterator[tuple[int, Samples]]:
         guard = PhaseCancellationGuard(name, num_mixed, warnings)
         rest, num_read = b"", 0
-        while more := stream.read(block_bytes):
-            num_read += len(more)
-            data = rest + more
-            whole = len(data) - len(data) % frame_bytes
-            rest = data[whole:]
-            channels = to_float(np.frombuffer(data[:whole], raw.dtype)).reshape(-1, num_channels)
+        while block := stream.read(block_bytes):
+            num_read += len(block)
+            data = rest + block
+            num_whole = len(data) - len(data) % frame_bytes
+            rest = data[num_whole:]
+            channels = to_float(np.frombuffer(data[:num_whole], raw.dtype)).reshape(
+                -1, num_channels
+            )
             yield raw.sample_rate_hz, guard.mix(channels, channels)
         sizes = (num_read, num_read + num_missing())
         seconds = (size / frame_bytes / raw.sample_rate_hz for size in sizes)
@@ -360,9 +362,9 @@ def _blocks(
         num_rest += len(piece)
         if num_rest >= size:
             samples = np.concatenate(rest)
-            whole = num_rest - num_rest % size
-            yield from np.split(samples[:whole], whole // size)
-            rest, num_rest = [samples[whole:]], num_rest - whole
+            num_whole = num_rest - num_rest % size
+            yield from np.split(samples[:num_whole], num_whole // size)
+            rest, num_rest = [samples[num_whole:]], num_rest - num_whole
     if num_rest:
         yield np.concatenate(rest)
 

@@ -136,11 +136,13 @@ class MediaSound:
             kinds = {stream.type for stream in self._container.streams}
             kind = "video" if "video" in kinds else min(kinds)
             raise UserError(f"{self._name}: the file has {kind} but no audio track")
-        listing = "; ".join(f"{number} {_describe(one)}" for number, one in enumerate(tracks, 1))
+        listing = "; ".join(
+            f"{number} {_describe(stream)}" for number, stream in enumerate(tracks, 1)
+        )
         if track is not None and not 1 <= track <= len(tracks):
             raise UserError(f"{self._name}: there is no track {track}; the tracks are: {listing}")
         decodable = [
-            number for number, one in enumerate(tracks, 1) if one.codec_context is not None
+            number for number, stream in enumerate(tracks, 1) if stream.codec_context is not None
         ]
         default = av.stream.Disposition.default
         decodable.sort(key=lambda number: not tracks[number - 1].disposition & default)
@@ -301,7 +303,9 @@ class MediaSound:
         if not _HEADERS_STATE_LENGTH.match(container.format.name):
             return False
         bit_rate = sum(
-            one.bit_rate or 0 for one in container.streams if one.type in ("audio", "video")
+            stream.bit_rate or 0
+            for stream in container.streams
+            if stream.type in ("audio", "video")
         )
         estimated_bytes = bit_rate * (self._stated_s() or 0) / 8
         sizes = (container.size, container.size - (self._first_place or 0))
@@ -324,8 +328,9 @@ def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:
     try:
         with av.open(file, mode="r", options=OPTIONS, metadata_errors="replace") as container:
             cover = av.stream.Disposition.attached_pic
-            has_pictures = any(not one.disposition & cover for one in container.streams.video)
-            return bool(has_pictures and container.streams.audio)
+            videos = container.streams.video
+            has_images = any(not stream.disposition & cover for stream in videos)
+            return bool(has_images and container.streams.audio)
     except (av.error.FFmpegError, ValueError) as error:
         raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
 

@@ -168,8 +168,8 @@ def _measures_table(faces: Figures, measures: Mapping[str, str]) -> Table:
     if REAL in faces:
         scores = {"real lips": faces[REAL][CLEAN][ALL], **scores}
     rows = [
-        [title, *(_format_measure(name, of_face.get(name)) for name in measures.values())]
-        for title, of_face in scores.items()
+        [title, *(_format_measure(name, face_scores.get(name)) for name in measures.values())]
+        for title, face_scores in scores.items()
     ]
     return Table(("face, delay", *measures), rows)
 
@@ -184,19 +184,19 @@ def better_programs(faces: Figures) -> list[list[str]]:
     rows = []
     for group, group_title in _COMPARED_GROUPS.items():
         real = faces[REAL][CLEAN].get(group, {})
-        of_group = {face: scores[face].get(group, {}) for face in (own, *others)}
+        group_scores = {face: scores[face].get(group, {}) for face in (own, *others)}
         for measure, name in (_COMPARED | _REALISM_MEASURES).items():
             is_realism = measure in _REALISM_MEASURES
             if is_realism and (group != ALL or real.get(measure) is None):
                 continue
             losses = {
                 face: _loss(measure, values[measure], real.get(measure))
-                for face, values in of_group.items()
+                for face, values in group_scores.items()
                 if values.get(measure) is not None
             }
             best = min(losses, key=losses.__getitem__, default=own)
             if own in losses and losses[best] < losses[own]:
-                theirs, ours = (_describe(measure, of_group[face]) for face in (best, own))
+                theirs, ours = (_describe(measure, group_scores[face]) for face in (best, own))
                 if is_realism:
                     ours += f", real lips {_describe(measure, real)}"
                 rows.append([f"{group_title}, {name}", title_of(best), theirs, ours])

@@ -52,9 +52,9 @@ def viseme_fit_table(results: Figures) -> Table:
     measures = dict.fromkeys(measure for _, measure in errors)
     rows = []
     for viseme in dict.fromkeys(viseme for viseme, _ in errors):
-        of_viseme = [errors.get((viseme, measure)) for measure in measures]
-        num_frames = max(error["num_frames"] for error in of_viseme if error)
-        rows.append([viseme, str(num_frames), *map(_fit_cell, of_viseme)])
+        viseme_errors = [errors.get((viseme, measure)) for measure in measures]
+        num_frames = max(error["num_frames"] for error in viseme_errors if error)
+        rows.append([viseme, str(num_frames), *map(_fit_cell, viseme_errors)])
     title = "errors, FAP units: learned / initial parameters / deviation of real lips"
     return Table(("viseme", "frames", *measures), rows, title)
 

@@ -127,14 +127,14 @@ def _no_actions(_system: System, _session: str, _timing: Timing) -> list[Action]
     return []
 
 
-def _cut_link(which: str, *, is_mended: bool) -> Actions:
+def _cut_link(end: str, *, is_mended: bool) -> Actions:
     """Return a fault that cuts off a host, for some time or permanently.
 
-    ``which`` is the client's host, or the kind of the service that serves the session.
+    ``end`` is the client's host, or the kind of the service that serves the session.
     """
 
     def actions(system: HostsSystem, session: str, timing: Timing) -> list[Action]:
-        host = which if which == CLIENT else system.instance_of(session, which)
+        host = end if end == CLIENT else system.instance_of(session, end)
         cut: Action = timing.fault_at_s, functools.partial(system.network.cut, host)
         restore: Action = timing.fault_at_s + timing.cut_s, system.network.restore
         return [cut, restore] if is_mended else [cut]

@@ -155,7 +155,7 @@ def _compare_lips(models: Path, folder: Path) -> tuple[int, dict[str, Agreement]
         }
         for name, predicted in faps.items():
             pairs[name].append((predicted_mouth(predicted.astype(float)), real))
-    return len(clips), {name: agreement_of(of_name) for name, of_name in pairs.items()}
+    return len(clips), {name: agreement_of(values) for name, values in pairs.items()}
 
 
 def _compare_phones(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -362,15 +363,15 @@ def find_control_address(address: str) -> Iterator[str]:
     """
     from kouxing_client import NotConnected
 
-    running, config, is_given = find_system(address)
-    is_guess = not (running or is_given)
-    others = other_systems() if is_guess else []
-    if any(system.address == config.control for system in others):
+    system = find_system(address)
+    config = system.config
+    others = other_systems() if system.is_guess else []
+    if any(other.address == config.control for other in others):
         raise UserError(_not_running_text(others))
     try:
-        yield running or control_endpoint(config.control, insecure=config.insecure)
+        yield system.running or control_endpoint(config.control, insecure=config.insecure)
     except UserError as error:
-        if is_guess and isinstance(error.__cause__, NotConnected):
+        if system.is_guess and isinstance(error.__cause__, NotConnected):
             raise UserError(f"{_not_running_text(others)}. Tried: {error}") from error
         raise
 
@@ -388,11 +389,17 @@ def _not_running_text(others: Sequence[RunningSystem]) -> str:
     return text
 
 
-def find_system(address: str) -> tuple[str, ServiceConfig, bool]:
-    """Return control's endpoint in the user's newest system, if any, and the settings.
+@dataclass(frozen=True, slots=True)
+class ChosenSystem:
+    """The system that a command connects to."""
 
-    The last value is whether ``address`` or a setting names control, so that no system is searched.
-    """
+    config: ServiceConfig
+    running: str  # control's endpoint in the user's newest system; empty if none was found
+    is_guess: bool  # nothing names control and no system was found: try the default address
+
+
+def find_system(address: str) -> ChosenSystem:
+    """Choose the system whose control is ``address``, is in the settings, or was started last."""
     if address:
         split_endpoint(address, "--control")
     settings, overrides = read_settings(), {"control": address} if address else {}
@@ -403,4 +410,4 @@ def find_system(address: str) -> tuple[str, ServiceConfig, bool]:
     if "*" in config.control:
         key = "--control" if address else "common.control"
         raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
-    return running, config, is_given
+    return ChosenSystem(config, running, is_guess=not (running or is_given))

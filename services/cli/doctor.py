@@ -38,8 +38,9 @@ class CheckResult(NamedTuple):
 
 def run_checks(address: str) -> Iterator[CheckResult]:
     """Yield the result of each check; if ``address`` is empty, control is the configured one."""
-    control, config, _ = find_system(address)
-    control = control or config.control
+    system = find_system(address)
+    config = system.config
+    control = system.running or config.control
     endpoint_address = control.partition(" ")[0]
     if reason := reach_error(*split_endpoint(endpoint_address, "control"), is_zeromq=True):
         yield CheckResult(f"control at {endpoint_address}", "cannot be reached", reason)

@@ -375,11 +375,11 @@ def lips(
 def _format(form: PhoneFormat | None, output: Path | None) -> PhoneFormat:
     if output is None:
         return form or PhoneFormat.TABLE
-    of_suffix = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
-    if of_suffix is None:
+    suffix_format = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
+    if suffix_format is None:
         raise UserError(
             f"{output}: unknown format; use a name that ends in {', '.join(_FORMAT_OF_SUFFIX)}"
         )
-    if form not in (None, of_suffix):
+    if form not in (None, suffix_format):
         raise UserError(f"{output}: --format {form} does not fit this name; leave out the option")
-    return of_suffix
+    return suffix_format

@@ -97,8 +97,8 @@ def lock_output_folder(folder: Path) -> Iterator[None]:
 
 def find_control() -> str:
     """Return control of the newest running system with this user's keys, or an empty string."""
-    own = [system.control for system in running_systems() if system.keys == _key_folder()]
-    return own[0] if own else ""
+    addresses = [system.control for system in running_systems() if system.keys == _key_folder()]
+    return addresses[0] if addresses else ""
 
 
 def other_systems() -> list[RunningSystem]:

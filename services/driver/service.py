@@ -27,7 +27,7 @@ from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
-from kouxing.shared.service_follower import ServiceFollower
+from kouxing.shared.session_follower import SessionFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import SetFace
@@ -42,7 +42,7 @@ RETRY_AFTER_S = 5.0  # for a client whose session cannot be recorded now
 class _FollowedSession:
     """A session that the driver follows."""
 
-    follower: ServiceFollower
+    follower: SessionFollower
     leave_by_s: float | None = None  # set once the session has closed
 
 
@@ -96,7 +96,7 @@ class DriverService(SessionService):
             }
             if start.opening.record:
                 handlers[Sound] = self._on_sound
-            session = _FollowedSession(ServiceFollower(self, start, handlers))
+            session = _FollowedSession(SessionFollower(self, start, handlers))
             self._sessions[start.session] = session
             self.poses.add(start.session, time.monotonic())
             if start.opening.record:
@@ -107,13 +107,13 @@ class DriverService(SessionService):
 
     def stop_session(self, session: str) -> None:
         """Stop following a session; a recorded session continues until its last frame."""
-        left = self._sessions.get(session)
-        if left is None:
+        stopped = self._sessions.get(session)
+        if stopped is None:
             return
         if not self.recorder.is_open(session):
-            self._unfollow(left)
-        elif left.leave_by_s is None:
-            left.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
+            self._unfollow(stopped)
+        elif stopped.leave_by_s is None:
+            stopped.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
 
     def gauges(self) -> dict[str, float]:
         """Return the number of videos that are not written yet."""

@@ -39,7 +39,7 @@ from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones import events
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllable_captions import SyllableCaptions
-from kouxing.shared.service_follower import ServiceFollower
+from kouxing.shared.session_follower import SessionFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import SessionProgress, StartSession
@@ -57,7 +57,7 @@ CONTROL_MISSING_S = 8.0  # delay before a missing control is shown; a restart is
 class _FollowedSession:
     """A session to which the gateway subscribes, from its first use until it ends."""
 
-    follower: ServiceFollower
+    follower: SessionFollower
     syllables: SyllableCaptions
 
 
@@ -286,7 +286,7 @@ class GatewayService(SessionService):
     # --- from the publishers ---------------------------------------------------------------------
 
     def _make_session(self, start: StartSession) -> _FollowedSession:
-        follower = ServiceFollower(
+        follower = SessionFollower(
             self,
             start,
             {

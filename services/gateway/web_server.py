@@ -270,14 +270,16 @@ class WebServer:
 
     def _make_room(self, address: str) -> bool:
         """Close a connection if the server is full; return False if none may be closed."""
-        candidates = [other for other in self._connections if other.address == address]
+        candidates = [
+            connection for connection in self._connections if connection.address == address
+        ]
         if len(candidates) < self._max_per_address:
             if len(self._connections) < MAX_CONNECTIONS:
                 return True
             candidates = [*self._connections]
-        candidates = [other for other in candidates if other.deadline_s < math.inf]
+        candidates = [connection for connection in candidates if connection.deadline_s < math.inf]
         if candidates:
-            closed = min(candidates, key=lambda other: other.changed_s)
+            closed = min(candidates, key=lambda connection: connection.changed_s)
             self._connections.pop(closed).cancel()
         return bool(candidates)
 

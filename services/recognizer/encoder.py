@@ -122,10 +122,10 @@ def process_positions(
     states = np.array([stream.state for stream in streams])
     outputs = streams[0].encoder.run(np.array(frames), states)
     positions = []
-    for stream, of_stream, *rows in zip(streams, frames, *outputs, strict=True):
+    for stream, mels, *rows in zip(streams, frames, *outputs, strict=True):
         features, phones, voice, state = (row.copy() for row in rows)  # a view would keep all rows
         stream.state = state
-        positions.append(EncoderOutput(of_stream, features, phones, voice, state))
+        positions.append(EncoderOutput(mels, features, phones, voice, state))
     return positions
 
 

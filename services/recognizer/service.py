@@ -175,7 +175,7 @@ class RecognizerService(SessionService):
             session.link.connect(socket, start.session, start.epoch, time.monotonic())
             if not is_new:  # the new synthesizer must receive the stalled state
                 session.silent_s = 0.0
-            used = {one.start.endpoints["phone_input"] for one in self._sessions.values()}
+            used = {active.start.endpoints["phone_input"] for active in self._sessions.values()}
             self._synthesizers.close_unused(used)
         return True
 
@@ -284,7 +284,7 @@ class RecognizerService(SessionService):
             self._finish(session)
 
     def _select_sessions(self, *, paced: bool) -> list[RecognizerSession]:
-        return [one for one in self._sessions.values() if one.is_paced == paced]
+        return [session for session in self._sessions.values() if session.is_paced == paced]
 
     def _queued_s(self, *, paced: bool) -> float:
         """Duration of the paced or unpaced audio that is not decoded yet."""
@@ -292,12 +292,11 @@ class RecognizerService(SessionService):
 
     @property
     def _has_live_audio(self) -> bool:
-        sessions = self._sessions.values()
-        return any(one.is_paced and one.can_accept for one in sessions)
+        return any(session.can_accept for session in self._select_sessions(paced=True))
 
     @property
     def _has_unpaced_audio(self) -> bool:
-        return any(one.audio and not one.is_paced for one in self._sessions.values())
+        return any(session.audio for session in self._select_sessions(paced=False))
 
     @property
     def _is_live_waiting(self) -> bool:
@@ -307,7 +306,8 @@ class RecognizerService(SessionService):
         """After a stall, read all received audio, so that it can be skipped at once."""
         end_s = time.monotonic() + MAX_READ_S
         while not self._is_live_blocked and (now_s := time.monotonic()) < end_s:
-            late = [one.audio for one in self._sessions.values() if one.audio.is_outdated(now_s)]
+            queues = [session.audio for session in self._sessions.values()]
+            late = [audio for audio in queues if audio.is_outdated(now_s)]
             if not late:
                 return
             if not self._audio.wait(READ_WAIT_S):

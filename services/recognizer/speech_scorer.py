@@ -258,11 +258,13 @@ class SpeechScorer:
 
 def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
     """Find the speech in the queued audio of several sessions, in batches."""
-    while waiting := [(one, position) for one in scorers if (position := one.next_encoder_input())]:
+    while waiting := [
+        (scorer, position) for scorer in scorers if (position := scorer.next_encoder_input())
+    ]:
         streams = [scorer.encoder for scorer, _ in waiting]
-        encoder_outputs = process_positions(streams, [position.mels for _, position in waiting])
-        for (scorer, position), of_scorer in zip(waiting, encoder_outputs, strict=True):
-            scorer.add_encoder_output(position, of_scorer)
+        outputs = process_positions(streams, [position.mels for _, position in waiting])
+        for (scorer, position), output in zip(waiting, outputs, strict=True):
+            scorer.add_encoder_output(position, output)
 
 
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:

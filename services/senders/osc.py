@@ -59,8 +59,8 @@ def encode_message(address: str, *arguments: str | int | float) -> bytes:
 def _message_start(address: str, texts: tuple[str, ...], kinds: str) -> bytes:
     """Return a message without its numbers. This part is the same in each frame."""
     numbers = [0 if kind == "i" else 0.0 for kind in kinds]
-    whole = build_msg(address, [*texts, *numbers]).dgram
-    return whole[: len(whole) - 4 * len(numbers)]
+    packet = build_msg(address, [*texts, *numbers]).dgram
+    return packet[: len(packet) - 4 * len(numbers)]
 
 
 def split_packet(packet: bytes, depth: int = 0) -> Iterator[bytes]:

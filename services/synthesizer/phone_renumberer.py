@@ -48,5 +48,5 @@ class PhoneRenumberer:
         return withdrawn
 
 
-def _is_same(one: Phone, other: Phone) -> bool:
-    return one.symbol == other.symbol and abs(one.onset_s - other.onset_s) < _MAX_ONSET_DIFFERENCE_S
+def _is_same(old: Phone, new: Phone) -> bool:
+    return old.symbol == new.symbol and abs(old.onset_s - new.onset_s) < _MAX_ONSET_DIFFERENCE_S

@@ -37,8 +37,8 @@ def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
 
 def _read(kind: str) -> tuple[tuple[str, ...], Float32]:
     rows, values = fap_table("high_level.tsv")
-    of_kind = [number for number, row in enumerate(rows) if row["kind"] == kind]
-    return tuple(rows[number]["name"] for number in of_kind), values[of_kind]
+    indices = [number for number, row in enumerate(rows) if row["kind"] == kind]
+    return tuple(rows[number]["name"] for number in indices), values[indices]
 
 
 VISEME_NAMES, VISEMES = _read("viseme")  # (15, 68), row 0 is "none"

@@ -154,26 +154,28 @@ class PhoneInventory:
 
     def _of_kind(self, kind: str) -> frozenset[str]:
         return frozenset(
-            phone for phone, other in zip(self.phones, self.kinds, strict=True) if other == kind
+            phone
+            for phone, phone_kind in zip(self.phones, self.kinds, strict=True)
+            if phone_kind == kind
         )
 
 
 @lru_cache
 def language_codes() -> dict[str, str]:
     """Return the language of each code that a user may give, with ``auto``."""
-    of_tables = {load_table_language(BUILT_IN[name]).code: name for name in TABLE_LANGUAGES}
-    return {AUTO: UNIVERSAL, "zh": DEFAULT_LANGUAGE} | dict(sorted(of_tables.items()))
+    table_languages = {load_table_language(BUILT_IN[name]).code: name for name in TABLE_LANGUAGES}
+    return {AUTO: UNIVERSAL, "zh": DEFAULT_LANGUAGE} | dict(sorted(table_languages.items()))
 
 
 def language_titles() -> dict[str, Mapping[str, str]]:
     """Return the display names in "en" and "zh" of ``language_codes``; zh first."""
-    of_tables = {
+    table_languages = {
         code: BUILT_IN[name] for code, name in language_codes().items() if name in TABLE_LANGUAGES
     }
     return {
         "zh": {"en": "Mandarin", "zh": "普通话"},
         AUTO: {"en": "any language", "zh": "任何语言"},
-    } | {code: load_table_language(package).titles for code, package in of_tables.items()}
+    } | {code: load_table_language(package).titles for code, package in table_languages.items()}
 
 
 def find_language(name: str) -> str:
@@ -217,8 +219,8 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
         if resources.files(package).joinpath(SETTINGS).is_file():
             return _inventory_of_tables(language, load_table_language(package))
         lexicon = importlib.import_module(package)
-        own = _universal_phones(package, language)
-        return _inventory_of(language, read_table(package, "phones.tsv"), lexicon, own)
+        universal = _universal_phones(package, language)
+        return _inventory_of(language, read_table(package, "phones.tsv"), lexicon, universal)
     except (OSError, ImportError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"language {language}: cannot read package {package}: {error}") from None
 

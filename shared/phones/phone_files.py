@@ -125,12 +125,12 @@ def _format_tier(number: int, name: str, intervals: list[_Interval], total_s: fl
     return lines
 
 
-def _fill_gaps(given: Sequence[_Interval], total_s: float) -> list[_Interval]:
+def _fill_gaps(unfilled: Sequence[_Interval], total_s: float) -> list[_Interval]:
     """Fill gaps with empty intervals and cut overlaps, so that intervals cover the whole time."""
     intervals: list[_Interval] = []
     now_s = 0.0
-    for number, (onset_s, offset_s, text) in enumerate(given):
-        next_s = given[number + 1][0] if number + 1 < len(given) else total_s
+    for number, (onset_s, offset_s, text) in enumerate(unfilled):
+        next_s = unfilled[number + 1][0] if number + 1 < len(unfilled) else total_s
         start_s = max(now_s, onset_s)
         end_s = min(offset_s, next_s, total_s)
         if round(end_s, 4) <= round(start_s, 4):

@@ -172,7 +172,7 @@ class TableLanguage:
         if self.words == _MECAB and (has_mecab() or any(map(_has_character, texts))):
             return split_words(texts)
         pieces = [list(text) if self.words == _CHARACTER else [text] for text in texts]
-        return [[(piece, piece) for piece in some] for some in pieces]
+        return [[(piece, piece) for piece in text_pieces] for text_pieces in pieces]
 
     def _is_split(self, token: re.Match[str]) -> bool:
         """Return whether a token is part of a phrase. Other readable words are whole phrases."""

@@ -36,9 +36,9 @@ def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) ->
     return indices
 
 
-def _syllable_distance(one: Syllable, other: Syllable) -> float:
+def _syllable_distance(recognized: Syllable, spoken: Syllable) -> float:
     """Return 0 for the same syllable, up to 1 without common phones."""
-    return 1.0 - len({*one} & {*other}) / max(len(one), len(other))
+    return 1.0 - len({*recognized} & {*spoken}) / max(len(recognized), len(spoken))
 
 
 def split_characters(text: str, inventory: PhoneInventory) -> Characters:

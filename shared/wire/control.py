@@ -24,7 +24,7 @@ from msgspec import Meta, Struct, field
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import MAX_KEYS, MAX_ROLES
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import ServiceMessage
+from kouxing.shared.wire.message import RegisteredMessage
 from kouxing.shared.wire.session import OpenSession
 
 
@@ -56,7 +56,7 @@ class SessionProgress(Struct, frozen=True, kw_only=True):
     skipped_s: Seconds = 0.0  # total duration of the audio skipped by a slow service
 
 
-class Heartbeat(ServiceMessage, frozen=True, kw_only=True):
+class Heartbeat(RegisteredMessage, frozen=True, kw_only=True):
     """A service's loop is running; the first heartbeat registers the service with control."""
 
     service: Name
@@ -86,7 +86,7 @@ class AllowedKey(Struct, frozen=True, kw_only=True):
     roles: Annotated[list[Name], Meta(max_length=MAX_ROLES)]
 
 
-class HeartbeatReply(ServiceMessage, frozen=True, kw_only=True):
+class HeartbeatReply(RegisteredMessage, frozen=True, kw_only=True):
     """Control's answer to a heartbeat; the four timestamps give the offset of the clocks."""
 
     sent_ns: int  # as in the heartbeat
@@ -98,7 +98,7 @@ class HeartbeatReply(ServiceMessage, frozen=True, kw_only=True):
     )
 
 
-class StartSession(ServiceMessage, frozen=True, kw_only=True):
+class StartSession(RegisteredMessage, frozen=True, kw_only=True):
     """Control asks a service to serve a session; again with a greater epoch after a move."""
 
     request: Name
@@ -116,7 +116,7 @@ class StartSession(ServiceMessage, frozen=True, kw_only=True):
         return replace(self, opening=replace(self.opening, face=face))
 
 
-class SessionStarted(ServiceMessage, frozen=True, kw_only=True):
+class SessionStarted(RegisteredMessage, frozen=True, kw_only=True):
     """A service serves a session."""
 
     request: Name  # request of the start-session

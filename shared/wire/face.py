@@ -15,7 +15,7 @@ from kouxing.shared.face.expressions import (
     MIN_EXPRESSIVENESS,
 )
 from kouxing.shared.fast_record import replace
-from kouxing.shared.wire.message import ServiceMessage
+from kouxing.shared.wire.message import RegisteredMessage
 
 Strength = Annotated[float, Meta(ge=0, le=1)]
 ExpressionMap = Annotated[dict[Name, Strength], Meta(max_length=32)]
@@ -78,7 +78,7 @@ class CurrentFace:
         return self.settings.after(now_s - self.set_at_s)
 
 
-class SetFace(ServiceMessage, frozen=True, kw_only=True):
+class SetFace(RegisteredMessage, frozen=True, kw_only=True):
     """Changes a session's face. Sent by a client to control, and by control to the services."""
 
     face: FaceSettings

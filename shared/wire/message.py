@@ -1,4 +1,4 @@
-"""The base class of the messages between services, and all classes of messages by kind.
+"""All classes of messages by kind, and a base class of the messages between services.
 
 ``kouxing_client.messages`` has the messages that the Python client reads. A message is two ZeroMQ
 parts: the topic ``<kind>/<session>/`` and a msgpack map of the fields of its class.
@@ -31,10 +31,11 @@ MESSAGES: dict[str, type[Message]] = {
 }
 
 
-class ServiceMessage(Message, frozen=True, kw_only=True):
-    """A message between services, or one that the Python client reads and writes as a map.
+class RegisteredMessage(Message, frozen=True, kw_only=True):
+    """Base class that adds each subclass to ``MESSAGES``.
 
-    The kind is the class name in kebab-case: ``OpenSession`` is an ``open-session``.
+    The kind is the class name in kebab-case: ``OpenSession`` is an ``open-session``. The messages
+    are exchanged between services, or the Python client reads and writes them as maps.
     """
 
     def __init_subclass__(cls) -> None:

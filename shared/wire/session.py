@@ -19,7 +19,7 @@ from msgspec import Meta, field
 
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.message import ServiceMessage
+from kouxing.shared.wire.message import RegisteredMessage
 
 Encoding = Annotated[str, whole_text(f"({'|'.join(SAMPLE_BYTES)})")]
 SampleRate = Annotated[int, Meta(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]
@@ -49,7 +49,7 @@ class ErrorCode(StrEnum):
     UNKNOWN_SESSION = "unknown-session"
 
 
-class OpenSession(ServiceMessage, frozen=True, kw_only=True):
+class OpenSession(RegisteredMessage, frozen=True, kw_only=True):
     """A client asks for a session; if the session name is empty, control chooses one."""
 
     request: Name  # repeated in the answer
@@ -63,7 +63,7 @@ class OpenSession(ServiceMessage, frozen=True, kw_only=True):
     face: FaceSettings = field(default_factory=FaceSettings)
 
 
-class SessionOpened(ServiceMessage, frozen=True, kw_only=True):
+class SessionOpened(RegisteredMessage, frozen=True, kw_only=True):
     """The session exists; connect to these endpoints."""
 
     request: Name
@@ -75,7 +75,7 @@ class SessionOpened(ServiceMessage, frozen=True, kw_only=True):
     facts: SessionFacts
 
 
-class SessionMoved(ServiceMessage, frozen=True, kw_only=True):
+class SessionMoved(RegisteredMessage, frozen=True, kw_only=True):
     """Other workers serve the session from now on; ``epoch`` is the new one.
 
     Sent to the client, and published for all followers of the session.
@@ -87,7 +87,7 @@ class SessionMoved(ServiceMessage, frozen=True, kw_only=True):
     next_sequence: Count | None = None  # first audio message to resend; None: the recognizer stays
 
 
-class AudioChunk(ServiceMessage, frozen=True, kw_only=True):
+class AudioChunk(RegisteredMessage, frozen=True, kw_only=True):
     """PCM in the session's encoding; media_time is the time of its first sample."""
 
     token: Name
@@ -96,7 +96,7 @@ class AudioChunk(ServiceMessage, frozen=True, kw_only=True):
     acknowledge: bool = False  # the client reads acknowledge messages and resends lost messages
 
 
-class CloseSession(ServiceMessage, frozen=True, kw_only=True):
+class CloseSession(RegisteredMessage, frozen=True, kw_only=True):
     """The session is over; the services delete its state.
 
     Sent by a client to control, and by control to the services.
@@ -106,7 +106,7 @@ class CloseSession(ServiceMessage, frozen=True, kw_only=True):
     token: Name | None = None  # a client must give it
 
 
-class FlushSession(ServiceMessage, frozen=True, kw_only=True):
+class FlushSession(RegisteredMessage, frozen=True, kw_only=True):
     """Interrupts: audio not yet shown is dropped and the face returns to rest.
 
     Sent by a client to control, and by control to the services.
@@ -116,14 +116,14 @@ class FlushSession(ServiceMessage, frozen=True, kw_only=True):
     token: Name
 
 
-class StatusRequest(ServiceMessage, frozen=True, kw_only=True):
+class StatusRequest(RegisteredMessage, frozen=True, kw_only=True):
     """Asks for the state of the whole system, or of one session and its services."""
 
     request: Name
     after: Count = 0  # ``next`` of the page before
 
 
-class StatusReport(ServiceMessage, frozen=True, kw_only=True):
+class StatusReport(RegisteredMessage, frozen=True, kw_only=True):
     """The answer to a status request."""
 
     request: Name
@@ -133,13 +133,13 @@ class StatusReport(ServiceMessage, frozen=True, kw_only=True):
     resting_face: FaceSettings | None = None  # settings of the face at rest that are in effect
 
 
-class Done(ServiceMessage, frozen=True, kw_only=True):
+class Done(RegisteredMessage, frozen=True, kw_only=True):
     """Control has carried out a request."""
 
     request: Name
 
 
-class Error(ServiceMessage, frozen=True, kw_only=True):
+class Error(RegisteredMessage, frozen=True, kw_only=True):
     """A request or message was refused.
 
     The kind and these fields exist in every version of the protocol. A message of another version

@@ -8,7 +8,7 @@ from kouxing_client.messages import Phone, Speech
 from msgspec import Meta, Struct, field
 
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.wire.message import ServiceMessage
+from kouxing.shared.wire.message import RegisteredMessage
 
 MAX_TOGETHER = 8  # messages in one, so that it fits into the limit of the synthesizer's socket
 _TOGETHER = Meta(max_length=MAX_TOGETHER)
@@ -34,7 +34,7 @@ class AcousticModelName(StrEnum):
     LIGHT = "light"  # fewer right phones, in less time
 
 
-class Acoustic(ServiceMessage, frozen=True, kw_only=True):
+class Acoustic(RegisteredMessage, frozen=True, kw_only=True):
     """The acoustic model that finds the phones from now on. Repeated when speech starts."""
 
     published_at: ClassVar[str] = "phones"
@@ -42,7 +42,7 @@ class Acoustic(ServiceMessage, frozen=True, kw_only=True):
     model: Name = AcousticModelName.FULL
 
 
-class LipPositions(ServiceMessage, frozen=True, kw_only=True):
+class LipPositions(RegisteredMessage, frozen=True, kw_only=True):
     """The mouth at media_time, from a lip model that works on the audio itself."""
 
     published_at: ClassVar[str] = "phones"
@@ -61,7 +61,7 @@ class NewestFrame(Struct, frozen=True, kw_only=True):
     values: FapValues  # 68 float32, little-endian, in FAP units
 
 
-class Progress(ServiceMessage, frozen=True, kw_only=True):
+class Progress(RegisteredMessage, frozen=True, kw_only=True):
     """The audio is processed up to media_time."""
 
     state: Name = AudioState.RUNNING
@@ -77,7 +77,7 @@ class Progress(ServiceMessage, frozen=True, kw_only=True):
     newest_frame: NewestFrame | None = None
 
 
-class Results(ServiceMessage, frozen=True, kw_only=True):
+class Results(RegisteredMessage, frozen=True, kw_only=True):
     """Messages that the recognizer sends together; ``sequence`` is their order."""
 
     phones: Annotated[list[Phone], _TOGETHER] = field(default_factory=list)
@@ -86,7 +86,7 @@ class Results(ServiceMessage, frozen=True, kw_only=True):
     progress: Annotated[list[Progress], _TOGETHER] = field(default_factory=list)
 
 
-class Acknowledge(ServiceMessage, frozen=True, kw_only=True):
+class Acknowledge(RegisteredMessage, frozen=True, kw_only=True):
     """Every message of the session up to ``sequence`` has arrived.
 
     Sent by the recognizer to the client, and by the synthesizer to the recognizer.

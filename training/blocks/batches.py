@@ -83,10 +83,10 @@ class BlockBatch:
 
 def draw_block_batch(batch_source: BatchSource, number: int) -> BlockBatch:
     """Draw the batch with this number; the batches of a step have the same shape."""
-    of_step = np.random.default_rng([SEED, number // BATCHES_PER_STEP])
-    length = int(of_step.choice(_LENGTHS))
-    block = _BLOCKS[int(of_step.choice(len(_BLOCKS), p=_BLOCK_PROBS))]
-    start = 0 if of_step.random() < _FIRST_ROW_PROB else int(of_step.integers(_MAX_START))
+    rng = np.random.default_rng([SEED, number // BATCHES_PER_STEP])
+    length = int(rng.choice(_LENGTHS))
+    block = _BLOCKS[int(rng.choice(len(_BLOCKS), p=_BLOCK_PROBS))]
+    start = 0 if rng.random() < _FIRST_ROW_PROB else int(rng.integers(_MAX_START))
     rng = np.random.default_rng([SEED, 1, number])
     probs = np.cumsum(sampling_probs(batch_source.recordings))
     num_frames = 2 * (length + _BEYOND) + 1

@@ -128,8 +128,8 @@ class ReadoutGraph(Graph):
         parameters, length = self._readout, self.length
         width = self._gru_width
         by_session = self.integers("by_session", -1, length, len(parameters["readout.inner.bias"]))
-        of_sessions = self.node("Reshape", [inner, by_session])
-        in_order = self.node("Transpose", [of_sessions], perm=[1, 0, 2])
+        rows_by_session = self.node("Reshape", [inner, by_session])
+        in_order = self.node("Transpose", [rows_by_session], perm=[1, 0, 2])
         zero, one = self.integers("zero", 0), self.integers("one_row", 1)
         repeated = []  # with the first session's row once more
         for values, axis in ((in_order, 1), ("num_positions", 0), (f"{self.prefix}state", 0)):
@@ -249,9 +249,9 @@ class BlockGraph(ReadoutGraph):
         parts = []
         for name, limit in (("num_cached", self._past), ("num_positions", self.length)):
             count = self.node("Unsqueeze", [name, self.integers("three_axes", 1, 2, 3)])
-            there = self.node("Less", [self.integers(f"{name}.places", *range(limit)), count])
+            is_present = self.node("Less", [self.integers(f"{name}.places", *range(limit)), count])
             limits = [self.number("may", 0.0), self.number("may_not", -np.inf)]
-            parts.append(self.node("Where", [there, *limits]))
+            parts.append(self.node("Where", [is_present, *limits]))
         return self.node("Concat", parts, axis=-1)
 
     def _attention(self, number: int, mask: str, joint: str) -> str:
@@ -266,8 +266,8 @@ class BlockGraph(ReadoutGraph):
         )
         ends = [self.integers("zero", 0), self.integers("block", self.block)]
         for values in (key, value):
-            of_block = self.node("Slice", [values, *ends, self.integers("place_axis", 2)])
-            self._new.append(self.node("Unsqueeze", [of_block, self.integers("ring_axis", 1)]))
+            block_values = self.node("Slice", [values, *ends, self.integers("place_axis", 2)])
+            self._new.append(self.node("Unsqueeze", [block_values, self.integers("ring_axis", 1)]))
         old_keys, old_values = (self.floats_of(f"{kind}_{number}") for kind in _KINDS)
         products = [
             self.node("FusedMatMul", [query, keys], domain=DOMAIN, transB=1, alpha=size**-0.5)

@@ -79,9 +79,9 @@ class BlockLayout:
     right_indices: Tensor  # (copies,), places in the flattened right contexts
     block_length: int  # B
 
-    def in_order(self, of_blocks: Tensor) -> Tensor:
+    def in_order(self, by_block: Tensor) -> Tensor:
         """Put values of the blocks, (batch, blocks, B + R, width), in order: (batch, n, width)."""
-        return of_blocks.flatten(1, 2)[:, self.block_indices]
+        return by_block.flatten(1, 2)[:, self.block_indices]
 
 
 @cache
@@ -106,8 +106,8 @@ def block_layout(
     begin = begins[block_of][:, None]  # start of the attending position's block
     attention_mask = block_of == block_of[:, None]
     attention_mask[:, :num_positions] |= (positions < begin) & (positions >= begin - PAST)
-    of_block = is_valid & ~copied
-    block_indices = torch.cat([part.flatten().nonzero()[:, 0] for part in (of_block, copied)])
+    is_block_row = is_valid & ~copied
+    block_indices = torch.cat([part.flatten().nonzero()[:, 0] for part in (is_block_row, copied)])
     return BlockLayout(
         num_positions=num_positions,
         places=torch.cat([positions, places[copied]]).to(device),
@@ -147,18 +147,20 @@ class BlockReadout(Readout):
     def read(self, features: Tensor, layout: BlockLayout) -> Tensor:
         """Compute log posteriors: (batch, n, features) to (batch, n, 2, states)."""
         inner = self.inner_of(features)
-        of_blocks = inner[:, layout.blocks]
-        forward_states = self._forward_states(inner[:, : layout.num_positions], of_blocks, layout)
-        context = torch.cat([forward_states, self._backward_states(of_blocks, layout)], dim=-1)
+        block_inputs = inner[:, layout.blocks]
+        forward_states = self._forward_states(
+            inner[:, : layout.num_positions], block_inputs, layout
+        )
+        context = torch.cat([forward_states, self._backward_states(block_inputs, layout)], dim=-1)
         return self.log_posteriors(context, inner).view(*features.shape[:2], 2, -1)
 
-    def _forward_states(self, inner: Tensor, of_blocks: Tensor, layout: BlockLayout) -> Tensor:
+    def _forward_states(self, inner: Tensor, block_inputs: Tensor, layout: BlockLayout) -> Tensor:
         outputs = self._run(inner, inner.new_zeros(len(inner), self.gru.hidden_size))
         last = layout.blocks[:, : layout.block_length].amax(dim=1)
-        right = of_blocks[:, :, layout.block_length :]
+        right = block_inputs[:, :, layout.block_length :]
         after = self._run(right.flatten(0, 1), outputs[:, last].flatten(0, 1).contiguous())
-        of_right = after.reshape(len(inner), -1, after.shape[-1])[:, layout.right_indices]
-        return torch.cat([outputs, of_right], dim=1)
+        right_outputs = after.reshape(len(inner), -1, after.shape[-1])[:, layout.right_indices]
+        return torch.cat([outputs, right_outputs], dim=1)
 
     def _run(self, inputs: Tensor, state: Tensor) -> Tensor:
         weights = [getattr(self.gru, f"{kind}_l0") for kind in _GRU_WEIGHTS]
@@ -168,16 +170,16 @@ class BlockReadout(Readout):
         )
         return outputs
 
-    def _backward_states(self, of_blocks: Tensor, layout: BlockLayout) -> Tensor:
+    def _backward_states(self, block_inputs: Tensor, layout: BlockLayout) -> Tensor:
         """Run backward over each right context and its block: (batch, n, width)."""
         weights = [getattr(self.gru, f"{kind}_l0_reverse") for kind in _GRU_WEIGHTS]
-        state = of_blocks.new_zeros(
-            of_blocks[:, :, 0].numel() // of_blocks.shape[-1], self.gru.hidden_size
+        state = block_inputs.new_zeros(
+            block_inputs[:, :, 0].numel() // block_inputs.shape[-1], self.gru.hidden_size
         )
         states = []
-        for column in reversed(range(of_blocks.shape[2])):
-            state = torch.gru_cell(of_blocks[:, :, column].flatten(0, 1), state, *weights)
-            state = state * layout.is_valid[:, column].repeat(len(of_blocks))[:, None]
+        for column in reversed(range(block_inputs.shape[2])):
+            state = torch.gru_cell(block_inputs[:, :, column].flatten(0, 1), state, *weights)
+            state = state * layout.is_valid[:, column].repeat(len(block_inputs))[:, None]
             states.append(state)
         steps = torch.stack(states[::-1], dim=1)
-        return layout.in_order(steps.view(*of_blocks.shape[:3], -1))
+        return layout.in_order(steps.view(*block_inputs.shape[:3], -1))

@@ -79,9 +79,9 @@ class Projection:
     @classmethod
     def fit(cls, positions: Floats) -> Projection:
         """Fit it to positions, (n, features)."""
-        some = positions[::_STRIDE]
-        mean, deviation = some.mean(axis=0), some.std(axis=0) + _MIN_DEVIATION
-        standard = _standard(some, mean, deviation)
+        sampled = positions[::_STRIDE]
+        mean, deviation = sampled.mean(axis=0), sampled.std(axis=0) + _MIN_DEVIATION
+        standard = _standard(sampled, mean, deviation)
         variances, directions = np.linalg.eigh(standard.T @ standard / len(standard))
         first = slice(-1, -1 - _NUM_COMPONENTS, -1)
         scale = np.sqrt(np.maximum(variances[first], _MIN_DEVIATION))

@@ -135,16 +135,18 @@ def _speech_of(
 ) -> list[SourceRecording]:
     """List all speech. Sources are weighted by the square root of their size; the sum is 1."""
     weights = zip(utterances, weights_of(utterances), strict=True)
-    of_sources = [[(utterance.path, weight * utterance.seconds) for utterance, weight in weights]]
+    files_by_source = [
+        [(utterance.path, weight * utterance.seconds) for utterance, weight in weights]
+    ]
     for folder in untranscribed:
-        of_sources.append([(path, 1.0) for path in audio_files(folder)])
-    of_sources.append([(path, 1.0) for path in filmed])
+        files_by_source.append([(path, 1.0) for path in audio_files(folder)])
+    files_by_source.append([(path, 1.0) for path in filmed])
     source_weights = np.sqrt(
-        [sum(path.stat().st_size for path, _ in source) for source in of_sources]
+        [sum(path.stat().st_size for path, _ in source) for source in files_by_source]
     )
     recordings = []
     for source, source_weight in zip(
-        of_sources, source_weights / source_weights.sum(), strict=True
+        files_by_source, source_weights / source_weights.sum(), strict=True
     ):
         total = sum(weight for _, weight in source)
         recordings += [_recording(path, source_weight * weight / total) for path, weight in source]

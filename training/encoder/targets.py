@@ -194,11 +194,11 @@ class TargetStore:
         pieces, errors = [], []
         for recording in self._recordings[CHUNK_SIZE * chunk :][:CHUNK_SIZE]:
             try:
-                of_recording = self.pieces_of(recording)
+                recording_pieces = self.pieces_of(recording)
             except UserError as error:
                 errors.append((recording.name, str(error)))
                 continue
-            for piece in of_recording:
+            for piece in recording_pieces:
                 pieces.append(piece)
                 if recording.voice == VoiceKind.SPEECH and rng.random() < _SUNG_PROB:
                     pieces += _sung_copy(piece, rng)

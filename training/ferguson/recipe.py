@@ -170,10 +170,10 @@ def fit_openings(
         heights.append(opening[is_measured])
     weights, height = np.concatenate(parts), np.concatenate(heights)
     fractions = _viseme_fractions(inventory) * is_open[:, None]
-    of_visemes = _least_squares(
+    viseme_heights = _least_squares(
         weights @ fractions, height, np.full(fractions.shape[1], _DEFAULT_OPENING)
     )
-    fitted = _least_squares(weights, height, fractions @ of_visemes)
+    fitted = _least_squares(weights, height, fractions @ viseme_heights)
     return dict(zip(inventory.phones, (fitted * is_open).tolist(), strict=True))
 
 
@@ -247,10 +247,10 @@ def train_ferguson(
     rows = training_rows(corpora, inventory, errors, any_license=any_license)
     table = phone_table(openings, aligned_speech(model, rows, errors), inventory)
     errors.report_to(print_message)
-    of_fap = dict(zip(MOUTH_FAPS, measure_travel(used), strict=True))
+    travel_by_fap = dict(zip(MOUTH_FAPS, measure_travel(used), strict=True))
     for name, point in load_lip_points().items():
         if point.fap is not None:
-            travel = of_fap[point.fap]
+            travel = travel_by_fap[point.fap]
             result = f"travel {travel:.1f} FAP units" if travel else "not measured; keep its value"
             print_message(f"lip_points.tsv: point {name}, FAP {point.fap}: {result}")
     licenses = sorted({clip.license for clip in used} | {row.license for row in rows})
@@ -271,12 +271,15 @@ def training_rows(
     Raises ``UserError`` if there are no usable sentences.
     """
     chosen: list[Utterance] = []
-    of_speaker: Counter[str] = Counter()
+    num_by_speaker: Counter[str] = Counter()
     for corpus in corpora:
         rows = read_corpus(corpus, errors, inventory, split="train", any_license=any_license)
         for row in rows:
-            if len(row.syllables) >= _MIN_SYLLABLES and of_speaker[row.speaker] < _MAX_OF_SPEAKER:
-                of_speaker[row.speaker] += 1
+            if (
+                len(row.syllables) >= _MIN_SYLLABLES
+                and num_by_speaker[row.speaker] < _MAX_OF_SPEAKER
+            ):
+                num_by_speaker[row.speaker] += 1
                 chosen.append(row)
     if not chosen:
         raise errors.no_recording_error(f"in {', '.join(map(str, corpora))}")

@@ -43,11 +43,11 @@ def speech_of(clips: Sequence[LipClip], copy: int = 0) -> Iterator[SpeechStretch
 
     A copy is always augmented in the same way.
     """
-    of_encoder = hashlib.sha256(_FORMAT.encode())
-    of_encoder.update(ENCODER_PATH.read_bytes())
+    encoder_hash = hashlib.sha256(_FORMAT.encode())
+    encoder_hash.update(ENCODER_PATH.read_bytes())
     for clip in track(clips, "augmented copies" if copy else "clips"):
         samples, speed = _sound_of(clip, copy)
-        positions = _positions(of_encoder, samples)
+        positions = _positions(encoder_hash, samples)
         parts = [np.split(positions[name], positions["starts"]) for name in ("features", "known_s")]
         for features, known_s in zip(*parts, strict=True):
             if len(known_s):
@@ -62,8 +62,8 @@ def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:
     return scale_level(samples, rng), speed
 
 
-def _positions(of_encoder: hashlib._Hash, samples: Floats) -> dict[str, NDArray[Any]]:
-    key = of_encoder.copy()
+def _positions(encoder_hash: hashlib._Hash, samples: Floats) -> dict[str, NDArray[Any]]:
+    key = encoder_hash.copy()
     key.update(samples.tobytes())
 
     def compute() -> dict[str, NDArray[Any]]:

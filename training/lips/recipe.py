@@ -160,8 +160,8 @@ def examples_of(
 def repeats_by_source(clips: Sequence[LipClip]) -> dict[str, int]:
     """Return how often to use the clips of each source, so that none outweighs the others."""
     num_clips = Counter(clip.source for clip in clips)
-    most = max(num_clips.values())
-    return {source: min(_MAX_REPEATS, most // number) for source, number in num_clips.items()}
+    max_clips = max(num_clips.values())
+    return {source: min(_MAX_REPEATS, max_clips // number) for source, number in num_clips.items()}
 
 
 def principal_components(features: Floats) -> tuple[Floats, Floats]:
@@ -216,22 +216,22 @@ def combine_parts(
     scale[:_NUM_FAPS] = units.extent * _EXTENT_FACTOR
     width = [LIP_FAPS.index(fap) for fap in _WIDTH_FAPS]
     scale[width] = units.extent[width] * _WIDTH_FACTOR
-    of_network, of_linear = scale.copy(), scale.copy()
-    of_network[:_NUM_FAPS] *= _NETWORK_WEIGHT
-    of_network[CLOSURE] = 1 - _LINEAR_CLOSURE
-    of_linear[:_NUM_FAPS] *= _LINEAR_WEIGHT
-    of_linear[CLOSURE] = _LINEAR_CLOSURE
+    network_scale, linear_scale = scale.copy(), scale.copy()
+    network_scale[:_NUM_FAPS] *= _NETWORK_WEIGHT
+    network_scale[CLOSURE] = 1 - _LINEAR_CLOSURE
+    linear_scale[:_NUM_FAPS] *= _LINEAR_WEIGHT
+    linear_scale[CLOSURE] = _LINEAR_CLOSURE
     encoder_weights = np.zeros((len(LIP_DELAYS_S), NUM_OUTPUTS, *shape))
     for fap in range(_NUM_FAPS):
         for number, delay_weights in enumerate(np.eye(len(LIP_DELAYS_S))):
             encoder_weights[number, fap, :, fap] = np.interp(DELAYS_S, LIP_DELAYS_S, delay_weights)
-    linear = linear_weights * of_linear
+    linear = linear_weights * linear_scale
     num_rows = encoder_weights[..., 0, 0].size
     linear[-num_rows:] += _ENCODER_WEIGHT * scale * encoder_weights.reshape(-1, *shape)
-    bias = weights["output.bias"].reshape(shape) * of_network + linear_bias * of_linear
+    bias = weights["output.bias"].reshape(shape) * network_scale + linear_bias * linear_scale
     bias[:, :_NUM_FAPS] += units.mean
     bias[:, CLOSURE] += np.interp(DELAYS_S, *_CLOSURE_BIAS)
-    output = weights["output.weight"].T.reshape(-1, *shape) * of_network
+    output = weights["output.weight"].T.reshape(-1, *shape) * network_scale
     return LipPredictor(
         delays=np.array(DELAYS_S, np.float32),
         feature_mean=basis.mean,

@@ -96,10 +96,10 @@ def label(
         replace(recording, targets=recording.targets.average_with(targets))
         for recording, targets in zip(recordings, labels, strict=False)
     ]
-    of_folders = [list(zip(pieces, labels, strict=False)) for pieces in folders]
-    sizes = [sum(len(targets) for _, targets in pairs) for pairs in of_folders]
+    pairs_by_folder = [list(zip(pieces, labels, strict=False)) for pieces in folders]
+    sizes = [sum(len(targets) for _, targets in pairs) for pairs in pairs_by_folder]
     counted = [min(size, _FULL_FOLDER_MINUTES * FRAMES_PER_MINUTE) for size in sizes]
-    for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
+    for pairs, size, count in zip(pairs_by_folder, sizes, counted, strict=True):
         for sound, targets in pairs:
             weight = mix.untranscribed * count / sum(counted) * len(targets) / size
             labeled.append(LabeledRecording(samples=sound, targets=targets, weight=weight))

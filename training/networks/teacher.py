@@ -145,8 +145,8 @@ class Teacher:
             for row, sound in zip(padded, sounds, strict=True):
                 row[: len(sound)] = as_floats(sound)
             features = [self.encoder.encode(padded)[:, 1 : 1 + math.ceil(longest / 2)]]
-        for some in features:
-            log_posteriors = self.readout(some.to(DEVICE).float())
+        for batch in features:
+            log_posteriors = self.readout(batch.to(DEVICE).float())
             best, states = log_posteriors.topk(min(_NUM_TARGETS, log_posteriors.shape[-1]))
             rows = zip(states.cpu().numpy(), best.softmax(dim=-1).cpu().numpy(), strict=True)
             for (row, probs), sound in zip(rows, sounds, strict=False):

@@ -131,14 +131,14 @@ def _components(stored: Sequence[Features]) -> list[Tensor]:
     """Return whitened principal components of the positions, (positions, 256) each."""
     rng = np.random.default_rng(SEED)
     size = min(_NUM_FOR_COMPONENTS, len(stored))
-    some = np.concatenate(
+    sampled = np.concatenate(
         [
             stored[index].position_features()
             for index in rng.choice(len(stored), size, replace=False)
         ]
     )
-    mean = some.mean(axis=0)
-    variance, axes = np.linalg.eigh(np.cov((some - mean).T))
+    mean = sampled.mean(axis=0)
+    variance, axes = np.linalg.eigh(np.cov((sampled - mean).T))
     axes = (axes / np.sqrt(variance + 1e-3))[:, -_NUM_COMPONENTS:].astype(np.float32)
     return [torch.from_numpy((features.position_features() - mean) @ axes) for features in stored]
 

@@ -67,10 +67,10 @@ class FeatureEncoder:
             blocks.append(features)
             slot = start % PAST
             rings[:, :, :, slot : slot + BLOCK_LENGTH] = new.swapaxes(0, 1)
-        of_sessions = np.stack(blocks, axis=1)
+        rows_by_session = np.stack(blocks, axis=1)
         return [
             rows[: -(-number // BLOCK_LENGTH)]
-            for rows, number in zip(of_sessions, num_positions, strict=True)
+            for rows, number in zip(rows_by_session, num_positions, strict=True)
         ]
 
 

@@ -104,11 +104,13 @@ class FeatureStore:
                 batch = recordings[start : start + _BATCH]
                 frames = [_frames_of(recording) for recording in batch]
                 encoded = self._encoder.encode(frames)
-                for recording, some, rows in zip(batch, frames, encoded, strict=True):
+                for recording, recording_frames, rows in zip(batch, frames, encoded, strict=True):
                     standard = (rows.astype(np.float32) - self.mean) / self.deviation
                     integers = np.clip(np.rint(standard * (1 / STEP)), -127, 127).astype(np.int8)
                     file.write(integers.tobytes())
-                    entries.append((recording.utterance_id, len(some), first, len(rows)))
+                    entries.append(
+                        (recording.utterance_id, len(recording_frames), first, len(rows))
+                    )
                     first += len(rows)
         write_text(index, json.dumps(entries))
 

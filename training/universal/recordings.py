@@ -115,7 +115,9 @@ def _sample_mandarin(corpus: Path, errors: RowErrors, *, any_license: bool) -> l
     by_kind: dict[str, list[Utterance]] = defaultdict(list)
     for row in rows:
         by_kind[kind_of_speech(row.license, row.phones)].append(row)
-    drawn = [row for kind, some in by_kind.items() for row in some[: _MANDARIN_LIMITS[kind]]]
+    drawn = [
+        row for kind, recordings in by_kind.items() for row in recordings[: _MANDARIN_LIMITS[kind]]
+    ]
     converted = []
     for row in drawn:
         words = [mandarin.in_universal_phones(word) for word in syllables_of(row, mandarin)]

@@ -97,8 +97,8 @@ def _crop(
     num_more = len(recording.rows) - _CROP_BLOCKS
     first = int(rng.integers(num_more + 1)) if num_more > 0 and rng.random() < 0.5 else 0
     rows = np.zeros((_CROP_BLOCKS, LENGTH, WIDTH), np.int8)
-    some = recording.rows[first : first + _CROP_BLOCKS]
-    rows[: len(some)] = some
+    crop = recording.rows[first : first + _CROP_BLOCKS]
+    rows[: len(crop)] = crop
     targets = np.full(2 * _CROP_POSITIONS, _NO_STATE)
     kept = states[2 * BLOCK_LENGTH * first :][: len(targets)]
     targets[: len(kept)] = kept

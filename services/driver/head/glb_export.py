@@ -119,10 +119,10 @@ def export_glb(
     if len(motion):
         _add_animation(document, nodes, motion, as_arkit=as_arkit)
     avatar = {"VRMC_vrm": _vrm(document, head, nodes)} if is_avatar else {}
-    of_materials = {
+    material_extensions = {
         name for entry in document.json["materials"] for name in entry.get("extensions", ())
     }
-    used = [*avatar, *sorted(of_materials)]
+    used = [*avatar, *sorted(material_extensions)]
     document.save(
         Path(path),
         scene=0,

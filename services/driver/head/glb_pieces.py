@@ -162,8 +162,8 @@ def _piece(
     count = len(points)
     index = np.arange(count)
     if "indices" in attributes:
-        given = attributes["indices"].astype(np.int64)
-        index = given[:, 0] if given.shape[1] == 1 else np.array([-1])
+        indices = attributes["indices"].astype(np.int64)
+        index = indices[:, 0] if indices.shape[1] == 1 else np.array([-1])
     if points.shape[1] != 3 or (len(index) and not 0 <= index.min() <= index.max() < count):
         raise ValueError("a triangle refers to a missing vertex")
     uv = _moved_uv(attributes.get(uv_name, np.zeros((count, 2)))[:, :2], base)
@@ -304,8 +304,8 @@ class _Skin:
 
     def mean(self, values: Mapping[int, float]) -> Float64:
         """Return each vertex's weighted mean (V,) of joint values. Missing values count as 0."""
-        of_joint = np.array([values.get(joint, 0.0) for joint in self._joints])
-        mean: Float64 = (self._weights * of_joint[self._index]).sum(axis=1)
+        joint_values = np.array([values.get(joint, 0.0) for joint in self._joints])
+        mean: Float64 = (self._weights * joint_values[self._index]).sum(axis=1)
         return mean
 
     def jaw_arm(self, vertices: Float64) -> Float64 | None:

@@ -91,12 +91,12 @@ def pack_head(
     first = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
     bounds = np.cumsum([0] + [len(piece.triangles) for piece in pieces])
     faps, ends, moved, shifts = [], [0], [], []
-    for fap in sorted({fap for of_piece in fields for fap in of_piece}):
-        for of_piece, start in zip(fields, first, strict=False):
-            if fap in of_piece:
-                rows = np.flatnonzero(np.abs(of_piece[fap]).max(axis=1) > _MIN_SHIFT_M)
+    for fap in sorted({fap for piece_fields in fields for fap in piece_fields}):
+        for piece_fields, start in zip(fields, first, strict=False):
+            if fap in piece_fields:
+                rows = np.flatnonzero(np.abs(piece_fields[fap]).max(axis=1) > _MIN_SHIFT_M)
                 moved.append(rows + start)
-                shifts.append(of_piece[fap][rows])
+                shifts.append(piece_fields[fap][rows])
         faps.append(fap)
         ends.append(sum(map(len, moved)))
     textures = {"plain": picture.encode(_WHITE)}

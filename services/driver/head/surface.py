@@ -16,8 +16,8 @@ def find_edges(quads: Index) -> tuple[Index, Index]:
     corner, in the shape of ``quads``.
     """
     pairs = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
-    edges, which = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
-    return edges, which.reshape(quads.shape)
+    edges, edge_index = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
+    return edges, edge_index.reshape(quads.shape)
 
 
 class Geodesics:

@@ -109,7 +109,8 @@ class BlockModel(NetworkModel):
             stream.append_frames(frames)
         while ready := [(stream, stream.block()) for stream in streams if stream.is_due]:
             num_kept = ready[0][1].num_kept
-            self._run([one for one in ready if one[1].num_kept == num_kept][:_MAX_BATCH])
+            batch = [(stream, block) for stream, block in ready if block.num_kept == num_kept]
+            self._run(batch[:_MAX_BATCH])
         return [stream.take_settled_scores() for stream in streams]
 
     def _run(self, blocks: Sequence[tuple[BlockStream, Block]]) -> None:

@@ -72,9 +72,9 @@ def load_component(
     """
     archive = read_archive(path)
     try:
-        found = str(archive.array("format", ()))
-        if found != form:
-            raise ValueError(f"it has the format {found!r}, expected {form!r}")
+        stored_form = str(archive.array("format", ()))
+        if stored_form != form:
+            raise ValueError(f"it has the format {stored_form!r}, expected {form!r}")
         return build(archive)
     except ValueError as error:
         raise UserError(f"{name} {path}: {error}; train it again") from error

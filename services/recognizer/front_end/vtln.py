@@ -224,11 +224,11 @@ def _period(phi: NDArray[np.float64]) -> tuple[float, float]:
     """Return lag and height of the first good peak, interpolated by a parabola, or zeros."""
     threshold = _PEAK_RATIO * phi.max()
     for k in range(1, len(phi) - 1):
-        left, here, right = phi[k - 1], phi[k], phi[k + 1]
-        if here >= threshold and here >= left and here >= right and here > 0.0:
-            bend = left - 2.0 * here + right
+        left, middle, right = phi[k - 1], phi[k], phi[k + 1]
+        if middle >= threshold and middle >= left and middle >= right and middle > 0.0:
+            bend = left - 2.0 * middle + right
             offset = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-            return _MIN_LAG + k + offset, here
+            return _MIN_LAG + k + offset, middle
     return 0.0, 0.0
 
 

@@ -184,12 +184,12 @@ def _advance(
     leave_before = np.full(num_nodes, 0.0)
     leave_before[1:] = leave[:-1]
     for frame in range(len(scores)):
-        of_frame = scores[frame]
+        frame_scores = scores[frame]
         for node in range(num_nodes):
             best = old[node + num_skipped] + stay[node]
             best = max(best, old[node + num_skipped - 1] + leave_before[node])
             best = max(best, old[node] + skip[node])
-            new[node + num_skipped] = best + of_frame[columns[node]]
+            new[node + num_skipped] = best + frame_scores[columns[node]]
         old, new = new, old
     return old[num_skipped:].copy()
 

@@ -331,7 +331,8 @@ def _sound_alike(characters: Sequence[SpokenSyllable], reading: Sequence[SpokenS
     if not reading or len(characters) != len(reading):
         return False
     num_equal = sum(
-        one.phones == other.phones for one, other in zip(characters, reading, strict=True)
+        character.phones == syllable.phones
+        for character, syllable in zip(characters, reading, strict=True)
     )
     return num_equal >= _MIN_ALIKE * len(reading)
 
@@ -343,8 +344,8 @@ def _annotate(
     if len(characters) != len(reading):
         return reading
     return [
-        replace(one, text=character.text)
-        for character, one in zip(characters, reading, strict=True)
+        replace(syllable, text=character.text)
+        for character, syllable in zip(characters, reading, strict=True)
     ]
 
 

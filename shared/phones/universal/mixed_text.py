@@ -49,8 +49,8 @@ def _split_languages(text: str) -> list[tuple[str, str]]:
     scripts = [unicodedata.name(c, "").split(" ")[0] if c.isalpha() else "" for c in text]
     for unit in _UNIT.finditer(text):
         scripts[unit.start() : unit.end()] = [""] * len(unit[0])
-    of_characters = "japanese" if {"HIRAGANA", "KATAKANA"} & {*scripts} else "mandarin"
-    languages = _LANGUAGES | dict.fromkeys(("CJK", "IDEOGRAPHIC"), of_characters)
+    character_language = "japanese" if {"HIRAGANA", "KATAKANA"} & {*scripts} else "mandarin"
+    languages = _LANGUAGES | dict.fromkeys(("CJK", "IDEOGRAPHIC"), character_language)
     for letter, script in zip(text, scripts, strict=True):
         language = languages.get(script)
         if not parts or language not in (None, parts[-1][0]):

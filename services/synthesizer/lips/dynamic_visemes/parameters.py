@@ -102,14 +102,14 @@ class VisemeParameters:
                     f"viseme parameters: {name} is not between {low:g} and {high:g}; "
                     "reinstall kouxing, or train it with 'kouxing train visemes'"
                 )
-        of_visemes = (self.offset_s, np.log(self.alpha), self.theta_minus, self.theta_plus)
-        object.__setattr__(self, "dominance", np.stack(of_visemes, axis=1))
-        of_silences = {
+        viseme_columns = (self.offset_s, np.log(self.alpha), self.theta_minus, self.theta_plus)
+        object.__setattr__(self, "dominance", np.stack(viseme_columns, axis=1))
+        silence_values = {
             "silence_log_alpha": np.log([self.alpha_right, self.alpha_left]),
             "silence_theta": np.array([self.theta_right, self.theta_left]),
             "silence_offset_s": np.array([self.offset_right_s, self.offset_left_s]),
         }
-        for name, values in of_silences.items():
+        for name, values in silence_values.items():
             object.__setattr__(self, name, values[:, None, None])
         object.__setattr__(self, "any_closes", (self.closes > 0.0).any(axis=1))
 

@@ -87,11 +87,11 @@ def draw_mouth(
     near_teeth = np.abs(x - 0.5) < _TEETH_HALF_WIDTH + 0.03
     near_tongue = np.abs(x - 0.5) < _TONGUE_HALF_WIDTH
     # highlight in the middle of the lower lip
-    of_lower = np.interp(x, outer_lower[:, 0], outer_lower[:, 1])
+    lower_edge = np.interp(x, outer_lower[:, 0], outer_lower[:, 1])
     level = 0.5 + 0.16 * (1.0 - ((x - 0.5) / 0.25) ** 2)
     on_lip = np.abs(x - 0.5) < 0.25
     shine_low, shine_high = (
-        bottom + (of_lower - bottom) * height for height in (level, 1.0 - level)
+        bottom + (lower_edge - bottom) * height for height in (level, 1.0 - level)
     )
 
     def between(above: Array, below: Array, where: NDArray[np.bool_]) -> Array:

@@ -246,8 +246,8 @@ class LearnedStream:
         return MouthFrame(faps, articulation)
 
 
-def _is_different(one: FapState, other: FapState) -> bool:
+def _is_different(a: FapState, b: FapState) -> bool:
     return bool(
-        np.abs(one.value - other.value).max() > _EPSILON
-        or np.abs(one.velocity - other.velocity).max() > _EPSILON
+        np.abs(a.value - b.value).max() > _EPSILON
+        or np.abs(a.velocity - b.velocity).max() > _EPSILON
     )

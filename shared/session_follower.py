@@ -12,7 +12,7 @@ from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import StartSession
 
 
-class ServiceFollower(Follower):
+class SessionFollower(Follower):
     """Passes a session's messages to handlers; counts missed frames in the service's metrics.
 
     Control is notified when the subscriptions are in effect. ``session_start`` is control's newest
