@@ -52,7 +52,7 @@ Conditions = Annotated[
     list[str] | None,
     typer.Option(
         "--condition",
-        help='Condition of the sound, such as clean or "babble 10 dB"; repeatable. Default: all.',
+        help='Condition of the audio, such as clean or "babble 10 dB"; repeatable. Default: all.',
     ),
 ]
 Tables = Annotated[

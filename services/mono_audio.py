@@ -1,4 +1,4 @@
-"""Reads sound files as 16 kHz mono, the format of the recognizer."""
+"""Reads audio files as 16 kHz mono, the format of the recognizer."""
 
 import math
 from collections.abc import Iterable

@@ -120,25 +120,25 @@ def _open_file(
     if count_parts(file) > 1:  # FFmpeg reads one of them
         if wav := pcm_of_wav(begin):
             return _wav_audio(file, begin, wav, path)
-        raise UserError(f"{path}: the file has several parts of sound; convert them separately")
+        raise UserError(f"{path}: the file has several audio parts; convert them separately")
     sound = MediaSound(file, path, begin, track, is_pipe=False)
     return _make_source(sound, path, name, block_s, begin, lambda: num_bytes)
 
 
 def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -> AudioSource:
     if stream.isatty():
-        raise UserError(f"{name}: this is a terminal; pipe sound into the command")
+        raise UserError(f"{name}: this is a terminal; pipe audio into the command")
     pipe = _PeekablePipe(stream)
     begin = pipe.peek()
     if not begin:
-        raise UserError(f"{name}: no sound arrived; check the command that writes it")
+        raise UserError(f"{name}: no audio arrived; check the command that writes it")
     start = find_sound_start(begin)
     if start is None:
         if kind := non_audio_kind(begin):
             raise UserError(f"{name}: this is {kind}")
         source = raw_audio(pipe, raw := RawFormat(), name)
         source.notices.append(
-            f"{name}: the sound format is unknown; reading raw samples: 16-bit, mono,"
+            f"{name}: the audio format is unknown; reading raw samples: 16-bit, mono,"
             f" {raw.sample_rate_hz} Hz; for other samples use kouxing speak with --raw, --rate and"
             " --channels"
         )
@@ -234,7 +234,7 @@ def limited_blocks(
         num_samples += len(block)
         if num_samples > max_duration_s * source.sample_rate_hz:
             raise UserError(
-                f"{source.name}: the sound is longer than {max_duration_s / 3600:g} h; use a"
+                f"{source.name}: the audio is longer than {max_duration_s / 3600:g} h; use a"
                 " shorter file"
             )
         yield block
@@ -260,7 +260,7 @@ def check_video(path: Path) -> None:
         file.seek(0)
         is_video = has_video(file, str(path), begin)
     if not is_video:
-        raise UserError(f"{path}: the video must have images and audio; record it with sound")
+        raise UserError(f"{path}: the video must have images and audio; record it again with both")
 
 
 def count_clipped(samples: Samples) -> int:

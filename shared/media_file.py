@@ -83,7 +83,7 @@ class MediaSound:
         if begin.startswith(b"RIFX"):  # FFmpeg reads its samples in the wrong byte order
             raise UserError(f"{name}: this is a big-endian WAV file; export it as wav or flac")
         if codec := misread_wav_codec(begin):
-            raise UserError(f"{name}: {codec} is not supported; export the sound as 16-bit PCM")
+            raise UserError(f"{name}: {codec} is not supported; export the audio as 16-bit PCM")
         options = OPTIONS
         if is_pipe:
             options = _PACKET_OPTIONS if is_transport_stream(begin) else _PIPE_OPTIONS
@@ -150,7 +150,7 @@ class MediaSound:
         stream = tracks[chosen - 1]
         if stream.codec_context is None:
             raise UserError(
-                f"{self._name}: the codec of audio track {chosen} is unknown; export the sound as"
+                f"{self._name}: the codec of audio track {chosen} is unknown; export the audio as"
                 " wav, flac, mp3 or m4a"
             )
         if len(tracks) > 1 and track is None:
@@ -204,9 +204,9 @@ class MediaSound:
 
     def _why_silent(self) -> str:
         if self._is_encrypted:
-            return "the sound is encrypted (DRM); use a copy without protection"
+            return "the audio is encrypted (DRM); use a copy without protection"
         if self._num_damaged:
-            return "the sound is damaged or encrypted; nothing can be decoded; export it again"
+            return "the audio is damaged or encrypted; nothing can be decoded; export it again"
         return "the file contains no samples; record it again"
 
     def _blocks(self, first: Any) -> Iterator[tuple[int, Samples]]:
@@ -221,7 +221,7 @@ class MediaSound:
                 rate_hz = frame.sample_rate
                 if not 0 < rate_hz <= _MAX_RATE_HZ:
                     raise UserError(
-                        f"{self._name}: the sample rate is {rate_hz} Hz; export the sound again"
+                        f"{self._name}: the sample rate is {rate_hz} Hz; export the audio again"
                     )
                 samples = guard.mix(*self._mix(frame))
                 ahead_s = 0.0

@@ -31,7 +31,7 @@ LABELED = {
     "in_": ("messages_received", "kind", "Messages received."),
     "out_": ("messages_published", "kind", "Messages published."),
     "dropped_": ("messages_dropped", "reason", "Messages dropped."),
-    "refused_": ("requests_refused", "code", "Requests refused, by error code."),
+    "refused_": ("requests_refused", "code", "Requests rejected, by error code."),
     "event_": ("events", "event", "Events published by control."),
 }
 

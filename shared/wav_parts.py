@@ -58,7 +58,7 @@ class WavParts:
                 break
             elif kind == b"fmt " and self._read_all(size)[:16] != self._format:
                 raise UserError(
-                    f"{self._name}: the encoding of the sound changes; convert each part separately"
+                    f"{self._name}: the encoding of the audio changes; convert each part separately"
                 )
             elif kind != b"fmt ":
                 self._read_all(size + size % 2)

@@ -42,7 +42,7 @@ export class Speaker {
    *   come faster than real time, mouthProfile: in base64, language, token, error: called with each
    *   error, after which the session may continue, closed: called with an error or null when the
    *   session has ended }
-   * @returns a promise of a Speaker; it is rejected if the gateway is not running or refuses the session
+   * @returns a promise of a Speaker; it is rejected if the gateway is not running or rejects the session
    */
   static async open(gateway, options = {}) {
     const { sampleRateHz = 16000, numChannels = 1, encoding = "s16le", token = "" } = options;

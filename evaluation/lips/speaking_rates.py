@@ -85,7 +85,7 @@ def score_rates(folder: Path) -> list[RateScore]:
     """Score all methods on the held-out Mandarin clips that are in sync."""
     clips = [clip for clip in read_clips(folder) if clip.split == "held" and clip.is_in_sync]
     if not clips:
-        raise UserError(f"{folder} has no held-out clips with sound in sync")
+        raise UserError(f"{folder} has no held-out clips with audio in sync")
     real = scale_openings([clip.speaker for clip in clips], [clip.faps for clip in clips])
     model = load_model()
     return [_score_rate(model, clips, real, rate) for rate in RATES]

@@ -199,7 +199,7 @@ def silent_subscribers(control: str, source: str, seconds: float) -> None:
 
 
 def many_sessions(control: str, _source: str, seconds: float) -> None:
-    """Open sessions until control refuses, and keep them."""
+    """Open sessions until control rejects one, and keep them."""
     end_s = time.monotonic() + seconds
     with client_connection.connect_client(control) as client:
         with contextlib.suppress(Refused):

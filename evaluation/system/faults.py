@@ -297,7 +297,7 @@ def _measure_fault(
 
 
 def _open_all(client: Client, num: int) -> tuple[list[Session], int]:
-    """Open sessions; return them and the number of refusals. The first session is not refused."""
+    """Open sessions; return them and the number of rejected ones. The first is never one."""
     sessions = [client.open_session(encoding="f32le")]
     num_refused = 0
     for _ in range(num - 1):

@@ -1,4 +1,4 @@
-"""Measures how many live sessions a system can serve: delay, refusals, CPU and memory.
+"""Measures how many live sessions a system can serve: delay, rejections, CPU and memory.
 
 One client process speaks in all sessions in real time. Their number rises in steps beyond the limit
 of the system. Each step starts new sessions. A frame's latency is the time from when the last
@@ -106,7 +106,7 @@ def measure(
     """
     speech = np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
     machine_load = os.getloadavg()[0]
-    settings = {"KOUXING_CONTROL_MAX_SESSIONS": "2000"}  # so that only load causes refusals
+    settings = {"KOUXING_CONTROL_MAX_SESSIONS": "2000"}  # so that only load causes rejections
     delay_s = read_settings().load(SynthesizerConfig).delay_ms / 1e3
     steps: list[Step] = []
     with run_all_services(console, settings) as system:
@@ -317,7 +317,7 @@ class LoadGenerator:
                 self._turn = (self._turn + 1) % len(self.speakers)
                 if self._turn == 0:
                     for speaker in self.speakers:
-                        speaker.session.take_errors()  # refused audio shows as missing frames
+                        speaker.session.take_errors()  # rejected audio shows as missing frames
 
     def close(self) -> None:
         """End all sessions."""

@@ -106,7 +106,7 @@ def animate(
     captions: CaptionKind | None = None,
     language: str,
 ) -> FaceMotion:
-    """Animate a face from a sound file.
+    """Animate a face from an audio file.
 
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
     equal the live services' frames with default settings. Otherwise the whole

@@ -63,7 +63,7 @@ def speak(
         typer.Argument(
             metavar="FILE|-|mic|monitor",
             help="Audio or video file. '-': standard input, in any format. 'mic': a microphone."
-            " 'monitor': the sound that this machine plays.",
+            " 'monitor': the audio that this machine plays.",
         ),
     ],
     session: Annotated[str, typer.Option(help="Name of the session. Default: generated.")] = "",
@@ -95,7 +95,7 @@ def speak(
     language: Language = None,
     control: Control = "",
 ) -> None:
-    """Stream a file, a pipe, the microphone or this machine's sound to a running system."""
+    """Stream a file, a pipe, the microphone or this machine's audio to a running system."""
     from kouxing.services.cli.streaming import stream
     from kouxing.services.recognizer.mouth_profile import read_mouth_profile
     from kouxing.shared.audio_file import open_audio

@@ -110,7 +110,7 @@ def draw_mouth(
     track: int | None = None,
     language: str = DEFAULT_LANGUAGE,
 ) -> None:
-    """Draw the mouth of a sound file, in the format of the output's suffix.
+    """Draw the mouth of an audio file, in the format of the output's suffix.
 
     ``.svg`` and ``.png`` show the mouth at the key frames, ``.mp4`` is a video with sound, and
     ``.csv`` has the contour of every frame with ``NUM_POINTS`` for each line. Without a text, the
@@ -247,8 +247,8 @@ def _write_picture(output: Path, mouth: _MouthMotion) -> str:
     moments = _key_frame_mouths(mouth, _syllable_labels(mouth))
     if len(moments) > _MAX_MOUTHS:
         raise UserError(
-            f"{output}: a picture holds {_MAX_MOUTHS} mouths, but this sound has {len(moments)};"
-            " cut the sound, or write .mp4 or .csv"
+            f"{output}: a picture holds {_MAX_MOUTHS} mouths, but this recording has"
+            f" {len(moments)}; cut the recording, or write .mp4 or .csv"
         )
     picture = drawing.draw_strip(moments, _MOUTHS_PER_ROW, _MOUTH_PX)
     if is_svg:

@@ -140,7 +140,7 @@ def render(
         float, typer.Option(min=0.25, max=1, help="Speed at the same pitch; 0.5 is half as fast.")
     ] = _DEFAULTS.speed,
     track: AudioTrack = None,
-    sound: Annotated[Path | None, typer.Option(help="Sound file to add to curves.")] = None,
+    sound: Annotated[Path | None, typer.Option(help="Audio file to add to curves.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of a single picture, seconds.")] = None,
     mouth: MouthFile = None,
     expressiveness: Annotated[
@@ -190,12 +190,12 @@ def render(
 
         if has_motion(source):
             reject_options(
-                f"applies to sound; {source} already contains the lip motion",
+                f"applies to audio; {source} already contains the lip motion",
                 lips=lips, live=live, text=text, mouth=mouth, language=language,
                 expressiveness=expressiveness, track=track, captions=captions,
             )  # fmt: skip
         elif sound is not None:
-            raise UserError(f"--sound applies to curves; {source} has its own sound")
+            raise UserError(f"--sound applies to curves; {source} has its own audio")
         exporter = open_exporter(target, options)
         with open_progress() as progress:
             if has_motion(source):
@@ -215,7 +215,7 @@ def render(
         print_message(f"wrote {target}: {plural(count, exporter.unit)}{phones}")
         if motion.has_wrong_text:
             print_message(
-                f"{target}: the mouth follows the text; without --text, it follows the sound"
+                f"{target}: the mouth follows the text; without --text, it follows the audio"
             )
             wrong_texts.append(source)
 
@@ -290,7 +290,7 @@ def align(
 ) -> None:
     """Find the times of the phones of a known text.
 
-    The exit status is 1 if the text does not fit the sound.
+    The exit status is 1 if the text does not fit the audio.
     """
     with show_loading():
         from kouxing.services.cli.spoken_text import read_transcript, report_mismatch

@@ -74,7 +74,7 @@ def report_mismatch(audio: Path, alignment: Alignment) -> None:
 def print_mismatch(audio: Path, reason: str) -> None:
     """Report that a text does not fit a recording, and how to fix it."""
     print_message(
-        f"{audio}: the text does not fit the sound ({reason}); check that the text is complete and"
+        f"{audio}: the text does not fit the audio ({reason}); check that the text is complete and"
         " is what was said"
     )
 

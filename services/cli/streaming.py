@@ -49,7 +49,7 @@ def stream(
     """Stream a source through a running system and wait for its last FAP frame.
 
     ``mouth_profile`` is the speaker's, if any. ``language`` is the language of the speech. Raises
-    ``UserError`` if the system does not answer, refuses the session or stops answering.
+    ``UserError`` if the system does not answer, rejects the session or stops answering.
     """
     with connect_client(control) as client:
         return _Streamer(client, source, console).run(

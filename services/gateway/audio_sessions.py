@@ -94,7 +94,7 @@ class AudioClient:
     async def open(self, session: str = "", **options: object) -> AsyncIterator[AudioSession]:
         """Open a session; on leaving, wait for its last frame and close it.
 
-        Raises ``KouxingError`` if control refuses or does not answer.
+        Raises ``KouxingError`` if control rejects the session or does not answer.
         """
         if self._client is None or self._client.is_closed:
             self._client = AsyncClient(

@@ -1,4 +1,4 @@
-"""Process that decodes an uploaded sound file to a 16-bit WAV file on standard output."""
+"""Process that decodes an uploaded audio file to a 16-bit WAV file on standard output."""
 
 import resource
 import sys

@@ -1,4 +1,4 @@
-"""Decodes sound files for the page's *File* button, like the commands.
+"""Decodes audio files for the page's *File* button, like the commands.
 
 The browser sends a file and receives 16-bit WAV, mono.
 """
@@ -57,7 +57,7 @@ class SoundUploadHandler(UploadHandler):
         if status == USER_ERROR:
             raise UserError(messages)
         if status != 0:
-            LOG.error("decoding a sound file failed with status %d: %s", status, messages)
+            LOG.error("decoding an audio file failed with status %d: %s", status, messages)
             raise UserError(f"{source.name}: the file cannot be decoded; export it again")
         headers = {"Content-Type": "audio/wav", REMARKS_HEADER: quote(messages)}
         response = web.StreamResponse(headers=headers)

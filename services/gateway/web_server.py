@@ -44,7 +44,7 @@ _OPTIONS: dict[str, Any] = {
     "access_log": None,
     "auto_decompress": False,
     "keepalive_timeout": IDLE_TIMEOUT_S,
-    "lingering_time": 0,  # a refused body is not read
+    "lingering_time": 0,  # the body of a rejected request is not read
 }
 
 

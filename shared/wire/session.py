@@ -140,10 +140,10 @@ class Done(RegisteredMessage, frozen=True, kw_only=True):
 
 
 class Error(RegisteredMessage, frozen=True, kw_only=True):
-    """A request or message was refused.
+    """A request or message was rejected.
 
     The kind and these fields exist in every version of the protocol. A message of another version
-    is answered in that version, so that its sender can read why it was refused.
+    is answered in that version, so that its sender can read why it was rejected.
     """
 
     code: Name  # an ErrorCode, or one of a later build

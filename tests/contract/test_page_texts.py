@@ -27,7 +27,7 @@ CONTROL_SOURCES = (  # their errors reach the page through control's messages
 )
 # Texts of the command line, of other clients than the page, and of a broken page.
 OTHERS = re.compile(
-    r"--rate|^this is \{\}$|--raw$|--raw if|a terminal|sound arrived|images and audio"
+    r"--rate|^this is \{\}$|--raw$|--raw if|a terminal|audio arrived|images and audio"
     r"|a folder|no such file|there is no track|expected 'start'|has disconnected"
     r"|it is larger|landmark file|header|landmarks a frame|sample rate is|times do|not pixels"
     r"|a worker must name|may provide|host and port to connect to|registered with another key"

@@ -1,4 +1,4 @@
-"""The page in a real browser streams sound files and records videos, see ``test_page``."""
+"""The page in a real browser streams audio files and records videos, see ``test_page``."""
 
 import base64
 import io

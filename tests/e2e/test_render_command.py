@@ -92,10 +92,10 @@ def test_renders_a_transparent_picture_of_any_head(face: Path, tmp_path: Path) -
     [
         ("a.png", {"at": 9.0, "size": "64x48"}, "use 0 to 0.45 seconds"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
-        ("a.mp4", {"lips": ["learned"]}, "--lips applies to sound"),
-        ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth applies to sound"),
-        ("a.mp4", {"live": True}, "--live applies to sound"),
-        ("a.csv", {"text": "你好"}, "--text applies to sound"),
+        ("a.mp4", {"lips": ["learned"]}, "--lips applies to audio"),
+        ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth applies to audio"),
+        ("a.mp4", {"live": True}, "--live applies to audio"),
+        ("a.csv", {"text": "你好"}, "--text applies to audio"),
         ("no/a.png", {"size": "64x48"}, "cannot write"),
     ],
 )
@@ -123,7 +123,7 @@ def test_renders_a_sound_as_curves_and_converts_them(tmp_path: Path) -> None:
 def test_a_text_that_does_not_fit_is_rendered_with_exit_status_1(tmp_path: Path) -> None:
     result = kouxing("render", SENTENCE, tmp_path / "a.csv", "--text", "你好")
     assert result.returncode == 1
-    assert "the text does not fit the sound" in result.stderr
+    assert "the text does not fit the audio" in result.stderr
     assert "a.csv: the mouth follows the text; without --text, it" in result.stderr
     assert (tmp_path / "a.csv").exists()
 

@@ -1,4 +1,4 @@
-"""Uploads of mouths, with other programs in place of the real learning, and of sound files."""
+"""Uploads of mouths, with other programs in place of the real learning, and of audio files."""
 
 import asyncio
 import io
@@ -160,7 +160,7 @@ async def test_stops_learning_when_the_browser_disconnects(tmp_path: Path) -> No
         await wait_until_ended(process)
 
 
-# --- sound files
+# --- audio files
 
 
 def media_bytes(suffix: str, channels: np.ndarray) -> bytes:
@@ -196,7 +196,7 @@ async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch
     async with serve(SoundUploadHandler()) as post:
         status, data, _ = await post(b'{"error": "no key"}', "a.mp3")
         assert status == 422
-        assert b"a.mp3: cannot read audio: this is text, not sound" in data
+        assert b"a.mp3: cannot read audio: this is text, not audio" in data
         monkeypatch.setattr(sound_upload, "MAX_BYTES", 1000)
         status, data, _ = await post(media_bytes("WAV", SINE), "a.wav")
         assert status == 413

@@ -58,7 +58,7 @@ def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
     for name, message in (
         ("me", "a face was found in only 0 images"),
         ("silent", "must have images and audio"),
-        ("text", "this is text, not sound"),
+        ("text", "this is text, not audio"),
         ("nobody", "no such file"),
     ):
         with pytest.raises(UserError, match=message):

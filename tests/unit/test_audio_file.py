@@ -50,10 +50,10 @@ def test_rejects_a_file_without_samples(tmp_path: Path) -> None:
         ("text.wav", b"this is not audio", "cannot read audio"),
         ("header.wav", VOWELS_FILE.read_bytes()[:44], "no samples"),
         ("list.m3u8", b"#EXTM3U\n#EXTINF:5,\n" + bytes(VOWELS_FILE), "cannot read audio"),
-        ("json.mp3", b'{"error": "quota"}', 'this is text, not sound: \'{"error"'),
+        ("json.mp3", b'{"error": "quota"}', 'this is text, not audio: \'{"error"'),
         ("zeros.wav", bytes(5000), "only zeros"),
         ("zip.wav", b"PK\3\4" + bytes(100), "zip archive; unpack it"),
-        ("my.vrm", b"glTF" + bytes(100), "this is an avatar, not sound; show it with --head"),
+        ("my.vrm", b"glTF" + bytes(100), "this is an avatar, not audio; show it with --head"),
         ("cut.m4a", b"\0\0\0\x10ftypM4A \0\0\0\0\0\0\xff\xffmdat" + bytes(99), "before its index"),
         ("low.wav", (tmp_path / "low.wav").read_bytes(), "too low"),
     ):

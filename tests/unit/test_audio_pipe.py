@@ -226,8 +226,8 @@ def test_quiet_raw_samples_are_not_taken_for_frames() -> None:
 @pytest.mark.parametrize(
     ("data", "raw", "message"),
     [
-        (b"", None, "no sound arrived"),
-        (b'{"error": "invalid key"}', None, 'this is text, not sound: \'{"error": "invalid key'),
+        (b"", None, "no audio arrived"),
+        (b'{"error": "invalid key"}', None, 'this is text, not audio: \'{"error": "invalid key'),
         (b"\x1f\x8b\x08" + bytes(99), None, "gzip archive; unpack"),
         (b"\2#!SILK_V3" + bytes(99), None, "SILK voice message"),
         (b"\0" * 99, RawFormat(4_000), "4000 Hz is too low"),

@@ -100,7 +100,7 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     harness.commands.on_refused(True)
     answer = harness.core.request("flush-session", "s")
     harness.pass_time(10.1)
-    assert "refuses this client" in str(answer.exception(0))
+    assert "rejects this client" in str(answer.exception(0))
     harness.sockets.reach_error = "another program answers there"
     answer = harness.core.request("flush-session", "s")
     harness.pass_time(10.1)
@@ -245,7 +245,7 @@ def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
         assert not inbox.is_over
         harness.pass_time(6.0)
     assert inbox.is_over
-    assert "refuses this client" in str(inbox.failure)
+    assert "rejects this client" in str(inbox.failure)
 
 
 def test_a_failing_function_of_the_program_does_not_keep_other_sessions_open() -> None:

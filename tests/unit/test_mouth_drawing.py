@@ -85,7 +85,7 @@ def test_reports_a_text_that_does_not_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, fits: bool
 ) -> None:
     draw_mouth(SOUND, text, tmp_path / "mouth.csv", lips=WidthSource.FERGUSON)
-    assert ("the text does not fit the sound" not in capsys.readouterr().err) == fits
+    assert ("the text does not fit the audio" not in capsys.readouterr().err) == fits
 
 
 @pytest.mark.parametrize(

@@ -217,7 +217,7 @@ class ClientCore:
             " 'kouxing run'. If it is yours, restart it. If it runs on another machine, run"
             " 'kouxing keys add NAME --role client' there and copy the file here"
             if key
-            else "refuses this client: 'insecure' is set here but not there, or its log says why"
+            else "rejects this client: 'insecure' is set here but not there, or its log says why"
         )
 
     def _add(self, opened: Fields, options: Fields | None, *, is_live: bool) -> SessionCore:

@@ -130,7 +130,7 @@ class Sockets:
         """Connect to a ROUTER socket, whose public key may follow its address after a space.
 
         ``on_message`` is called with the parts of each message, and ``on_refused`` when an attempt
-        to connect shows whether the server refuses this key.
+        to connect shows whether the server rejects this key.
 
         Raises
         ------
@@ -239,7 +239,7 @@ class Sockets:
             raise
 
     def _monitor(self, raw: Connection, on_refused: Callable[[bool], None]) -> None:
-        """Report refusals: a server that refuses a key accepts the connection, then closes it."""
+        """Report rejections: a server that rejects a key accepts the connection, then closes it."""
         monitor = raw.get_monitor_socket(_MONITORED)
         state = {"connected": False}
 

@@ -74,7 +74,7 @@ def _parse_xml(path: Path, text: str) -> FeaturePoints:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"{path}: .fdp files must not have a document type; remove it")
     try:
-        root = ET.fromstring(text)  # noqa: S314 - entities are refused above
+        root = ET.fromstring(text)  # noqa: S314 - entities are rejected above
     except ET.ParseError as error:
         raise UserError(f"{path}: invalid XML: {error}; export it again") from error
     positions: dict[str, Position | tuple[str, int]] = {}

@@ -79,7 +79,7 @@ class VideoRenderer:
         missing = media_time - self._num_samples
         if missing > MAX_SILENCE_S * MEDIA_RATE_HZ:
             raise UserError(
-                f"no video was written: {missing / MEDIA_RATE_HZ:.0f} s of sound are missing;"
+                f"no video was written: {missing / MEDIA_RATE_HZ:.0f} s of audio are missing;"
                 " record again"
             )
         if missing > 0:

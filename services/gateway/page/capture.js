@@ -37,7 +37,7 @@ export function capture(context, stream, onChunk) {
 }
 
 /**
- * Return { name, stream, remarks, play(onEnded) } for a sound file or the sound of a video. The gateway
+ * Return { name, stream, remarks, play(onEnded) } for an audio file or the sound of a video. The gateway
  * decodes it, as browsers ignore gaps in timestamps and read fewer formats.
  *
  * @throws {UserError} if the file is too large, too long or silent, or cannot be decoded

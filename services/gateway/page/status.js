@@ -19,7 +19,7 @@ export class GatewayState {
   acoustic = ""; // acoustic model of the session: full or light
   missing = []; // services that are not running
 
-  /** Whether the gateway refused the first connection, although it served this page. */
+  /** Whether the gateway rejected the first connection, although it served this page. */
   isRefused = false;
 
   /** Whether the page is connecting for the first time. */

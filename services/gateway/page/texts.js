@@ -56,7 +56,7 @@ export const TEXTS = {
     zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
   },
   connectionRefused: {
-    en: "The gateway refused the connection. Open the full URL that “kouxing run” printed, including #token=… if it has one.",
+    en: "The gateway rejected the connection. Open the full URL that “kouxing run” printed, including #token=… if it has one.",
     zh: "网关拒绝了连接。请打开 kouxing run 显示的完整地址（包括其中的 #token=…）。",
   },
   controlMissing: {
@@ -217,7 +217,7 @@ export const TEXTS = {
     zh: "头像的口型不像你。请放弃结果，在脸部有光、没有其他人说话的地方再试。",
   },
   noFace: { en: "No face is visible. Sit in front of the camera, with light on your face.", zh: "看不到脸。请坐在摄像头前，脸部要有光。" },
-  tooQuiet: { en: "The sound is too quiet. Speak louder, or turn up the microphone.", zh: "声音太小。请大声一点，或调高麦克风音量。" },
+  tooQuiet: { en: "Your voice is too quiet. Speak louder, or turn up the microphone.", zh: "声音太小。请大声一点，或调高麦克风音量。" },
   tooSlow: {
     en: "This computer is too slow to track your face. Close other programs and try again. Or film yourself and use kouxing track and kouxing adapt.",
     zh: "这台电脑太慢，无法跟踪你的脸。请关闭其他程序再试，或录一段视频，用 kouxing track 和 kouxing adapt 学习。",

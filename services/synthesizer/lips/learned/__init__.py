@@ -20,5 +20,5 @@ def _load(inventory: PhoneInventory) -> LipModel:
 
 
 LIP_MODEL = LipModelInfo(
-    delay_ms=60.0, titles={"en": "from the sound (learned)", "zh": "由声音（学得）"}, load=_load
+    delay_ms=60.0, titles={"en": "from the audio (learned)", "zh": "由声音（学得）"}, load=_load
 )
