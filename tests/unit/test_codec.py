@@ -7,12 +7,13 @@ import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kouxing_client.messages import Message
+from kouxing_client.messages import VERSION, Decoders, Message
+from kouxing_client.messages import decode as decode_fields
 
 from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply
-from kouxing.shared.wire.session import OpenSession
+from kouxing.shared.wire.session import Done, OpenSession
 from tests.samples import SAMPLES
 
 PHONE: dict[str, Any] = {"index": 0, "symbol": "a", "duration": 1, "final": True}
@@ -57,6 +58,16 @@ def test_rejects_bad_messages_with_a_reason(parts: list[bytes], reason: str) -> 
 def test_fields_with_defaults_are_optional_and_unknown_fields_are_ignored() -> None:
     message = decode(parts_of("open-session", request="r", color="red"))
     assert message == OpenSession(session="s", request="r")
+
+
+def test_clients_accept_messages_without_a_version() -> None:
+    parts = parts_of("done", request="r")
+    assert Decoders(Done).decode(parts) == decode(parts) == Done(session="s", request="r")
+    kind, fields = decode_fields(parts) or ("", {})
+    assert (kind, fields["version"], fields["request"]) == ("done", VERSION, "r")
+    other = parts_of("done", request="r", version=VERSION + 1)
+    assert Decoders(Done).decode(other) is None
+    assert decode_fields(other) is None
 
 
 @pytest.mark.parametrize("clock_ns", [-(2**63), -1, 2**63, 2**64 - 1])

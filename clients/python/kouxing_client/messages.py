@@ -305,10 +305,11 @@ def decode(parts: list[bytes]) -> tuple[str, Fields] | None:
     """Return the kind and the fields of a message; None if it is not a message of this version."""
     try:
         _, body = parts
-        fields = {"session": "", "epoch": 0, "sequence": 0, **_FIELDS_DECODER.decode(body)}
+        defaults = {"version": VERSION, "session": "", "epoch": 0, "sequence": 0}
+        fields = defaults | _FIELDS_DECODER.decode(body)
     except (msgspec.MsgspecError, ValueError):
         return None
-    return (kind_of(parts), fields) if fields.get("version") == VERSION else None
+    return (kind_of(parts), fields) if fields["version"] == VERSION else None
 
 
 class Decoders:
