@@ -269,7 +269,7 @@ class FaceAnimator:
     def _pass_to_lips(self, event: SoundEvent) -> None:
         self._lip_stream.add_event(event)
         self._recent.append(event)
-        while time_of(self._recent[0]) < self._event_s - _RECENT_S:
+        while self._recent and time_of(self._recent[0]) < self._event_s - _RECENT_S:
             self._recent.popleft()
 
     def _withdraw_phones(self) -> None:

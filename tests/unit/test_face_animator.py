@@ -53,6 +53,15 @@ def test_the_face_relaxes_and_returns_without_a_jump() -> None:
     assert np.abs(np.diff(faps[:, JAW])).max() < 200.0
 
 
+def test_an_old_phone_can_be_withdrawn_after_an_interruption() -> None:
+    face = make_face()
+    speak(face)  # ends with an open vowel at 0.4 s
+    advance(face, 3.0)
+    face.flush()
+    face.change_recognizer()
+    assert values(face.relax(20))[-1, JAW] < 1.0
+
+
 def test_skips_to_newer_audio_without_a_jump() -> None:
     face = make_face(idle_motion_seed=3)
     spoken = speak(face)
