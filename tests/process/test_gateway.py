@@ -120,6 +120,19 @@ async def test_viewers_receive_their_session(control: FakeControl, gateway: Gate
 
 
 @async_test
+async def test_viewers_see_a_session_whose_name_was_used_before(
+    control: FakeControl, gateway: Gateway
+) -> None:
+    async with open_websockets(gateway.page, "viewer?session=again") as (viewer,):
+        control.start("again", epoch=EPOCH + 1)
+        await receive_json(viewer, "session", session="again", epoch=EPOCH + 1)
+        control.start("again", token="another")  # the gateway missed the close
+        await receive_json(viewer, "session", session="again", epoch=EPOCH)
+        publish_all(control, "again")
+        assert (await receive_binary(viewer, FAP_TYPE))[16:] == FACE
+
+
+@async_test
 async def test_viewers_receive_shapes_in_the_requested_format(
     control: FakeControl, gateway: Gateway
 ) -> None:
