@@ -35,6 +35,7 @@ export class KouxingFace extends HTMLElement {
   #names = [];
   #recording = null; // { frames, names, nowS, onEnded }
   #lips = null; // a promise of the local lip sync
+  #lipsId = 0; // number of the newest local lip sync
   #localFaces = null; // the local faces, once they are loaded
   #blinks = new Blinks();
   #drawnMs = 0;
@@ -145,11 +146,12 @@ export class KouxingFace extends HTMLElement {
   }
 
   async #loadLips() {
+    const id = ++this.#lipsId;
     const { LipSync } = await import("kouxing-lips");
     const [models, phones] = ["local", "phones"].map((name) => this.getAttribute(name));
     const lips = await LipSync.create({ shapes: ["arkit", "oculus", "vrm"], ...(models && { models }), ...(phones && { phones }) });
-    if (this.#renderer === null || !this.hasAttribute("local")) {
-      lips.close();
+    if (id !== this.#lipsId) {
+      lips.close(); // it was closed or replaced while it was loading
       return lips;
     }
     lips.addEventListener("notice", ({ detail }) => this.dispatchEvent(new CustomEvent("notice", { detail })));
@@ -158,10 +160,8 @@ export class KouxingFace extends HTMLElement {
   }
 
   #closeLips() {
-    this.#lips?.then(
-      (lips) => lips.close(),
-      () => {},
-    );
+    this.#lipsId++;
+    this.#localFaces?.close();
     this.#lips = this.#localFaces = null;
   }
 
