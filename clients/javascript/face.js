@@ -206,6 +206,7 @@ export class KouxingFace extends HTMLElement {
     const [session, token] = ["session", "token"].map((name) => this.getAttribute(name) ?? "");
     const shapes = this.set === "faps" ? "" : this.set;
     const gateway = this.getAttribute("gateway") ?? location.origin;
+    let shown = null; // the session
     const handlers = {
       frame: (mediaTime, faps) => shapes || this.#player.addFrame(mediaTime, faps),
       rest: (faps) => shapes || this.#setRest(faps, []),
@@ -213,7 +214,9 @@ export class KouxingFace extends HTMLElement {
       restWeights: (weights, names) => this.#setRest(weights, names),
       sound: (mediaTime, samples) => this.#player.addSound(mediaTime, samples),
       session: (message) => {
-        if (message.session !== null) this.#player.reset();
+        const isOther = message.session !== shown;
+        shown = message.session;
+        if (shown !== null) this.#player.reset(isOther);
         this.dispatchEvent(new CustomEvent("session", { detail: message }));
       },
       phone: (message) => this.dispatchEvent(new CustomEvent("phone", { detail: message })),
@@ -228,7 +231,7 @@ export class KouxingFace extends HTMLElement {
     this.#recording?.onEnded();
     this.#recording = this.#values = null;
     this.#names = [];
-    this.#player.reset();
+    this.#player.reset(true);
   }
 
   /** Set the face at rest. The first one starts the player. */

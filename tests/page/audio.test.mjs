@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { AudioUplink } from "../../services/gateway/page/audio-uplink.js";
+import { Player } from "../../services/gateway/page/player.js";
 
 const BLOCK = 128; // samples, as the Web Audio API processes them
 const processors = {};
@@ -54,6 +55,25 @@ test("sound is played at its media time, faded in against clicks", () => {
   assert.equal(output[256], 0.5 / 64);
   assert.ok(output.slice(320, 768).every((value) => value === 0.5));
   assert.ok(output.slice(768).every((value) => value === 0));
+});
+
+test("the sound of another session is forgotten", () => {
+  const player = playerWith(0);
+  player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(8000).fill(16384) } });
+  player.port.onmessage({ data: { clear: true } });
+  player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(256).fill(16384) } });
+  const output = play(player, 8);
+  assert.ok(output[255] > 0);
+  assert.ok(output.slice(320).every((value) => value === 0));
+});
+
+test("a player forgets the sound of another session, and keeps it in a new epoch", () => {
+  let numCleared = 0;
+  const player = new Player({ clear: () => numCleared++ });
+  player.reset(true);
+  assert.equal(numCleared, 1);
+  player.reset(false);
+  assert.equal(numCleared, 1);
 });
 
 test("a leap waits until the sound has faded out", () => {

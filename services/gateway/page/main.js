@@ -119,7 +119,7 @@ function showSession(message) {
   if (isOther) statusBar.reset();
   if (gateway.session !== null) {
     // A session that has ended stays visible and audible to its end.
-    player.reset();
+    player.reset(isOther);
     caption.reset();
     meter.reset();
   }

@@ -36,8 +36,9 @@ export class Player {
     this.#streamFaps = new Float32Array(numValues);
   }
 
-  /** Start again with another session or epoch. */
-  reset() {
+  /** Start again with another session, or with another epoch. */
+  reset(isOtherSession) {
+    if (isOtherSession) this.#sound.clear();
     this.playout.reset();
     this.#track.reset();
     this.lateness = new Lateness();

@@ -36,6 +36,7 @@ class SoundPlayer extends AudioWorkletProcessor {
     super();
     this.port.onmessage = ({ data }) => {
       if (data.anchor !== undefined) this.#target = data.anchor;
+      else if (data.clear) this.#mediaTimes.fill(-1);
       else this.#write(data.mediaTime, data.samples);
     };
   }

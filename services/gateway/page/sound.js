@@ -123,6 +123,11 @@ export class Sound {
     if (this.isPlaying) this.#node.port.postMessage({ mediaTime, samples });
   }
 
+  /** Forget all sound: that of another session has the same media times. */
+  clear() {
+    this.#node?.port.postMessage({ clear: true });
+  }
+
   get outputLatencyMs() {
     if (!this.isPlaying) return 0;
     return 1000 * (this.#context.outputLatency || this.#context.baseLatency || 0);
