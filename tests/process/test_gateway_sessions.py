@@ -1,26 +1,20 @@
 """The gateway's sessions end, stall and stop; without control, they do not start."""
 
-import asyncio
 import signal
 from collections.abc import Iterator
-from typing import Any
 
 import aiohttp
 import pytest
 from kouxing_client.base import MAX_UNACKNOWLEDGED
-from kouxing_client.field_types import MASK_BYTES
-from kouxing_client.messages import EndOfFaps, FapFrame
+from kouxing_client.messages import EndOfFaps
 
-from kouxing.services.gateway.browser_messages import FAP_TYPE
 from kouxing.shared.wire.control import SessionStarted
 from kouxing.shared.wire.session import AudioChunk, CloseSession, FlushSession
 from tests.fake_control import EPOCH, FakeControl
 from tests.process.web_clients import (
-    FACE,
     async_test,
     open_websockets,
     publish_phone,
-    receive_binary,
     receive_json,
     wait_until_async,
 )
@@ -123,24 +117,3 @@ async def test_without_control_browsers_are_told_to_start_it() -> None:
     assert "does not answer" in text
     assert "kouxing run" in text
     assert gateway.stop() == 0
-
-
-@async_test
-async def test_shows_another_session_with_the_name_of_one_whose_end_was_not_reported(
-    control: FakeControl, gateway: Gateway
-) -> None:
-    async with (
-        asyncio.timeout(LIMIT_S),
-        open_websockets(gateway.page, "viewer?session=again") as (viewer,),
-    ):
-        await asyncio.to_thread(control.start, "again")
-        stamp: dict[str, Any] = {"session": "again", "epoch": EPOCH, "mask": bytes(MASK_BYTES)}
-        frame = FapFrame(**stamp, sequence=9, media_time=3200, packed_values=FACE)
-        control.publish(control.faps, frame)
-        await receive_binary(viewer, FAP_TYPE)
-        await asyncio.to_thread(control.start, "again", token="other")
-        await receive_json(viewer, "session", session=None)
-        await receive_json(viewer, "session", session="again")
-        first = FapFrame(**stamp, sequence=1, media_time=320, packed_values=FACE)
-        control.publish(control.faps, first)
-        await receive_binary(viewer, FAP_TYPE)
