@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.pcm import FULL_SCALE
-from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, find_sound_start
+from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, audio_file_kind, find_sound_start
 
 Array = NDArray[np.float64]
 Measure = tuple[float, float, float]  # spectral flatness, correlation of neighbors, RMS
@@ -87,6 +87,11 @@ class EncodingCheck:
         """
         if self._is_done or not message:
             return
+        if not self._begin and (kind := audio_file_kind(message)):
+            self._error = (
+                f"expected s16le samples; this looks like the start of {kind}: decode it, or send"
+                " only its samples"
+            )
         if self._error:
             raise UserError(self._error)
         self._packet_starts.append(message[0] >> 4)

@@ -95,7 +95,10 @@ def speak(
     language: Language = None,
     control: Control = "",
 ) -> None:
-    """Stream a file, a pipe, the microphone or this machine's audio to a running system."""
+    """Stream a file, a pipe, the microphone or this machine's audio to a running system.
+
+    The exit status is 1 if --record was given and no video was written.
+    """
     from kouxing.services.cli.streaming import stream
     from kouxing.services.recognizer.mouth_profile import read_mouth_profile
     from kouxing.shared.audio_file import open_audio
@@ -138,6 +141,8 @@ def speak(
     )
     if summary.video:
         print_message(f"wrote {summary.video}")
+    elif record:
+        raise typer.Exit(1)
 
 
 def devices() -> None:

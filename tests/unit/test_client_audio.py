@@ -106,6 +106,12 @@ def test_small_integers_in_a_list_are_quiet() -> None:
     assert to_pcm([0, 1, -1], "f32le") == array("f", [0, 1 / 32767, -1 / 32767]).tobytes()
 
 
+@pytest.mark.parametrize("audio", [None, "text", [b"bytes"]])
+def test_rejects_what_is_neither_bytes_nor_numbers(audio: object) -> None:
+    with pytest.raises(KouxingError, match="audio must be bytes or numbers, not "):
+        to_pcm(audio, "s16le")
+
+
 def test_rejects_an_array_with_another_number_of_channels() -> None:
     for audio in (b"", FLOATS, np.zeros(4), np.zeros((4, 2))):
         check_channels(audio, 2)

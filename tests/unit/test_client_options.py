@@ -3,8 +3,9 @@
 from typing import Any
 
 import pytest
-from kouxing_client import KouxingError
-from kouxing_client.options import FaceSettings, check_name, face_fields, open_fields
+from kouxing_client import FapFrame, KouxingError, Phone, Shapes
+from kouxing_client.messages import Event
+from kouxing_client.options import FaceSettings, check_name, check_results, face_fields, open_fields
 
 from kouxing.shared.name_rules import NAME_RULE
 from kouxing.shared.wire import face
@@ -23,6 +24,7 @@ def test_the_package_has_all_face_settings_of_the_protocol() -> None:
         ),
         ({"channels": 2}, "did you mean 'num_channels'"),
         ({"x": 1}, "use sample_rate_hz, num_channels, "),
+        ({"lip_model": "learned"}, r"write face=\{'lip_model': \.\.\.\}"),
         (
             {"face": {"lip_mode": "learned"}},
             r"set_face\(\) has no keyword 'lip_mode'; did you mean 'lip_model'",
@@ -52,6 +54,22 @@ def test_an_unknown_face_setting_is_rejected() -> None:
 def test_wrong_values_are_rejected(options: Any, text: str) -> None:
     with pytest.raises(KouxingError, match=text):
         open_fields("", options)
+
+
+@pytest.mark.parametrize(
+    ("classes", "text"),
+    [
+        (["FapFrame"], "not 'FapFrame'"),
+        ([Event], "not <class .*Event'>"),
+        ([], "needs classes"),
+        ([FapFrame, Shapes], "shapes='arkit'"),
+    ],
+)
+def test_results_need_classes_that_a_session_publishes(classes: list[Any], text: str) -> None:
+    check_results([FapFrame, Phone], "")
+    check_results([FapFrame, Shapes], "arkit")
+    with pytest.raises(KouxingError, match=text):
+        check_results(classes, "")
 
 
 def test_a_name_follows_the_rule_of_the_product() -> None:

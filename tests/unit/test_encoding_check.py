@@ -92,6 +92,16 @@ def test_refuses_all_later_messages() -> None:
             check.check(message)
 
 
+@pytest.mark.parametrize(("name", "codec"), [("a.mp3", "mp3"), ("a.wav", "pcm_s16le")])
+def test_refuses_a_file_with_its_header(name: str, codec: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    write_media(path, codec, speech().astype(np.float32), RATE_HZ)
+    check = EncodingCheck(1)
+    for message in (path.read_bytes(), raw(speech())):
+        with pytest.raises(UserError, match=r"this looks like the start of an? .* file: decode it"):
+            check.check(message)
+
+
 @pytest.mark.parametrize("name", ["speech.mp3", "speech.aac"])
 def test_refuses_a_compressed_stream(name: str, tmp_path: Path) -> None:
     path = tmp_path / name

@@ -44,7 +44,8 @@ def to_pcm(audio: Any, encoding: str) -> bytes:
     The audio is PCM bytes in that encoding, or numbers (16-bit integers, or floats within ±1) in an
     iterable or a buffer, of shape ``(n,)`` or ``(n, channels)``.
 
-    Raises ``KouxingError`` if floats are not finite or far beyond ±1, or an array has another type.
+    Raises ``KouxingError`` if it is neither, if floats are not finite or far beyond ±1, or if an
+    array has another type.
     """
     try:
         view = memoryview(audio)
@@ -63,11 +64,16 @@ def to_pcm(audio: Any, encoding: str) -> bytes:
 
 
 def _to_array(numbers: Iterable[float]) -> array[int] | array[float]:
-    listed = list(numbers)
     try:
-        return array("h", listed)
-    except (TypeError, OverflowError):  # floats, or larger integers
-        return array("d", listed)
+        listed = list(numbers)
+        try:
+            return array("h", listed)
+        except (TypeError, OverflowError):  # floats, or larger integers
+            return array("d", listed)
+    except TypeError:
+        raise KouxingError(
+            f"audio must be bytes or numbers, not {type(numbers).__name__}"
+        ) from None
 
 
 def _pack(numbers: memoryview[Any], encoding: str) -> bytes:

@@ -13,7 +13,7 @@ from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.inbox import Inbox
 from kouxing_client.keys import Key, find_key, read_key
 from kouxing_client.messages import Fields, Result
-from kouxing_client.options import check_name
+from kouxing_client.options import check_name, check_results
 from kouxing_client.session_core import SessionCore, Subscription
 from kouxing_client.thread import ClientThread
 
@@ -227,6 +227,7 @@ class BaseSession:
 
         Return its inbox, a function that ends it, and a future that is done when it is in effect.
         """
+        check_results(classes, shape_set)
         thread, core = self._thread, self._core
         inbox = Inbox(MAX_LIVE if core.is_live and not keep_all else None)
         subscription = Subscription(core, classes, shape_set, inbox, on_result)

@@ -8,7 +8,7 @@ from typing import TypedDict
 from kouxing_client.audio import SAMPLE_BYTES
 from kouxing_client.errors import KouxingError
 from kouxing_client.field_types import SESSION_NAME
-from kouxing_client.messages import MEDIA_RATE_HZ, Fields
+from kouxing_client.messages import MEDIA_RATE_HZ, Fields, Result, Shapes
 
 MIN_RATE_HZ, MAX_RATE_HZ = 8000, 48000
 MAX_CHANNELS = 2
@@ -111,11 +111,25 @@ def check_name(name: str) -> None:
         )
 
 
+def check_results(classes: Sequence[object], shape_set: str) -> None:
+    """Raise ``KouxingError`` unless a session publishes results of these classes."""
+    for cls in classes:
+        if not (isinstance(cls, type) and issubclass(cls, Result)):
+            raise KouxingError(f"results() expects classes such as FapFrame or Phone, not {cls!r}")
+    if not classes or (Shapes in classes and not shape_set):
+        raise KouxingError(
+            "results() needs classes, such as results(FapFrame, Phone); Shapes also need the name"
+            " of a set, such as shapes='arkit'"
+        )
+
+
 def _check_keywords(function: str, given: Mapping[str, object], known: Collection[str]) -> None:
     for name in given:
         if name not in known:
             likely = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {likely[0]!r}?" if likely else f"use {', '.join(known)}"
+            if "face" in known and name in FaceSettings.__annotations__:
+                hint = f"write face={{{name!r}: ...}}"
             raise TypeError(f"{function}() has no keyword {name!r}; {hint}")
 
 
