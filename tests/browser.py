@@ -38,10 +38,14 @@ class Browser(Chromium):
 
     def restart(self, address: str) -> None:
         """Load a page of another origin, without the errors of the previous page."""
-        self.command("Page.navigate", url="about:blank")
-        self.wait_for("location.href === 'about:blank'")
+        self.show_nothing()
         self.page_errors.clear()
         self.command("Page.navigate", url=address)
+
+    def show_nothing(self) -> None:
+        """Leave the page, which would need processor time to draw its faces."""
+        self.command("Page.navigate", url="about:blank")
+        self.wait_for("location.href === 'about:blank'")
 
     def keep_resolution(self) -> None:
         """Let the gateway's page draw all further images with the same number of pixels."""

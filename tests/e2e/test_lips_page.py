@@ -1,5 +1,6 @@
 """The demo page of kouxing-lips in Chromium: lip sync without a server."""
 
+import contextlib
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,6 +35,15 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     browser.close()
 
 
+@contextlib.contextmanager
+def shown_demo(browser: Browser, site: Path) -> Iterator[str]:
+    """Serve and show the demo page; yields its origin. Afterwards, the browser draws no face."""
+    with serve_folder(site) as origin:
+        open_demo(browser, origin)
+        yield origin
+        browser.show_nothing()
+
+
 def open_demo(browser: Browser, origin: str) -> None:
     browser.restart(f"{origin}/")
     browser.wait_for(f"{FACE}?.set != null")
@@ -50,8 +60,7 @@ def open_demo(browser: Browser, origin: str) -> None:
 
 
 def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site):
         browser.click("microphone")
         browser.wait_for("window.opened > 200")
         browser.wait_for("document.getElementById('phones').textContent.split(' ').length > 4")
@@ -59,7 +68,7 @@ def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
         browser.click("microphone")
         assert browser.evaluate("document.getElementById('microphone').ariaPressed") == "false"
         browser.wait_for(f"Math.abs({FACE}.shown[2]) < 1")  # the face returns to rest
-    assert not [text for text in browser.page_errors if "GL Driver" not in text]
+        assert not [text for text in browser.page_errors if "GL Driver" not in text]
 
 
 def test_the_page_fits_on_a_phone(browser: Browser, site: Path) -> None:
@@ -73,8 +82,7 @@ def test_the_page_fits_on_a_phone(browser: Browser, site: Path) -> None:
 
 
 def test_the_page_works_offline_after_the_first_visit(browser: Browser, site: Path) -> None:
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site) as origin:
         browser.evaluate("navigator.serviceWorker.ready.then(() => 1)")
         browser.wait_for("navigator.serviceWorker.controller !== null")
     open_demo(browser, origin)
@@ -88,8 +96,7 @@ def test_frames_in_the_browser_equal_those_of_node(
     samples = samples_of_file(DEMO / "lake-male.wav")[:16_000]  # the block network is slow here
     for name, content in web_model().items():
         (tmp_path / name).write_bytes(content)
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site):
         first = frames_of(browser, samples)
         browser.click("final")
         browser.wait_for("document.getElementById('final').ariaPressed === 'true'")
@@ -102,8 +109,7 @@ def test_frames_in_the_browser_equal_those_of_node(
 def test_an_avatar_speaks(browser: Browser, site: Path) -> None:
     avatar = site / "avatar.vrm"
     subprocess.run([NODE.with_name("kouxing"), "head", "export", "--force", avatar], check=True)
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site):
         browser.evaluate(f"{FACE}.setAttribute('src', 'avatar.vrm')")
         browser.wait_for(f"['vrm', 'arkit'].includes({FACE}.set)")
         browser.click("microphone")
@@ -112,8 +118,7 @@ def test_an_avatar_speaks(browser: Browser, site: Path) -> None:
 
 def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path) -> None:
     faces = "[...document.querySelectorAll('kouxing-face')]"
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site):
         click = "document.getElementById('compare').click();"
         browser.evaluate(f"{click * 3} 1")  # on, off and on again, while the packages load
         browser.wait_for(f"{faces}.length === 3 && {faces}.every(({{ set }}) => set === 'faps')")
@@ -126,15 +131,14 @@ def test_other_lip_sync_is_shown_on_the_same_sound(browser: Browser, site: Path)
         browser.wait_for("window.jaws.every((jaw) => jaw > 10)")
         browser.click("compare")
         browser.wait_for(f"{faces}.length === 1")
-    assert not [text for text in browser.page_errors if "GL Driver" not in text]
+        assert not [text for text in browser.page_errors if "GL Driver" not in text]
 
 
 def test_each_problem_gives_a_sentence(browser: Browser, site: Path) -> None:
     def wait_for_note(text: str) -> None:
         browser.wait_for(f"{NOTE}.includes('{text}')")
 
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site):
         check_sound_waits_for_a_click(browser)
         browser.evaluate(
             "window.drop = new Event('drop', { bubbles: true });"
@@ -174,8 +178,7 @@ def test_notices_about_the_microphone_and_the_tab(browser: Browser, site: Path) 
             "document.dispatchEvent(new Event('visibilitychange')); 1"
         )
 
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site):
         browser.evaluate(
             "MediaStreamTrack.prototype.getSettings = function () {"
             " window.track = this; return { sampleRate: 8000 }; }; 1"
@@ -194,18 +197,14 @@ def test_notices_about_the_microphone_and_the_tab(browser: Browser, site: Path) 
         wait_for_notice("the microphone was unplugged")
 
 
-def test_calls_without_sound_give_a_sentence(browser: Browser, site: Path) -> None:
+def test_calls_without_sound_and_replaced_sources_are_reported(
+    browser: Browser, site: Path
+) -> None:
     text = "no sound is open; call open() or listenTo() first"
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
+    with shown_demo(browser, site):
         browser.evaluate("window.lips.push(new Float32Array(320)); 1")
         browser.wait_for(f"window.notices.includes('{text}')")
         assert browser.evaluate("window.lips.finish().catch(({ message }) => message)") == text
-
-
-def test_a_source_that_another_one_replaces_is_reported(browser: Browser, site: Path) -> None:
-    with serve_folder(site) as origin:
-        open_demo(browser, origin)
         result = browser.evaluate(
             "Promise.allSettled([window.lips.open(16000), window.lips.open(48000)])"
             ".then((all) => all.map(({ status, reason }) => reason?.name ?? status))"
