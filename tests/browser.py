@@ -1,7 +1,9 @@
 """A headless Chromium with one page, and screenshots of that page."""
 
 import base64
+import contextlib
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +48,24 @@ class Browser(Chromium):
         """Leave the page, which would need processor time to draw its faces."""
         self.command("Page.navigate", url="about:blank")
         self.wait_for("location.href === 'about:blank'")
+
+    @contextlib.contextmanager
+    def drawing_seldom(self, module: str = "/draw-rate.js") -> Iterator[None]:
+        """Let pages draw one image in two seconds: without a GPU, an image needs 0.2 s."""
+        self.command("Page.enable")
+        script = self.command(
+            "Page.addScriptToEvaluateOnNewDocument",
+            source="if (location.protocol.startsWith('http'))"
+            f" import('{module}').then(({{ ImageQueue: {{ prototype }} }}) => {{"
+            "   const { draw } = prototype;"
+            "   prototype.draw = function (nowMs, ...functions) {"
+            "     if (nowMs < (this.nextMs ?? 0)) return;"
+            "     this.nextMs = nowMs + 2000;"
+            "     draw.call(this, nowMs, ...functions); }; });",
+        )
+        yield
+        self.command("Page.removeScriptToEvaluateOnNewDocument", **script)
+        self.command("Page.disable")
 
     def keep_resolution(self) -> None:
         """Let the gateway's page draw all further images with the same number of pixels."""

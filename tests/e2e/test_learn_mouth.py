@@ -17,6 +17,7 @@ from PIL import Image
 
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
+from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from tests import heads
 from tests.browser import Browser
@@ -53,8 +54,9 @@ def browser(control: FakeControl, tmp_path_factory: pytest.TempPathFactory) -> I
     write_speaking_head(folder / "head.mjpeg")
     gateway = Gateway(control.address)
     browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg", (640, 480))
-    browser.open(gateway.page)
-    yield browser
+    with browser.drawing_seldom():
+        browser.open(gateway.page)
+        yield browser
     browser.close()
     assert gateway.stop() == 0
 
@@ -75,16 +77,18 @@ def start_recording(browser: Browser) -> None:
 
 
 def read_aloud(browser: Browser) -> None:
-    """Record until enough images were taken, however slowly, and wait for the outcome."""
+    """Record until enough faces were found, however slowly, and wait for the outcome."""
     set_min_rate(browser, 0)
     browser.evaluate(
-        "window.numImages = 0; window.takeImage = createImageBitmap;"
-        " window.createImageBitmap = (...args) => { numImages += 1; return takeImage(...args); }; 0"
+        "import('/face-recording.js').then(({ FaceRecording: { prototype } }) => {"
+        " window.numFaces = 0; const { addFace } = prototype;"
+        " prototype.addFace = function (takenMs, landmarks) {"
+        "   window.numFaces += landmarks !== null; addFace.call(this, takenMs, landmarks); }; })"
     )
     browser.evaluate("window.kouxing.readingS = 600")
     start_recording(browser)
     is_due = "document.getElementById('learn-reading').classList.contains('due')"
-    browser.wait_for(f"{is_due} && window.numImages > 80", 180)
+    browser.wait_for(f"{is_due} && window.numFaces > {MIN_FRAMES + 5}", 180)
     browser.evaluate("window.kouxing.readingS = 0.001")
     browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
 
@@ -187,7 +191,7 @@ def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
         "   return find.call(this, image); }; })"
     )
     set_min_rate(browser, 0)
-    browser.evaluate("window.kouxing.readingS = 2")
+    browser.evaluate("window.kouxing.readingS = 1")
     start_recording(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'", 180)
     problem, found = text_of(browser, "learn-problem"), browser.evaluate("found")
