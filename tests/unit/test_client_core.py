@@ -278,3 +278,13 @@ def test_closes_a_session_that_opens_after_its_request_has_failed() -> None:
     kind, closing = harness.commands.sent[-1]
     assert (kind, closing["session"], closing["token"]) == ("close-session", "s", "t")
     assert len(harness.core.sessions) == 1
+
+
+def test_events_can_be_closed_twice() -> None:
+    harness, first, second = CoreHarness(), Inbox(None), Inbox(None)
+    for inbox in (first, second):
+        harness.core.add_inbox("s", inbox)
+    for _ in range(2):
+        harness.core.remove_inbox("s", first)
+    assert first.is_over
+    assert not second.is_over

@@ -133,8 +133,9 @@ class ClientCore:
 
     def remove_inbox(self, session: str, inbox: Inbox) -> None:
         """Stop passing events to an inbox."""
-        self._inboxes[session].remove(inbox)
-        self._watch(session, on=False)
+        if inbox in self._inboxes[session]:
+            self._inboxes[session].remove(inbox)
+            self._watch(session, on=False)
         inbox.end(None)
 
     def tick(self) -> None:
