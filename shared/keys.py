@@ -81,8 +81,9 @@ def key_folder() -> Path:
 def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
     """Return a key of this machine. On control's machine, create and allow a missing key.
 
-    ``control`` is control's address; empty: this machine. Raises ``UserError`` if the key cannot be
-    read or created, other users can read it, or it belongs to another system than control's key.
+    ``control`` is control's address; if empty, control runs on this machine. Raises ``UserError``
+    if the key cannot be read or created, if other users can read it, or if it belongs to a
+    different system than control's key.
     """
     if credential := _find_credential(f"{name}.key"):
         return read_key(credential)
@@ -98,9 +99,9 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
             if name == CONTROL:
                 raise _key_error(path)
             raise UserError(
-                f"{path} belongs to another system than {control_path}. If control runs on another"
-                f" machine, run: rm {control_path} {folder / _ALLOWED}. If it runs here, run:"
-                f" {_replace_hint(path)}"
+                f"{path} belongs to a different system than {control_path}. If control runs on"
+                f" another machine, run: rm {control_path} {folder / _ALLOWED}. If it runs here,"
+                f" run: {_replace_hint(path)}"
             )
         return key
 

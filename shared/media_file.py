@@ -103,8 +103,8 @@ class MediaSound:
         try:
             if self._container.format.name in _RAW_FORMATS:
                 raise UserError(
-                    f"{name}: these are samples without a header; convert them to wav with FFmpeg,"
-                    " stating their format and rate"
+                    f"{name}: the file contains samples without a header; convert it to wav with"
+                    " FFmpeg, and specify their format and rate"
                 )
             self._stream = self._choose(track, begin)
             self._decoder = self._stream.codec_context

@@ -24,7 +24,9 @@ def pair_outputs(
         return [(sources[0], output)]
     if output is not None and not output.is_dir():
         if output.suffix:
-            raise UserError(f"{output} is a file for {len(sources)} inputs; use a folder")
+            raise UserError(
+                f"{output} is a single file, but there are {len(sources)} inputs; use a folder"
+            )
         try:
             output.mkdir()
         except OSError as error:

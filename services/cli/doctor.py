@@ -95,7 +95,7 @@ def _check_key(name: str, key: Key | None, address: str) -> CheckResult:
     if key is not None and controls and controls[0] not in (address, control):
         return CheckResult(
             f"key {name}",
-            "belongs to another system than this control",
+            "belongs to a different system than this control",
             "set XDG_STATE_HOME to the same folder as for 'kouxing run'",
         )
     return CheckResult(

@@ -247,7 +247,7 @@ def _write_picture(output: Path, mouth: _MouthMotion) -> str:
     moments = _key_frame_mouths(mouth, _syllable_labels(mouth))
     if len(moments) > _MAX_MOUTHS:
         raise UserError(
-            f"{output}: a picture holds {_MAX_MOUTHS} mouths, but this recording has"
+            f"{output}: a picture can show {_MAX_MOUTHS} mouths, but this recording has"
             f" {len(moments)}; cut the recording, or write .mp4 or .csv"
         )
     picture = drawing.draw_strip(moments, _MOUTHS_PER_ROW, _MOUTH_PX)

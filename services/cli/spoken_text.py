@@ -74,8 +74,8 @@ def report_mismatch(audio: Path, alignment: Alignment) -> None:
 def print_mismatch(audio: Path, reason: str) -> None:
     """Report that a text does not fit a recording, and how to fix it."""
     print_message(
-        f"{audio}: the text does not fit the audio ({reason}); check that the text is complete and"
-        " is what was said"
+        f"{audio}: the text does not fit the audio ({reason}); check that the text is complete"
+        " and matches what was said"
     )
 
 
@@ -103,7 +103,7 @@ def read_spoken_text(text: str) -> str:
         print_message(f"{time[0]} is read as a spoken time of day; delete it if it is not spoken")
     if len(labels := _LABEL.findall(spoken.text)) > 1:
         print_message(
-            f"{labels[0]!r} is read as spoken text; delete such labels if nobody says them"
+            f"{labels[0]!r} is read as spoken text; delete such labels if they are not spoken"
         )
     return spoken.text
 

@@ -162,7 +162,7 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
         spoken = remove_columns(text)
         form = "" if spoken == text else "a table of times or names"
     if _LEFT_TIME.search(spoken):
-        raise UserError("the text has times of an unknown format; keep only the spoken text")
+        raise UserError("the text has times in an unknown format; keep only the spoken text")
     return SpokenText(spoken, form)
 
 

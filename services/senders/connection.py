@@ -115,7 +115,7 @@ class DatagramConnection(TargetConnection):
             self._refused_s = now_s
             address = f"{self.target.host}:{self.target.port}"
             if error.errno == errno.ECONNREFUSED:
-                self.problem = f"no program listens on {address}: turn its receiver on"
+                self.problem = f"no program is listening on {address}; turn its receiver on"
             else:
                 self.problem = f"cannot reach {address}: {error.strerror}"
                 self._close()

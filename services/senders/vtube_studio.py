@@ -53,7 +53,9 @@ class VTubeStudioProtocol:
         """Return the first message."""
         if self._token:
             return _request("AuthenticationRequest", **PLUGIN, authenticationToken=self._token)
-        self.problem = "VTube Studio asks whether kouxing may move the model: press Allow there"
+        self.problem = (
+            "VTube Studio is asking whether kouxing may move the model; press Allow there"
+        )
         return _request("AuthenticationTokenRequest", **PLUGIN)
 
     def reply(self, text: str) -> str:
@@ -116,10 +118,10 @@ class VTubeStudioProtocol:
         number, text = data["errorID"], str(data["message"])[:200]
         if number == _DENIED:
             raise AccessDenied(
-                "access to VTube Studio was denied; stop and start sending to be asked again"
+                "access to VTube Studio was denied; to be asked again, stop sending and start again"
             )
         if number == _ACCESS_OFF:
-            text = "VTube Studio's API is off: turn on 'Start API (allow plugins)' in its settings"
+            text = "VTube Studio's API is off; turn on 'Start API (allow plugins)' in its settings"
         elif number == _ASKING:
             text = self.problem  # VTube Studio still shows the window of an earlier connection
         elif number == _IN_USE:
@@ -216,7 +218,7 @@ class VTubeStudioConnection(TargetConnection):
                         return
                 except (aiohttp.ClientError, OSError, TimeoutError):
                     self.problem = (
-                        f"no VTube Studio at {self._address}: start it, and turn on "
+                        f"VTube Studio is not running at {self._address}; start it, and turn on "
                         "'Start API (allow plugins)' in its settings"
                     )
                 finally:

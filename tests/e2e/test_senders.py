@@ -97,7 +97,7 @@ def test_reports_a_missing_receiver_and_finds_it_later(
     receiver_url = f"osc://127.0.0.1:{receiver.getsockname()[1]}"
     senders.start(parse_target(missing))
     senders.start(parse_target(receiver_url))
-    wait_until(lambda: "no program listens" in problem_of(senders, missing))
+    wait_until(lambda: "no program is listening" in problem_of(senders, missing))
     assert receiver.recv(2000)  # other targets are not affected
     assert problem_of(senders, receiver_url) == ""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:

@@ -316,7 +316,7 @@ def test_starts_again_when_a_rejected_key_was_replaced(
     path = key_folder() / "keyed.key"
     key = read_key(path)
     path.write_text(format_key(Key(key.public, key.secret, key.public)), "utf-8")
-    wait_until(lambda: "belongs to another system than" in caplog.text, step=step)
+    wait_until(lambda: "belongs to a different system than" in caplog.text, step=step)
     assert not service.should_exit
     path.unlink()
     wait_until(lambda: service.should_exit, step=step)

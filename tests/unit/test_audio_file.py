@@ -162,7 +162,7 @@ def test_reads_the_formats_of_phones_and_browsers(
 def test_samples_without_a_header_are_rejected(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"call.{suffix}"
     path.write_bytes(bytes(range(1, 200)) * 50)
-    with pytest.raises(UserError, match="samples without a header; convert them to wav"):
+    with pytest.raises(UserError, match="samples without a header; convert it to wav"):
         open_audio(path)
 
 

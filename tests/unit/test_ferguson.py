@@ -162,7 +162,7 @@ def test_rejects_text_that_cannot_be_timed() -> None:
         time_text(silent, [("a",)], TABLE)
     with pytest.raises(UserError, match="the text is empty"):
         time_text(silent, [], TABLE)
-    with pytest.raises(UserError, match=f"at most {MAX_SYLLABLES}"):
+    with pytest.raises(UserError, match=f"the maximum is {MAX_SYLLABLES}"):
         time_text(silent, [("a",)] * (MAX_SYLLABLES + 1), TABLE)
 
 

@@ -178,7 +178,7 @@ def test_names_the_key_of_another_system(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
     load_key("lamp", ("service:lamp",))  # started before its key was copied
     (tmp_path / "host.key").replace(key_folder() / "lamp.key")
-    with pytest.raises(UserError, match=r"belongs to another system.*rm .*control\.key .*allowed"):
+    with pytest.raises(UserError, match=r"different system.*rm .*control\.key .*allowed"):
         load_key("lamp", ("service:lamp",), control="tcp://192.0.2.1:5550")
 
 

@@ -144,7 +144,9 @@ def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) ->
         pair_outputs([tmp_path / "a.wav", tmp_path / "a.mp3"], None, ".mp4")
     with pytest.raises(UserError, match=r"would both be written to"):
         pair_outputs([tmp_path / "a.wav", tmp_path / "out/../a.wav"], None, ".mp4")
-    with pytest.raises(UserError, match=r"one\.csv is a file for 2 inputs; use a folder"):
+    with pytest.raises(
+        UserError, match=r"one\.csv is a single file, but there are 2 inputs; use a folder"
+    ):
         pair_outputs(sources, tmp_path / "one.csv", ".csv")
 
 

@@ -208,7 +208,7 @@ def test_reads_times_only_where_they_are_spoken(text: str, spoken_text: str) -> 
         ("Scenarist_SCC V1.0\n\n00:00:00:00 9420", "SCC captions"),
         ('{"phones": []}', "JSON without"),
         ('{"text": ', "not valid JSON"),
-        ("大家好 at 00:00:03.200 请看", "times of an unknown format"),
+        ("大家好 at 00:00:03.200 请看", "times in an unknown format"),
         (
             TEXTS["TextGrid"].replace(ONE, "da").replace('"请看我的""嘴唇""。"', '"jia"'),
             "'phones', 'w",
@@ -244,7 +244,7 @@ def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
         (b"%PDF-1.7", "PDF"),
         (b"{\\rtf1 ", "RTF"),
         (b"PK\3\4word/document.xml", "Word"),
-        (b"RIFF1234WAVE", "sound"),
+        (b"RIFF1234WAVE", "an audio or video file"),
         (b"\x01\x02\xff\xfe\xfd", "not a text file"),
     ],
 )

@@ -19,7 +19,7 @@ const CHINESE = {
   "cannot read audio: the file is damaged or cut off ({reason}); copy it again": "无法读取声音：文件损坏或不完整（{reason}），请重新复制",
   "cannot read audio from this file ({reason}); use wav, flac, mp3, m4a, mp4, webm or ogg. Raw samples need: kouxing speak --raw":
     "无法从此文件读取声音（{reason}），请用 wav、flac、mp3、m4a、mp4、webm 或 ogg。原始采样请用 kouxing speak --raw",
-  "these are samples without a header; convert them to wav with FFmpeg, stating their format and rate": "文件只有采样，没有文件头；请用 FFmpeg 按其格式和采样率转成 wav",
+  "the file contains samples without a header; convert it to wav with FFmpeg, and specify their format and rate": "文件只有采样，没有文件头；请用 FFmpeg 按其格式和采样率转成 wav",
   "the file contains no samples; record it again": "文件里没有声音数据，请重新录制",
   "the audio is encrypted (DRM); use a copy without protection": "声音已加密（DRM），请用没有保护的副本",
   "the audio is damaged or encrypted; nothing can be decoded; export it again": "声音已损坏或加密，无法解码；请重新导出",
@@ -98,7 +98,7 @@ const CHINESE = {
   "tracking parameters": "追踪参数",
   "{contents} of the mouth": "嘴部的{contents}",
   "{contents} and head": "{contents}和头部",
-  "no program listens on {address}: turn its receiver on": "{address} 没有程序接收，请在该程序中打开接收",
+  "no program is listening on {address}; turn its receiver on": "{address} 没有程序接收，请在该程序中打开接收",
   "cannot receive from a tracker on {host}:{port}: {reason}": "无法在 {host}:{port} 接收面部追踪数据：{reason}",
   "camera must be a port such as 39541, or ADDRESS:PORT, not {text}":
     "camera 应为端口（例如 39541）或 地址:端口，而不是 {text}",
@@ -107,14 +107,14 @@ const CHINESE = {
   "only=mouth lets another program control the head; leave out head=on":
     "only=mouth 表示头部由其他程序控制，请去掉 head=on",
   "cannot reach {address}: {reason}": "无法连接 {address}：{reason}",
-  "VTube Studio asks whether kouxing may move the model: press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
-  "VTube Studio's API is off: turn on 'Start API (allow plugins)' in its settings":
+  "VTube Studio is asking whether kouxing may move the model; press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
+  "VTube Studio's API is off; turn on 'Start API (allow plugins)' in its settings":
     "VTube Studio 的 API 未打开，请在其设置中打开“Start API (allow plugins)”",
-  "access to VTube Studio was denied; stop and start sending to be asked again": "VTube Studio 拒绝了访问；停止后再开始发送会重新询问",
+  "access to VTube Studio was denied; to be asked again, stop sending and start again": "VTube Studio 拒绝了访问；停止后再开始发送会重新询问",
   "the program at this address is not VTube Studio": "此地址的程序不是 VTube Studio",
   "another plugin sets the same parameters: {text}": "另一个插件在设置同样的参数：{text}",
   "VTube Studio closed the connection; trying again": "VTube Studio 断开了连接，正在重试",
-  "no VTube Studio at {address}: start it, and turn on 'Start API (allow plugins)' in its settings":
+  "VTube Studio is not running at {address}; start it, and turn on 'Start API (allow plugins)' in its settings":
     "{address} 没有 VTube Studio，请启动它并在设置中打开“Start API (allow plugins)”",
   "already sending to {count} programs; stop one first": "已在向 {count} 个程序发送，请先停止一个",
   "{host} is another machine; add the address to gateway.senders, or use 'kouxing send'":

@@ -60,8 +60,8 @@ def time_text(
         raise UserError("the text is empty; write the spoken words")
     if len(syllables) > MAX_SYLLABLES:
         raise UserError(
-            f"the text has {len(syllables)} syllables, of at most {MAX_SYLLABLES}; use forced"
-            " alignment (--timing align)"
+            f"the text has {len(syllables)} syllables, but the maximum is {MAX_SYLLABLES}; use"
+            " forced alignment (--timing align)"
         )
     phones: list[Phone] = []
     for syllable, (start_s, end_s) in zip(
