@@ -72,7 +72,7 @@ def _image_of(frame: av.VideoFrame) -> NDArray[np.uint8]:
     return np.rot90(pixels, round(frame.rotation / 90))  # phones store rotated images
 
 
-def track_video(video: Path, clip: Path, audio_track: int | None = None) -> tuple[int, int]:
+def track_video(video: Path, clip: Path, audio_track: int | None) -> tuple[int, int]:
     """Write the clip of a video as ``.flac``, ``.csv`` and ``.json``.
 
     Returns the number of images with a face, and of all images. Raises ``UserError`` if the video

@@ -64,7 +64,7 @@ def train(
 
 
 @contextmanager
-def _neural_training(output: Path | None = None, *, force: bool = False) -> Iterator[None]:
+def _neural_training(output: Path, *, force: bool) -> Iterator[None]:
     """Check the output, and explain how to install a missing package."""
     check_output(output, force=force)
     try:

@@ -88,9 +88,7 @@ class RecognizedSentence:
     outputs: Mapping[str, RecognizerOutput]  # by the recognizer's name
 
 
-def load_recognizers(
-    names: Sequence[str], *, uses_paper_rule: bool = False
-) -> list[RecognizerSetup]:
+def load_recognizers(names: Sequence[str], *, uses_paper_rule: bool) -> list[RecognizerSetup]:
     """Load recognizers by the names or paths of their acoustic models.
 
     With the paper's output rule, their names end in ``-paper``.

@@ -91,7 +91,7 @@ def score_lips(
     delays_ms: Sequence[float],
     music: Samples,
     conditions: Sequence[str],
-    tables: Sequence[Path] = (),
+    tables: Sequence[Path],
 ) -> Results:
     """Score faces (see ``load_faces``) on the held-out clips of a folder.
 

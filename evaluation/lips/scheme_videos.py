@@ -38,7 +38,7 @@ def write_videos(
     recognizers: Sequence[RecognizerSetup],
     lips: Sequence[str],
     folder: Path,
-    programs: Sequence[Path] = (),
+    programs: Sequence[Path],
 ) -> list[Path]:
     """Write ``CONDITION/SENTENCE.mp4`` for all conditions and sentences; keep existing videos.
 

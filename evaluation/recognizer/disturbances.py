@@ -39,9 +39,9 @@ _EPSILON = 1e-9
 
 
 def disturbances_for(
-    references: Sequence[AlignedRecording], music: Samples, names: Sequence[str] = ()
+    references: Sequence[AlignedRecording], music: Samples, names: Sequence[str]
 ) -> dict[str, Disturb]:
-    """Return clean speech and the disturbances with the given names, by default all.
+    """Return clean speech and the disturbances with the given names; if there are no names, all.
 
     The babble is mixed from ``references``.
     """

@@ -46,7 +46,7 @@ _HAMA_LANGUAGE = "en"
 
 
 def evaluate_languages(
-    references: Sequence[AlignedRecording], rule: OutputRuleConfig, *, with_hama: bool = False
+    references: Sequence[AlignedRecording], rule: OutputRuleConfig, *, with_hama: bool
 ) -> dict[str, dict[str, Any]]:
     """Measure the recognizers; return figures in the form of ``evaluate_recognizer``.
 

@@ -111,9 +111,7 @@ def endless_handshake(endpoint: str, source: str, seconds: float) -> None:
 
 
 @contextlib.contextmanager
-def many_connections(
-    port: int, number: int, source: str = LOCALHOST
-) -> Iterator[list[socket.socket]]:
+def many_connections(port: int, number: int, source: str) -> Iterator[list[socket.socket]]:
     """Hold up to ``number`` TCP connections; the peer or this process's limit may allow fewer."""
     with contextlib.ExitStack() as stack:
         connections = []

@@ -66,7 +66,7 @@ class MemoryUsage:
         """Growth at present."""
         return self._read_mb("VmRSS") - self._start_mb
 
-    def wait_until_kept(self, limit_mb: float, timeout_s: float = 10.0) -> bool:
+    def wait_until_kept(self, limit_mb: float, timeout_s: float) -> bool:
         """Wait until ``kept_mb`` is at most ``limit_mb``; return False after the timeout."""
         return wait_until(lambda: self.kept_mb <= limit_mb, timeout_s)
 

@@ -97,7 +97,7 @@ class Encoder(nn.Module):
         )
         self.layers = nn.ModuleList(EncoderLayer(shape, dropout) for _ in range(shape.layers))
 
-    def embed(self, bands: Tensor, start: int = 0) -> Tensor:
+    def embed(self, bands: Tensor, start: int) -> Tensor:
         """Compute the first layer's input: (batch, 80, frames) to (batch, positions, width).
 
         ``start`` is the first position's row in the table.

@@ -138,7 +138,7 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
         )
 
 
-def training_clip_names(path: Path | None = None) -> frozenset[str]:
+def training_clip_names(path: Path | None) -> frozenset[str]:
     """Return the names of the clips that were used for training or selection."""
     return _clip_names(_read(path))
 
