@@ -3,7 +3,7 @@
 import base64
 
 import numpy as np
-from kouxing_client.audio import SAMPLE_BYTES
+from kouxing_client.audio import MAX_FLOAT, SAMPLE_BYTES
 from msgspec import Struct
 
 from kouxing.shared.errors import UserError
@@ -12,7 +12,6 @@ from kouxing.shared.user_file import parse_json
 from kouxing.shared.wire.session import Encoding, NumChannels, SampleRate
 
 MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
-MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
 HEADER_BYTES = 12  # enough to recognize a file
 
 

@@ -18,6 +18,7 @@ from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mo
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels, select_lip_faps
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.audio_file import MAX_RATE_HZ, MIN_RATE_HZ
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.pcm import as_floats
@@ -28,7 +29,6 @@ MAX_BYTES = 64 * 1024 * 1024
 MIN_FRAMES = 50
 
 _MAX_HEADER_BYTES = 1000
-_MIN_RATE_HZ, _MAX_RATE_HZ = 8000, 48000
 _MAX_PIXEL = 1e5
 
 
@@ -57,9 +57,9 @@ def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], ND
     num_frames, num_points, rate_hz = (header[key] for key in keys)
     if num_points != len(LANDMARKS):
         raise ValueError(f"it has {num_points} landmarks a frame instead of {len(LANDMARKS)}")
-    if not _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ:
+    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
         raise ValueError(
-            f"its sample rate is {rate_hz} Hz; record {_MIN_RATE_HZ} to {_MAX_RATE_HZ} Hz"
+            f"its sample rate is {rate_hz} Hz; record {MIN_RATE_HZ} to {MAX_RATE_HZ} Hz"
         )
     if num_frames < MIN_FRAMES:
         raise ValueError(f"a face is visible in only {num_frames} frames; film it for 20 s or more")

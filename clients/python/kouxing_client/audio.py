@@ -16,7 +16,7 @@ SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 _CODES = {"s16le": "h", "f32le": "f"}
 _FULL_SCALE = 32767
 _EXPECTED = "audio must be 16-bit integers (array type int16), or floats within ±1"
-_MAX_FLOAT = 8.0  # smaller values beyond 1 are clipped
+MAX_FLOAT = 8.0  # smaller values beyond 1 are clipped
 # Audio before the newest acknowledgement that is kept in case another recognizer needs it
 RESEND_S = 10.0
 MAX_KEPT = 5000  # messages
@@ -81,7 +81,7 @@ def _pack(numbers: memoryview[Any], encoding: str) -> bytes:
     if len(numbers) and not is_integer:
         lowest, highest = min(numbers), max(numbers)
         is_finite = isfinite(sum(numbers))  # the sum finds every NaN
-        if not (is_finite and -_MAX_FLOAT <= lowest <= highest <= _MAX_FLOAT):
+        if not (is_finite and -MAX_FLOAT <= lowest <= highest <= MAX_FLOAT):
             raise KouxingError(
                 f"{_EXPECTED}, not "
                 + (f"{lowest:g} to {highest:g}" if is_finite else "NaN or infinity")
