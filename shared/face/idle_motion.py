@@ -61,7 +61,7 @@ _LIDS_UPPER = fap_slice("close_t_l_eyelid", "close_t_r_eyelid")
 _LIDS_LOWER = fap_slice("close_b_l_eyelid", "close_b_r_eyelid")
 EYES_YAW = fap_slice("yaw_l_eyeball", "yaw_r_eyeball")
 EYES_PITCH = fap_slice("pitch_l_eyeball", "pitch_r_eyeball")
-_HEAD = fap_slice("head_pitch", "head_roll")
+HEAD = fap_slice("head_pitch", "head_roll")
 
 
 class ConversationState(Enum):
@@ -139,7 +139,7 @@ class IdleMotion:
         head[0] += breath
         yaw, pitch = self._gaze(time_s)
         lid = self._lid(time_s)
-        faps[_HEAD] += head.astype(np.float32)
+        faps[HEAD] += head.astype(np.float32)
         # the gaze target stays in place while the head turns
         faps[EYES_PITCH] += pitch - head[0]
         faps[EYES_YAW] += yaw - head[1]

@@ -37,6 +37,7 @@ from kouxing.shared.face.faps import DEGREE
 from kouxing.shared.face.idle_motion import (
     EYES_PITCH,
     EYES_YAW,
+    HEAD,
     ConversationState,
     IdleMotion,
     fap_slice,
@@ -64,7 +65,6 @@ _TURN_S = 0.5  # start times in the same interval of this length have the same d
 
 _BROWS = fap_slice("raise_l_i_eyebrow", "raise_r_o_eyebrow")
 _BROW_UNITS = np.array([*_BROW.values()], np.float32)
-_HEAD = fap_slice("head_pitch", "head_roll")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +124,7 @@ class SpeechMotionModifier:
         pitch = self._nod.at(now_s, step_s) - _LIFT_DEG * lift
         yaw, roll = self._turn.at(now_s, step_s), self._tilt.at(now_s, step_s)
         if pitch or yaw or roll:
-            faps[_HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(DEGREE)
+            faps[HEAD] += np.array([pitch, yaw, roll], np.float32) * np.float32(DEGREE)
             # the gaze target stays in place
             faps[EYES_PITCH] -= np.float32(pitch * DEGREE)
             faps[EYES_YAW] -= np.float32(yaw * DEGREE)
