@@ -11,6 +11,7 @@ export class HeadAudio extends GainNode {
   /** Called when speech ends. */
   onended = null;
   #lips = null;
+  #loading = null; // a promise
   #weights = []; // last reported weights
 
   /** @param context audio context of the sound */
@@ -19,8 +20,15 @@ export class HeadAudio extends GainNode {
   }
 
   /** Load the models of this package; HeadAudio's own model is ignored. */
-  async loadModel() {
-    if (this.#lips) return;
+  loadModel() {
+    this.#loading ??= this.#load().catch((error) => {
+      this.#loading = null;
+      throw error;
+    });
+    return this.#loading;
+  }
+
+  async #load() {
     this.#lips = await LipSync.create({ context: this.context, shapes: ["oculus"] });
     this.#lips.addEventListener("voice", ({ detail: { timeS: t, isSpeaking } }) => {
       if (isSpeaking) this.onstarted?.({ event: "started", t });

@@ -6,9 +6,11 @@ import { LipSync } from "../index.js";
 
 class FakeWorker {
   static newest = null;
+  static count = 0;
   messages = [];
   constructor() {
     FakeWorker.newest = this;
+    FakeWorker.count++;
   }
   postMessage(message) {
     this.messages.push(message);
@@ -33,6 +35,8 @@ class FakeNode {
 }
 
 class FakeBuffer {}
+
+class FakeAudioNode {}
 
 class FakeContext extends EventTarget {
   state = "running";
@@ -60,6 +64,7 @@ let stream;
 let context;
 
 test.beforeEach(() => {
+  FakeWorker.count = 0;
   stream = new FakeStream();
   context = new FakeContext();
   const getUserMedia = () => new Promise((resolve) => (answerPrompt = () => resolve(stream)));
@@ -68,7 +73,7 @@ test.beforeEach(() => {
     document: new EventTarget(),
     location: { href: "http://localhost/" },
     Worker: FakeWorker,
-    AudioNode: class {},
+    AudioNode: FakeAudioNode,
     AudioBuffer: FakeBuffer,
     HTMLMediaElement: class {},
     MediaStreamTrack: FakeTrack,
@@ -176,4 +181,17 @@ test("a buffer that is replaced does not report its end", async () => {
   await second;
   lips.node.onended();
   assert.equal(numEnded, 1);
+});
+
+test("HeadAudio loads once, though it is asked twice", async () => {
+  globalThis.GainNode = class extends FakeAudioNode {
+    context = context;
+    connect() {}
+  };
+  const { HeadAudio } = await import("../headaudio.js");
+  const head = new HeadAudio(context);
+  const loading = [head.loadModel(), head.loadModel()];
+  await open();
+  await Promise.all(loading);
+  assert.equal(FakeWorker.count, 1);
 });
