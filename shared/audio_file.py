@@ -18,8 +18,8 @@ from kouxing.shared.media_file import (
     WavPcm,
     has_video,
     pcm_of_wav,
-    to_float,
 )
+from kouxing.shared.pcm import as_floats
 from kouxing.shared.phase_cancellation import PhaseCancellationGuard, Samples
 from kouxing.shared.sound_formats import (
     MAX_ZERO_BYTES,
@@ -297,7 +297,7 @@ def raw_audio(
             data = rest + block
             num_whole = len(data) - len(data) % frame_bytes
             rest = data[num_whole:]
-            channels = to_float(np.frombuffer(data[:num_whole], raw.dtype)).reshape(
+            channels = as_floats(np.frombuffer(data[:num_whole], raw.dtype)).reshape(
                 -1, num_channels
             )
             yield raw.sample_rate_hz, guard.mix(channels, channels)

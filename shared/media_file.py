@@ -8,10 +8,10 @@ from typing import Any, BinaryIO, NamedTuple, cast
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import is_interrupted
+from kouxing.shared.pcm import as_floats
 from kouxing.shared.phase_cancellation import PhaseCancellationGuard, Samples
 from kouxing.shared.sound_formats import (
     MAX_OGG_PAGE_BYTES,
@@ -422,17 +422,8 @@ def _end_s(packet: Any) -> float:
 
 def _samples_of(frame: Any) -> Samples:
     """Return a frame's samples as (n, channels), with full scale at 1."""
-    samples = to_float(frame.to_ndarray())
+    samples = as_floats(frame.to_ndarray())
     return samples.T if frame.format.is_planar else samples.reshape(-1, frame.layout.nb_channels)
-
-
-def to_float(samples: NDArray[Any]) -> NDArray[np.float32]:
-    """Return samples of any type with full scale at 1."""
-    values = samples.astype(np.float32)
-    if samples.dtype.kind == "f":
-        return values
-    values *= np.float32(2.0 ** (1 - 8 * samples.dtype.itemsize))
-    return values - 1 if samples.dtype.kind == "u" else values
 
 
 def _reason(error: Exception) -> str:

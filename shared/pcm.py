@@ -1,5 +1,7 @@
 """Conversion of PCM audio to floats in [-1, 1] and back."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,9 +10,13 @@ from kouxing.shared.errors import UserError
 FULL_SCALE = 32768.0  # of 16-bit samples
 
 
-def as_floats(samples: NDArray[np.int16]) -> NDArray[np.float32]:
-    """Convert 16-bit samples to floats in [-1, 1]."""
-    return samples.astype(np.float32) / np.float32(FULL_SCALE)
+def as_floats(samples: NDArray[Any]) -> NDArray[np.float32]:
+    """Convert samples of any type to floats with full scale at 1."""
+    values = samples.astype(np.float32)
+    if samples.dtype.kind == "f":
+        return values
+    values *= np.float32(2.0 ** (1 - 8 * samples.dtype.itemsize))
+    return values - 1 if samples.dtype.kind == "u" else values
 
 
 def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
