@@ -174,8 +174,9 @@ def test_senders_are_started_delayed_to_match_the_sound_and_stopped(talking_page
         page.click("open-settings")
         page.evaluate(f"document.getElementById('send-to').value = {url!r}")
         page.click("send button")
-        page.wait_for("!document.getElementById('send-delay').hidden")
-        page.click("send-delay")
+        # a busy page may hide the button again, so click as soon as it is shown
+        button = "document.getElementById('send-delay')"
+        page.wait_for(f"!{button}.hidden && ({button}.click(), true)")
         page.wait_for("/delayed \\d+ ms/.test(document.getElementById('senders').innerText)")
         page.click("senders button")
         page.wait_for("document.getElementById('senders').children.length === 0")
