@@ -64,7 +64,7 @@ class SkipPolicy:
         return self._late_s(0.0, now_s) > self._max_lag_s + for_s
 
     def adapt(self, now_s: float) -> None:
-        """Record that no newer audio was found, so the newest audio may be in time."""
+        """Record that no newer audio was found, so the newest audio may be on time."""
         if self._due_s is not None:
             self._due_s += ADAPTATION * max(0.0, now_s - self._due_s)
 

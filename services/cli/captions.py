@@ -26,7 +26,7 @@ def write_syllables(
 ) -> list[TimedSyllable]:
     """Return the syllables of the text, with tones, or of recognized phones, without tones.
 
-    The text of a syllable is its character, or else its spelling.
+    The text of a syllable is its character, or its spelling if it has no character.
     """
     if transcript is None:
         return [_join_phones(group, inventory) for group in group_syllables(phones, inventory)]
@@ -50,7 +50,7 @@ def check_characters(transcript: Transcript, inventory: PhoneInventory) -> None:
 
 
 def _write(syllable: SpokenSyllable | TimedSyllable, inventory: PhoneInventory) -> tuple[str, str]:
-    """Return the character of a syllable, or else its spelling, and its spelling."""
+    """Return the text of a syllable (its character, if it has one) and its spelling."""
     spelling = inventory.write(syllable.spelling)
     has_character = inventory.readable.search(syllable.text)
     return syllable.text if has_character else spelling, spelling

@@ -43,7 +43,7 @@ def follow(
     control: AbstractContextManager[str],
     alphabet: Alphabet | None = None,
 ) -> None:
-    """Follow a session until it ends; without a name, the newest one, or else the next one.
+    """Follow a session until it ends. Without a name, follow the newest one or wait for the next.
 
     The frames go to ``output``. Without it, they are printed, or syllables, or phones in an
     ``alphabet``. ``control`` finds control's address, once the file's format was checked. Raises

@@ -112,10 +112,10 @@ def draw_mouth(
 ) -> None:
     """Draw the mouth of an audio file, in the format of the output's suffix.
 
-    ``.svg`` and ``.png`` show the mouth at the key frames, ``.mp4`` is a video with sound, and
+    ``.svg`` and ``.png`` show the mouth at the key frames, ``.mp4`` is a video with audio, and
     ``.csv`` has the contour of every frame with ``NUM_POINTS`` for each line. Without a text, the
-    model in the folder ``speech_to_text`` recognizes it, or else phones are recognized. ``lips``
-    gives the width.
+    model in the folder ``speech_to_text`` recognizes the text. Without that folder, phones are
+    recognized. ``lips`` gives the width.
 
     Raises ``UserError`` if a file cannot be read or written, or the options do not fit each other.
     """

@@ -1,8 +1,8 @@
 """Measures the lateness of the frames of a live session.
 
 A live client sends audio in real time. Therefore, the clock minus the media time is constant for
-frames in time, and greater for late frames. Frames are compared with the earliest one of the last
-10 s. Older frames are not comparable, because clocks drift and a client may lose audio.
+frames that are on time, and greater for late frames. Frames are compared with the earliest one of
+the last 10 s. Older frames are not comparable, because clocks drift and a client may lose audio.
 """
 
 from collections import deque

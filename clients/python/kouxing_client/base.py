@@ -31,8 +31,8 @@ class BaseClient:
     Parameters
     ----------
     control
-        Address of control; default ``$KOUXING_CONTROL``, else ``tcp://127.0.0.1:5550``. Control's
-        public key may follow after a space.
+        Address of control. The default is ``$KOUXING_CONTROL``, or ``tcp://127.0.0.1:5550`` if that
+        is not set. Control's public key may follow after a space.
     key
         Key of this program, or the path of its file; default: the user's own key (``find_key``).
     insecure

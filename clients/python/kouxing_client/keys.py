@@ -26,8 +26,8 @@ class Key:
 def find_key() -> Key:
     """Return the user's key.
 
-    The file is ``client.key`` in ``$CREDENTIALS_DIRECTORY``, else in ``$XDG_STATE_HOME/kouxing``,
-    else in ``~/.local/state/kouxing``.
+    The file is ``client.key`` in ``$CREDENTIALS_DIRECTORY``. If it does not exist there, it is in
+    ``$XDG_STATE_HOME/kouxing``, by default ``~/.local/state/kouxing``.
 
     Raises
     ------

@@ -281,7 +281,10 @@ def _find_pivot(glb: GlbFile, turn: Float64, middle: Float64, unit: float) -> Fl
 
 
 def _head_weight(pieces: list[MeshPiece], height: Float64) -> Float64:
-    """Return the fraction (V,) of the head rotation: of the skeleton, or else by ``height``."""
+    """Return the fraction (V,) of the head rotation, from the skeleton if every piece has one.
+
+    Otherwise it is computed from ``height``.
+    """
     weights = [piece.head_weight for piece in pieces if piece.head_weight is not None]
     return np.concatenate(weights) if len(weights) == len(pieces) else head_weight_at(height)
 

@@ -15,8 +15,8 @@ const IMAGES_MS = 3000; // window of the delays of images
 /**
  * The lateness of the face: the lateness of the newest frame, plus the delay until its image is visible. A live
  * client sends audio in real time. The arrival of a frame minus its media time is therefore constant for
- * frames in time, and greater for late frames. Frames are compared with the earliest one of the last
- * 10 s, because clocks drift and a client may lose audio.
+ * frames that are on time, and greater for late frames. Frames are compared with the earliest one of the
+ * last 10 s, because clocks drift and a client may lose audio.
  */
 export class Lateness {
   isBehind = false; // true after frames have been late for some time

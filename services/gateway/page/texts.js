@@ -100,7 +100,7 @@ export const TEXTS = {
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
   noSpeech: { en: "{file}: no speech was found", zh: "{file}：没有找到语音" },
-  noSpeechSilent: { en: "{file}: no speech was found; it is silent", zh: "{file}：没有找到语音，文件是静音的" },
+  noSpeechSilent: { en: "{file}: no speech was found; the file is silent", zh: "{file}：没有找到语音，文件是静音的" },
   oldMouthProfile: {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
     zh: "保存的口型不适用于当前版本。请按“学我的口型”重新录制。",
@@ -171,7 +171,7 @@ export const TEXTS = {
     zh: "摄像头的图像不会离开浏览器。网关只收到你的声音和脸上 43 个点的位置，学完即删除。",
   },
   learnedOn: {
-    en: "Your mouth was learned on {day}. Similarity of the opening: {before} → {after}.",
+    en: "Your mouth was learned on {day}. Similarity of the mouth opening: {before} → {after}.",
     zh: "{day} 学会了你的口型。张口幅度的相似度：{before} → {after}。",
   },
   learnForget: { en: "Forget it", zh: "删除" },
@@ -191,7 +191,7 @@ export const TEXTS = {
   yourLips: { en: "your lips", zh: "你的嘴唇" },
   before: { en: "before", zh: "之前" },
   after: { en: "after", zh: "之后" },
-  resultSimilarity: { en: "How closely the head's lips follow yours (1 = exactly)", zh: "与你的相似度（1 为完全一致）" },
+  resultSimilarity: { en: "How closely the head's lips follow yours (1 = a perfect match)", zh: "与你的相似度（1 为完全一致）" },
   resultHeldOut: {
     en: "Measured on the last quarter of your reading, which was not used for learning.",
     zh: "用朗读的最后四分之一测得，这部分没有用于学习。",
@@ -238,7 +238,7 @@ export const TEXTS = {
   cameraUnplugged: { en: "The camera or the microphone was unplugged. Plug it in and try again.", zh: "摄像头或麦克风断开了。请接上后重试。" },
   trackerFailed: { en: "Face tracking does not work in this browser: {reason}", zh: "此浏览器无法跟踪面部：{reason}" },
   gatewaySilent: {
-    en: "The gateway does not answer. Start it with “kouxing run” and send again.",
+    en: "The gateway does not answer. Start it with “kouxing run”, then press Send again.",
     zh: "网关没有应答。请运行 kouxing run 后重发。",
   },
 };

@@ -162,7 +162,7 @@ def spell(phones: tuple[str, ...]) -> str:
 def write(spelling: str) -> str:
     """Return a syllable with tone mark and ü, or a phone as it is written in a syllable.
 
-    The mark is on a or e, on the o of ou, else on the last vowel (ISO 7098).
+    The mark is on a or e, on the o of ou, and otherwise on the last vowel (ISO 7098).
 
     Examples
     --------
