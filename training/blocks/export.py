@@ -34,6 +34,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
+from kouxing.services.recognizer.acoustic.blocks import cache_names
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
 from kouxing.training.networks.network import MAX_DEVIATIONS
@@ -47,7 +48,6 @@ from kouxing.training.networks.onnx_graph import (
 )
 from kouxing.training.networks.teacher import KEPT_LAYERS
 
-_KINDS = ("keys", "values")
 _LAST_OF_BLOCK = "last_of_block"
 
 
@@ -60,11 +60,6 @@ def export_onnx(
 ) -> NDArray[np.uint8]:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
     return BlockGraph(encoder, readout, block_length, right_context, past).file_of_block()
-
-
-def cache_names(num_layers: int) -> list[str]:
-    """Return the names of the cache inputs in order."""
-    return [f"{kind}_{layer}" for kind in _KINDS for layer in range(num_layers)]
 
 
 class ReadoutGraph(Graph):
@@ -268,7 +263,7 @@ class BlockGraph(ReadoutGraph):
         for values in (key, value):
             block_values = self.node("Slice", [values, *ends, self.integers("place_axis", 2)])
             self._new.append(self.node("Unsqueeze", [block_values, self.integers("ring_axis", 1)]))
-        old_keys, old_values = (self.floats_of(f"{kind}_{number}") for kind in _KINDS)
+        old_keys, old_values = (self.floats_of(f"{kind}_{number}") for kind in ("keys", "values"))
         products = [
             self.node("FusedMatMul", [query, keys], domain=DOMAIN, transB=1, alpha=size**-0.5)
             for keys in (old_keys, key)

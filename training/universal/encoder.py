@@ -10,14 +10,14 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.blocks import BlockModel, cache_names
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     open_onnx_session,
     position_table,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
-from kouxing.training.blocks.export import BlockGraph, cache_names
+from kouxing.training.blocks.export import BlockGraph
 from kouxing.training.blocks.exported import rebuild_encoder
 from kouxing.training.blocks.network import BlockEncoder
 from kouxing.training.networks.network import PADDING_FRAMES

@@ -173,7 +173,7 @@ class BlockRunner:
         axes = {_NUM_KEPT: 1, **dict.fromkeys(self._last_kept, 0)}
         self._session = open_onnx_session(file, encode_integer_inputs(axes))
         self.sizes, self._first_state = _sizes_of(self._session)
-        self._names = _cache_names(self.sizes.layers)
+        self._names = cache_names(self.sizes.layers)
         prefix = EXTENSION_PREFIX if self._first_state else ""
         self._state = f"{prefix}state"
         self._outputs = [f"{prefix}{name}" for name in _OUTPUTS[:2]] + _OUTPUTS[2:]
@@ -341,7 +341,7 @@ def _sizes_of(session: Any) -> tuple[BlockSizes, int]:
     is_extended = f"{EXTENSION_PREFIX}state" in shapes
     more_inputs = [f"{EXTENSION_PREFIX}state"] * is_extended
     more_outputs = [f"{EXTENSION_PREFIX}{name}" for name in _OUTPUTS[:2]] * is_extended
-    if list(shapes) != [*_INPUTS, *_cache_names(num_layers), *more_inputs] or (
+    if list(shapes) != [*_INPUTS, *cache_names(num_layers), *more_inputs] or (
         list(outputs) != [*_OUTPUTS, *more_outputs]
     ):
         raise ValueError(f"its network has the inputs {', '.join(shapes)}")
@@ -372,7 +372,7 @@ def _sizes_of(session: Any) -> tuple[BlockSizes, int]:
     return sizes, int(shapes["state"][0]) if is_extended else 0
 
 
-def _cache_names(num_layers: int) -> list[str]:
+def cache_names(num_layers: int) -> list[str]:
     """Return the names of a network's cache inputs, in the order of the rings."""
     return [f"{kind}_{layer}" for kind in ("keys", "values") for layer in range(num_layers)]
 
