@@ -7,14 +7,14 @@ frame, and the messages of the last seconds again.
 from collections import deque
 from collections.abc import Set as AbstractSet
 
-from kouxing_client.messages import Message, Speech
+from kouxing_client.messages import Message, Phone, Speech
 
 from kouxing.shared.clock import to_samples
 from kouxing.shared.message_loop import Handler, MessageLoop
 from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import is_state_report
-from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress
+from kouxing.shared.wire.speech import Acknowledge, LipPositions, NewestFrame, Progress
 
 MAX_BACKLOG = 2000  # unacknowledged messages above which audio waits
 MAX_OVERDUE_S = 5.0  # then new messages are dropped, so that other sessions continue
@@ -28,6 +28,7 @@ class SynthesizerLink:
         self._sender: ReliableSender | None = None
         self._acknowledged: deque[Message] = deque()  # messages of the last KEPT_SAMPLES
         self._speech: Speech | None = None  # the newest Speech before these messages
+        self._interrupted_sequence = 0  # number of the last message before an interruption
         self._newest_frame: NewestFrame | None = None  # published by the synthesizer
         self._full_since_s: float | None = None
         self._is_dropping = False
@@ -41,9 +42,10 @@ class SynthesizerLink:
         """Switch to this synthesizer. First send the newest frame and the kept messages."""
         messages = [
             *self._acknowledged,
-            *(self._sender.unacknowledged if self._sender is not None else ()),
+            *filter(self._is_needed, self._sender.unacknowledged if self._sender else ()),
         ]
         self._acknowledged.clear()
+        self._interrupted_sequence = 0
         self._full_since_s, self._is_dropping = None, False
         self._sender = ReliableSender(socket, session, epoch)
         if (frame := self._newest_frame) is not None:
@@ -85,7 +87,7 @@ class SynthesizerLink:
         self._newest_frame = ack.newest_frame or self._newest_frame
         acknowledged = self._sender.acknowledge(ack.sequence, now_s)
         messages = [message for message in acknowledged if not is_state_report(message)]
-        self._acknowledged.extend(messages)
+        self._acknowledged.extend(filter(self._is_needed, messages))
         while (
             self._acknowledged
             and self._acknowledged[0].media_time < self._acknowledged[-1].media_time - KEPT_SAMPLES
@@ -99,6 +101,13 @@ class SynthesizerLink:
         """Forget all messages before an interruption."""
         self._acknowledged.clear()
         self._speech = None
+        if self._sender is not None and self._sender.unacknowledged:
+            self._interrupted_sequence = self._sender.unacknowledged[-1].sequence
+
+    def _is_needed(self, message: Message) -> bool:
+        """Return whether a new synthesizer needs a message: no speech before an interruption."""
+        is_speech = isinstance(message, Phone | LipPositions)
+        return not is_speech or message.sequence > self._interrupted_sequence
 
     def tick(self, now_s: float) -> int:
         """Resend messages that were not acknowledged in time; return their number."""

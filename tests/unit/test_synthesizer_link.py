@@ -2,7 +2,8 @@
 
 from typing import cast
 
-from kouxing_client.messages import Message, Speech
+import pytest
+from kouxing_client.messages import Message, Phone, Speech
 
 from kouxing.services.recognizer.synthesizer_link import (
     KEPT_SAMPLES,
@@ -12,6 +13,7 @@ from kouxing.services.recognizer.synthesizer_link import (
 )
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import split_batch
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
@@ -73,6 +75,25 @@ def test_forgets_messages_before_an_interruption() -> None:
     link.send_all(Speech(media_time=16_000, active=False))
     expected = Speech(session="s", epoch=2, sequence=1, media_time=16_000, active=False)
     assert link.connect_to(2) == [expected]
+
+
+@pytest.mark.parametrize("is_acknowledged", [False, True])
+def test_an_interruption_also_concerns_phones_that_are_on_their_way(
+    *, is_acknowledged: bool
+) -> None:
+    link = FakeSynthesizerLink()
+    phone = Phone(index=0, symbol="a", duration=1600, confidence=1.0, final=True)
+    link.send_all(phone, progress(1.0))
+    link.forget()
+    if is_acknowledged:
+        assert len(link.acknowledge_up_to(2)) == 2
+    link.send_all(replace(phone, index=1), progress(2.0))
+    received = link.connect_to(2)
+    assert [message.index for message in received if isinstance(message, Phone)] == [1]
+    assert received[-1].media_time == to_samples(2.0)
+    link.forget()
+    link.send_all(phone)
+    assert link.connect_to(3)[-1].kind == phone.kind, "each synthesizer has its own numbers"
 
 
 def test_drops_messages_only_while_the_synthesizer_is_too_slow() -> None:
