@@ -1,5 +1,6 @@
 """A client's core: requests, sessions that move, lost connections; without sockets."""
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import pytest
@@ -288,3 +289,14 @@ def test_events_can_be_closed_twice() -> None:
         harness.core.remove_inbox("s", first)
     assert first.is_over
     assert not second.is_over
+
+
+def test_a_diagnosis_may_arrive_after_the_client_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    harness, reasons = CoreHarness(), list[Callable[[str], None]]()
+    monkeypatch.setattr(harness.sockets, "explain", lambda _, on_reason: reasons.append(on_reason))
+    answer = harness.core.request("flush-session", "s")
+    harness.pass_time(10.1)
+    harness.core.close(KouxingError("the client is closed"))
+    (on_reason,) = reasons
+    on_reason("")
+    assert "closed" in str(answer.exception(0))

@@ -161,6 +161,7 @@ class ClientCore:
         self._closed, self._events = failure, None
         for request in self._requests.values():
             request.answer.set_exception(failure)
+        self._requests.clear()
         for session in self.sessions:
             session.end(failure)
         for inboxes in self._inboxes.values():
