@@ -1,4 +1,4 @@
-"""Decodes the sound of files and pipes with FFmpeg, at the timestamps of the container."""
+"""Decodes the audio of files and pipes with FFmpeg, at the timestamps of the container."""
 
 import io
 import re

@@ -1,4 +1,4 @@
-"""Recognizes the formats of sound and other files by their first bytes."""
+"""Recognizes the formats of audio and other files by their first bytes."""
 
 import codecs
 import re

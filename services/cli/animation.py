@@ -1,4 +1,4 @@
-"""Computes the motion of a face from sound, or reads it from a ``.fap`` file or a table."""
+"""Computes the motion of a face from audio, or reads it from a ``.fap`` file or a table."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ class FaceMotion:
     syllables: Sequence[TimedSyllable] = ()  # as written, in order
     source: Path | None = None
     language: str = DEFAULT_LANGUAGE  # of the phones
-    has_wrong_text: bool = False  # the mouth follows a text that does not fit the sound
+    has_wrong_text: bool = False  # the mouth follows a text that does not fit the audio
 
 
 def slow_down(motion: FaceMotion, speed: float) -> FaceMotion:
@@ -112,7 +112,7 @@ def animate(
     equal the live services' frames with default settings. Otherwise the whole
     recording is known, and its phones are aligned with ``text``, a text or the name of a file with
     it, if given. ``language`` is the language of the speech. With ``text_may_differ``, a text that
-    cannot be read or does not fit the sound is reported and ignored. ``captions`` is what the
+    cannot be read or does not fit the audio is reported and ignored. ``captions`` is what the
     captions will show.
 
     Raises ``UserError`` if a file cannot be read, the text has nothing to say, or the captions

@@ -1,4 +1,4 @@
-"""``kouxing lips``: the 2-D mouth of a sound, as a video, a picture of key frames, or a table.
+"""``kouxing lips``: the 2-D mouth of a recording, as a video, a picture of key frames, or a table.
 
 Method: Zhang et al. 2021. A text and its timing give key frames of the opening R.
 Interpolation gives R(t), and R(t) gives the contour. The paper's mouth has one width. Here, another

@@ -151,12 +151,12 @@ def render(
 ) -> None:
     """Render a recording, or existing animation curves, as a video, images or curves.
 
-    The output is a video (.mp4, .mov, .webm, or .webp without sound) or a picture (.png). Other
-    outputs are numbered pictures (a folder, or a pattern such as face%05d.png), curves (.fap, .csv,
-    .jsonl), an animated head (.glb) and drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).
-    Without an output, the video my.mp4 of my.wav is written next to my.wav.
-    Curves of the app Live Link Face are also read. The exit status is 1 if --text does not fit the
-    sound; the mouth then follows the text.
+    The output is a video (.mp4, .mov, .webm, or .webp without audio), a picture (.png), or numbered
+    pictures (a folder, or a pattern such as face%05d.png). It can also be curves (.fap, .csv,
+    .jsonl), an animated head (.glb) or drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).
+    Without an output, the command writes a video next to the input: my.mp4 for my.wav.
+    The input may also be curves of the app Live Link Face. If --text does not fit the audio, the
+    mouth follows the text, and the exit status is 1.
     """
     with show_loading():
         from kouxing.services.cli.exporters import existing_output, is_output

@@ -1,4 +1,4 @@
-"""Sends the frames and sound of recorded sessions to the process that writes their videos."""
+"""Sends the frames and audio of recorded sessions to the process that writes their videos."""
 
 import contextlib
 import math

@@ -1,4 +1,4 @@
-"""Slows sound down without changing its pitch, with FFmpeg's filter atempo."""
+"""Slows audio down without changing its pitch, with FFmpeg's filter atempo."""
 
 from fractions import Fraction
 

@@ -1,4 +1,4 @@
-"""Renders the video of one session while its FAP frames and sound arrive.
+"""Renders the video of one session while its FAP frames and audio arrive.
 
 Images are interpolated between FAP frames by media time, at the video's own rate, so the video is
 in sync at any rates, and with late frames.

@@ -1,4 +1,4 @@
-"""Writes pictures and sound in sync: MP4, MOV, WebM; or pictures only: WebP, PNG files.
+"""Writes images with audio in sync (MP4, MOV, WebM) or only images (WebP, PNG files).
 
 Picture ``n`` is shown at ``n / frame_rate_hz`` and sound sample ``n`` is played at
 ``n / sample_rate_hz``, both from the start of the file.
