@@ -32,7 +32,7 @@ from kouxing.shared.keys import add_key, load_user_key
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import CloseSession, Error, OpenSession
 from tests.fake_control import FakeControl
-from tests.system import wait_until
+from tests.system import LIMIT_S, wait_until
 
 CHUNK = bytes(3200)  # 100 ms
 
@@ -302,19 +302,21 @@ def test_the_client_reports_why_control_does_not_answer(
     assert str(failure.value).startswith(f"control at {control} does not answer: ")
 
 
-def test_a_session_disconnects_though_control_does_not_answer(control: FakeControl) -> None:
-    with Client(control.address, insecure=True, timeout_s=0.5) as client:
-        session = client.open_session("s")
-        frames = session.frames()
-        control.is_silent = True
-        with pytest.raises(KouxingError, match="does not answer"):
-            session.close()
-        assert frames.has_ended
+def test_a_session_disconnects_though_control_does_not_answer(
+    control: FakeControl, client: Client
+) -> None:
+    session = client.open_session("s")
+    frames = session.frames()
+    control.is_silent = True
+    client._thread.core._timeout_s = 0.1
+    with pytest.raises(KouxingError, match="does not answer"):
+        session.close()
+    assert frames.has_ended
 
 
 def test_a_session_closes_if_its_opening_is_cancelled(control: FakeControl) -> None:
     async def run() -> None:
-        async with AsyncClient(control.address, insecure=True) as client:
+        async with AsyncClient(control.address, insecure=True, timeout_s=LIMIT_S) as client:
             control.is_silent = True
             opening = asyncio.create_task(client.open_session("s"))
             await asyncio.to_thread(wait_until, lambda: control.messages_of(OpenSession))
