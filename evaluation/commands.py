@@ -264,7 +264,7 @@ def pack_clips(
     clips: Clips,
     force: Force = False,
 ) -> None:
-    """Archive the clips whose licenses allow sharing, with their parts and licenses."""
+    """Archive the clips whose licenses allow sharing, with their splits and licenses."""
     from kouxing.corpora.clip_archive import write_clip_archive
 
     check_output(archive, force=force)

@@ -18,7 +18,9 @@ from kouxing.shared.terminal import (
 )
 
 app = typer.Typer(
-    no_args_is_help=True, add_completion=False, help="Run listening tests: people rate videos."
+    no_args_is_help=True,
+    add_completion=False,
+    help="Run listening tests, in which people rate videos.",
 )
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the videos.")]

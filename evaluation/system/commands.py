@@ -36,7 +36,7 @@ class BenchGroup(TyperGroup):
 app = typer.Typer(
     cls=BenchGroup,
     add_completion=False,
-    help="Measure speed and load. Without a command, run latency.",
+    help="Measure speed and load. The default command is latency.",
 )
 
 
@@ -47,7 +47,7 @@ def measure_latency(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure latency, CPU time and images per second of the whole chain on this machine.
+    """Measure latency, CPU time and images per second of the whole pipeline on this machine.
 
     If Chromium is installed, the page is also measured. --language applies only to latency.
     """
@@ -110,7 +110,7 @@ def load(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure how many live sessions all services can serve here.
+    """Measure how many live sessions the services can serve on this machine.
 
     A single client process streams to all sessions, with different voices. The number of sessions
     grows in up to 9 steps.

@@ -62,8 +62,8 @@ def speak(
         str,
         typer.Argument(
             metavar="FILE|-|mic|monitor",
-            help="Audio or video file. '-': standard input, in any format. 'mic': a microphone."
-            " 'monitor': the audio that this machine plays.",
+            help="Audio or video file, '-' for standard input in any format, 'mic' for a"
+            " microphone, or 'monitor' for the audio that this machine plays.",
         ),
     ],
     session: Annotated[str, typer.Option(help="Name of the session. Default: generated.")] = "",
@@ -329,7 +329,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
 
 
 def doctor(control: Control = "") -> None:
-    """Check keys, addresses, clocks and versions from this machine, and print what to do."""
+    """Check keys, addresses, clocks and versions from this machine, and print remedies."""
     from kouxing.services.cli.doctor import run_checks
 
     num_checks = num_failed = 0

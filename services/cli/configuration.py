@@ -44,7 +44,7 @@ def config(
     config: ConfigFile = None,
     assignments: Assignments = None,
 ) -> None:
-    """Print every setting with its meaning, allowed values, default, value and source."""
+    """Print the value, source, default, allowed values and meaning of every setting."""
     if service and service not in CONFIG_TYPES:
         raise UserError(f"unknown service {service!r}; choose one of {', '.join(CONFIG_TYPES)}")
     values = parse_assignments(assignments or [])
