@@ -99,7 +99,7 @@ export class Speaker {
   push(audio: Int16Array | Float32Array | Uint8Array | ArrayBuffer): Promise<void>;
   /** Interrupt: drop audio whose face is not shown yet. The face returns to rest. */
   flush(): void;
-  /** End the audio. Resolved when all is spoken and the session is closed. */
+  /** End the audio. Resolved when all is spoken and the session is closed; rejected if an error ends it first. */
   finish(): Promise<void>;
   /** Close the session at once. */
   close(): void;

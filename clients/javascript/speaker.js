@@ -1,6 +1,12 @@
 // Sends speech into a new session.
 
-import { checkWebSocket, socketUrl } from "./viewer.js";
+import { checkOptions, checkWebSocket, socketUrl } from "./viewer.js";
+
+const OPTIONS = [
+  "sampleRateHz", "numChannels", "encoding", "ahead", "mouthProfile", "language", "token", "error", "closed",
+];
+const AUDIO_TYPES = ["Int16Array", "Float32Array", "Uint8Array", "ArrayBuffer", "DataView"];
+const MAX_FLOAT = 8; // smaller values beyond 1 are clipped
 
 const MESSAGE_BYTES = 32000;
 const MAX_BUFFERED_BYTES = 1 << 18; // above it, push() waits
@@ -45,8 +51,11 @@ export class Speaker {
    * @returns a promise of a Speaker; it is rejected if the gateway is not running or rejects the session
    */
   static async open(gateway, options = {}) {
-    const { sampleRateHz = 16000, numChannels = 1, encoding = "s16le", token = "" } = options;
-    const { ahead = false, mouthProfile, language, error = () => {}, closed = () => {} } = options;
+    const {
+      sampleRateHz = 16000, numChannels = 1, encoding = "s16le", token = "",
+      ahead = false, mouthProfile, language, error = () => {}, closed = () => {}, ...unknown
+    } = options;
+    checkOptions(unknown, OPTIONS);
     const format = { sample_rate_hz: sampleRateHz, num_channels: numChannels, encoding };
     checkWebSocket();
     const socket = new WebSocket(socketUrl(gateway, "/microphone", { token }));
@@ -87,11 +96,15 @@ export class Speaker {
     this.#socket.send(JSON.stringify({ flush: true }));
   }
 
-  /** End the audio. The promise is resolved when all is spoken and the session is closed. */
+  /**
+   * End the audio. The promise is resolved when all is spoken and the session is closed; it is rejected
+   * if an error ends the session first.
+   */
   async finish() {
     this.#checkOpen();
     this.#socket.send(JSON.stringify({ last: true }));
     await this.#closed;
+    if (this.#failure) throw this.#failure;
   }
 
   /** Close the session immediately. */
@@ -110,6 +123,13 @@ export class Speaker {
 }
 
 function toPcm(audio, encoding) {
+  const type = Object.prototype.toString.call(audio).slice("[object ".length, -1);
+  if (!AUDIO_TYPES.includes(type)) {
+    throw new TypeError(`audio must be an Int16Array, a Float32Array or bytes, not ${type}`);
+  }
+  if (type === "Float32Array" && !audio.every((value) => Math.abs(value) <= MAX_FLOAT)) {
+    throw new RangeError("samples of a Float32Array must be from -1 to 1; divide integers by 32768");
+  }
   if (encoding === "s16le" && audio instanceof Float32Array) {
     audio = Int16Array.from(audio, (value) => Math.round(32767 * Math.max(-1, Math.min(1, value))));
   } else if (encoding === "f32le" && audio instanceof Int16Array) {

@@ -2,6 +2,7 @@
 
 import { ViewerSocket } from "./page/viewer-socket.js";
 
+const SHAPE_SETS = ["arkit", "oculus", "vrm"];
 const EVENTS = [
   "session", "phone", "syllable", "speech", "end", "error", "status", "face", "acoustic",
 ];
@@ -14,6 +15,9 @@ const EVENTS = [
  * @param fields of the query, without empty fields
  */
 export function socketUrl(gateway, path, fields) {
+  if (!/^(http|ws)s?:/.test(gateway)) {
+    throw new TypeError(`${gateway} is not the address of a gateway, such as http://localhost:8080`);
+  }
   const url = new URL(path, gateway);
   url.protocol = url.protocol.replace("http", "ws");
   for (const [name, value] of Object.entries(fields)) if (value) url.searchParams.set(name, value);
@@ -27,6 +31,12 @@ export function checkWebSocket() {
   }
 }
 
+/** Throw an error if there are options that a function does not have. */
+export function checkOptions(unknown, known) {
+  const [name] = Object.keys(unknown);
+  if (name !== undefined) throw new TypeError(`unknown option ${name}; use ${known.join(", ")}`);
+}
+
 /** Follows one session, or always the newest. Reconnects by itself until it is closed. */
 export class Viewer {
   #socket;
@@ -37,8 +47,12 @@ export class Viewer {
    * @param options { session: name, "" for the newest; shapes: set of blendshapes to receive in
    *   addition to FAP frames; token: the gateway's token }
    */
-  constructor(gateway, handlers, { session = "", shapes = "", token = "" } = {}) {
+  constructor(gateway, handlers, { session = "", shapes = "", token = "", ...unknown } = {}) {
     checkWebSocket();
+    checkOptions(unknown, ["session", "shapes", "token"]);
+    if (shapes && !SHAPE_SETS.includes(shapes)) {
+      throw new TypeError(`unknown set of shapes ${shapes}; use ${SHAPE_SETS.join(", ")}`);
+    }
     let names = [];
     let resolveReady = null;
     /** Resolved when a session is shown. The viewer misses nothing from then on. */

@@ -21,10 +21,13 @@ function isNewer(frame, other) {
 
 /** Wait for the named session, or for any session; return it, or the newest. */
 async function findSession(control) {
+  let isWaiting = false;
   for (;;) {
     const [, { sessions = [] }] = await ask(control, "status-request", sessionName); // an error has no sessions
     const open = sessions.filter(({ endpoints }) => "faps" in endpoints);
     if (open.length > 0) return open.reduce((a, b) => (a.age_s < b.age_s ? a : b));
+    if (!isWaiting) console.error(`waiting for ${sessionName || "a session"}`);
+    isWaiting = true;
     await sleep(500);
   }
 }

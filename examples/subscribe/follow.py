@@ -18,13 +18,17 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program without 
 
 def wait_for_session(client, name):
     """Return a session as soon as it is open; if the name is empty, the newest."""
+    is_waiting = False
     while True:
         try:
             return client.follow(name)
         except Refused as refusal:
             if refusal.code != "unknown-session":
                 raise
-            time.sleep(0.5)  # there is no such session yet
+        if not is_waiting:
+            print(f"waiting for {name or 'a session'}", file=sys.stderr)
+            is_waiting = True
+        time.sleep(0.5)
 
 
 name, address = (*sys.argv[1:], "", "")[:2]

@@ -53,6 +53,21 @@ test("speech returns as frames, shapes, phones and sound", async () => {
   assert.ok(numSamples > 15000);
 });
 
+test("wrong options, addresses and audio are rejected", async () => {
+  await assert.rejects(Speaker.open(GATEWAY, { sampleRate: 48000 }), /unknown option sampleRate; use sampleRateHz/);
+  await assert.rejects(Speaker.open("localhost:8080"), /localhost:8080 is not the address of a gateway, such as/);
+  assert.throws(() => new Viewer(GATEWAY, {}, { shape: "arkit" }), /unknown option shape; use session, shapes/);
+  assert.throws(() => new Viewer(GATEWAY, {}, { shapes: "ARKit" }), /unknown set of shapes ARKit; use arkit/);
+  const speaker = await Speaker.open(GATEWAY);
+  for (const [audio, name] of [[[0.5], "Array"], ["text", "String"], [null, "Null"], [new Float64Array(1), "Float64Array"]]) {
+    await assert.rejects(speaker.push(audio), new RegExp(`not ${name}`));
+  }
+  await assert.rejects(speaker.push(Float32Array.of(0, 1000)), /must be from -1 to 1; divide/);
+  await assert.rejects(speaker.push(Float32Array.of(NaN)), /must be from -1 to 1/);
+  await speaker.push(Buffer.from("RIFF....WAVE"));
+  await assert.rejects(speaker.finish(), /looks like the start of a WAV file/);
+});
+
 test("a refused session is rejected with the reason", async () => {
   await assert.rejects(Speaker.open(GATEWAY, { sampleRateHz: 1000 }), /sample_rate_hz must be/);
   await assert.rejects(Speaker.open("http://127.0.0.1:1"), /no gateway at .*kouxing run/);
