@@ -285,7 +285,11 @@ class ControlService(Service):
                 self._lifecycle.move(record)
         if heartbeat.role == "observer":
             missed_start = [
-                record for record in self._sessions if record.name not in heartbeat.sessions
+                record
+                for record in self._sessions
+                if record.name not in heartbeat.sessions
+                # it has another session with this name, whose end it missed
+                or not (record.restored or heartbeat.instance in record.started)
             ]
         for record in missed_start:
             self._commands.send(record.start_message(time.monotonic()), to=sender)

@@ -214,6 +214,7 @@ class SessionTable:
     def record_started(self, record: SessionRecord, instance: str, final_until: int) -> set[str]:
         """Record that a service serves a session; return deferred services to notify now."""
         record.waiting_for.discard(instance)
+        record.started.add(instance)
         record.final_until = max(record.final_until, final_until)
         if record.missing_workers > record.deferred:
             return set()
@@ -272,6 +273,7 @@ class SessionTable:
         record.moved = True
         record.started_s = now_s
         record.waiting_for = self.participants(record)
+        record.started = set()
         return True
 
     def _add(self, record: SessionRecord, now_s: float) -> None:

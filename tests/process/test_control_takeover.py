@@ -1,14 +1,28 @@
 """A restarted control learns the sessions from the services."""
 
+import time
+
 import pytest
 from kouxing_client.messages import Speech
 
 from kouxing.services.control import restart_recovery, session_lifecycle
 from kouxing.shared.fast_record import replace
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.control import SessionProgress, SessionStarted, StartSession
+from kouxing.shared.wire.control import (
+    Heartbeat,
+    SessionProgress,
+    SessionStarted,
+    StartSession,
+)
 from kouxing.shared.wire.face import FaceSettings
-from kouxing.shared.wire.session import CloseSession, Done, Error, OpenSession, SessionMoved
+from kouxing.shared.wire.session import (
+    CloseSession,
+    Done,
+    Error,
+    OpenSession,
+    SessionMoved,
+    SessionOpened,
+)
 from tests.control_harness import ControlHarness, make_heartbeat
 from tests.samples import START
 
@@ -141,3 +155,34 @@ def test_repeats_session_moved_to_the_client(
     assert isinstance(first, SessionMoved)
     assert (first.epoch, first.faps) == (2, "tcp://127.0.0.1:9")
     assert others == [first, first]
+
+
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_an_observer_that_was_lost_learns_what_it_missed(
+    harness: ControlHarness, client: Socket, *, is_moved: bool
+) -> None:
+    observer = harness.buses[0].connect_dealer(harness.control.endpoints["commands"])
+    harness.services.append(observer)
+    lamp = Heartbeat(
+        service="recognizer", instance="lamp", role="observer", state="ready", sent_ns=0
+    )
+    observer.send(lamp)
+    harness.receive(observer)
+    client.send(OpenSession(session="mine", request="1"))
+    harness.step_until(lambda: client.wait(0.0))
+    (opened,) = harness.receive(client)
+    assert isinstance(opened, SessionOpened)
+    harness.control._on_service_lost("lamp", "no heartbeat")
+    record = harness.control._sessions.find("mine")
+    if is_moved:
+        assert harness.control._sessions.move(record, time.monotonic())
+    else:  # another session with the same name
+        client.send(CloseSession(session="mine", token=opened.token, request="2"))
+        harness.receive(client)
+        client.send(OpenSession(session="mine", request="3"))
+        harness.step_until(lambda: client.wait(0.0))
+        record = harness.control._sessions.find("mine")
+    observer.send(replace(lamp, sessions={"mine": SessionProgress()}))
+    messages = harness.receive(observer, 2)
+    (start,) = (message for message in messages if isinstance(message, StartSession))
+    assert (start.token, start.epoch) == (record.token, record.epoch)
