@@ -63,7 +63,7 @@ def is_local(host: str) -> bool:
 
 
 def with_host(endpoint: str, host: str) -> str:
-    """Replace the host of an endpoint by another name or address."""
+    """Replace the host of an endpoint with another name or address."""
     _, port = split_endpoint(endpoint, "endpoint")
     if ":" in host and not host.startswith("["):
         host = f"[{host}]"

@@ -40,7 +40,7 @@ class Analyser {
   }
 }
 
-/** Replace a signal by its spectrum: the FFT of Cooley and Tukey, radix 2, in place. */
+/** Replace a signal with its spectrum: the FFT of Cooley and Tukey, radix 2, in place. */
 function transform(real, imaginary) {
   const size = real.length;
   for (let i = 1, j = 0; i < size; i++) {

@@ -161,7 +161,7 @@ class LiveDecoder:
         return [*revised, new]
 
     def _revise(self, segments: list[PathSegment], num_following: int) -> list[Phone]:
-        """Replace the open phones by the best string; return the new and changed phones.
+        """Replace the open phones with the best string; return the new and changed phones.
 
         ``num_following`` phones follow the segments: one, or none if speech has ended.
         """

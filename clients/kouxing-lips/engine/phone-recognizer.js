@@ -139,7 +139,7 @@ export class PhoneRecognizer {
     return true;
   }
 
-  /** Replace the open phones by the best string; return those that are new or changed. */
+  /** Replace the open phones with the best string; return those that are new or changed. */
   #revise(segments, numFollowing) {
     let numBefore = this.#openPhones.length - numFollowing;
     if (this.#finalFrame === 0 && segments.length > Math.max(0, numBefore) && segments[0].phone === this.#silence) segments = segments.slice(1);

@@ -53,7 +53,7 @@ export class FaceRecording {
     this.#frames.push({ ms: takenMs, landmarks });
   }
 
-  /** Return the key of an advice for the speaker, or null. */
+  /** Return the text key of advice for the speaker, or null. */
   advice(nowMs) {
     if (this.#lastImageMs - this.#lastFaceMs > NO_FACE_MS) return "noFace";
     const isQuiet = this.#lastLoudMs !== null && nowMs - this.#lastLoudMs > QUIET_MS;

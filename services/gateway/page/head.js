@@ -237,7 +237,7 @@ export class Head {
   }
 }
 
-/** Replace the triangles by the coarser ones in the file, for drawing without a graphics card. */
+/** Replace the triangles with the coarser ones in the file, for drawing without a graphics card. */
 async function coarsen(gltf) {
   const meshes = [];
   gltf.scene.traverse((node) => {

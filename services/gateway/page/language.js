@@ -1,4 +1,4 @@
-// The page's language, English or Chinese: the chosen one, else the browser's.
+// The page's language, English or Chinese. If none was chosen, it is the browser's.
 
 import { errorToChinese, toChinese } from "./gateway-texts.js";
 import { TEXTS } from "./texts.js";
