@@ -12,6 +12,7 @@ const MESSAGE_BYTES = 32000;
 const MAX_BUFFERED_BYTES = 1 << 18; // above it, push() waits
 const POLL_MS = 10;
 const REFUSED_CODE = 1008; // the last error has ended the session
+const NORMAL_CODES = [1000, 1005];
 
 /** A session that this program feeds with audio. */
 export class Speaker {
@@ -32,8 +33,11 @@ export class Speaker {
       if (type === "error") onError((lastError = new Error(text)));
     };
     this.#closed = new Promise((resolve) => {
-      socket.onclose = ({ code }) => {
+      socket.onclose = ({ code, reason }) => {
         if (code === REFUSED_CODE) this.#failure = lastError;
+        else if (!NORMAL_CODES.includes(code)) {
+          this.#failure ??= new Error(reason || "the connection to the gateway is lost; open another session");
+        }
         onClosed(this.#failure);
         resolve();
       };

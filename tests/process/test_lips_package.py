@@ -180,6 +180,12 @@ def test_voice_state_follows_the_speech(models: Path) -> None:
         ({"shapes": ["arkit52"]}, "unknown shapes arkit52; use arkit, oculus, vrm"),
         ({"expressiveness": 3}, "expressiveness is 3; it must be from 0.5 to 2"),
         ({"delayMs": -1}, "delayMs is -1; it must be from 0 to 300"),
+        ({"shapes": "oculus"}, 'shapes must be an array of names, such as ["arkit"]'),
+        (
+            {"sampleRate": 48000},
+            "unknown option sampleRate; use sampleRateHz, shapes, expressiveness, feeling, delayMs,"
+            " phones, models",
+        ),
     ],
 )
 def test_bad_options_give_a_sentence(models: Path, options: dict[str, Any], text: str) -> None:

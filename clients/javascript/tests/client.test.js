@@ -107,6 +107,11 @@ test("a session continues after an error, unless the gateway closes the connecti
     socket.onclose({ code: 1008 });
     await assert.rejects(speaker.push(new Int16Array(4)), /this is JSON/);
     assert.deepEqual(texts, ["unreadable", "this is JSON", "closed: this is JSON"]);
+    const reopening = Speaker.open(GATEWAY, { closed: ({ message }) => texts.push(message) });
+    socket.receive({ type: "opened", session: "voice" });
+    await reopening;
+    socket.onclose({ code: 1006, reason: "" }); // the gateway was killed
+    assert.equal(texts.at(-1), "the connection to the gateway is lost; open another session");
   } finally {
     globalThis.WebSocket = WebSocket;
   }

@@ -13,6 +13,7 @@ const MODELS = new URL("../models/", import.meta.url);
 const DEFAULT_SHAPES = ["arkit"];
 const DEFAULT_HOLD_S = 3;
 const MAX_DELAY_MS = 300;
+const OPTIONS = ["sampleRateHz", "shapes", "expressiveness", "feeling", "delayMs", "phones", "models"];
 
 export class LipEngine {
   #model;
@@ -28,7 +29,10 @@ export class LipEngine {
   #isSpeaking = false;
 
   /** Use LipEngine.load instead. */
-  constructor(model, { sampleRateHz = 16000, shapes = DEFAULT_SHAPES, expressiveness, feeling, delayMs } = {}) {
+  constructor(model, { sampleRateHz = 16000, shapes = DEFAULT_SHAPES, expressiveness, feeling, delayMs, ...unknown } = {}) {
+    const [name] = Object.keys(unknown);
+    if (name !== undefined) throw new TypeError(`unknown option ${name}; use ${OPTIONS.join(", ")}`);
+    if (!Array.isArray(shapes)) throw new TypeError('shapes must be an array of names, such as ["arkit"]');
     const { defaults, constants } = model;
     const delayS = inRange("delayMs", delayMs ?? 1000 * defaults.delayS, 0, MAX_DELAY_MS) / 1000;
     const amount = inRange("expressiveness", expressiveness ?? defaults.expressiveness, ...defaults.expressivenessRange);
