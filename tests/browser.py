@@ -50,8 +50,11 @@ class Browser(Chromium):
         self.wait_for("location.href === 'about:blank'")
 
     @contextlib.contextmanager
-    def drawing_seldom(self, module: str = "/draw-rate.js") -> Iterator[None]:
-        """Let pages draw one image in two seconds: without a GPU, an image needs 0.2 s."""
+    def drawing_seldom(self, module: str) -> Iterator[None]:
+        """Let pages draw one image in two seconds: without a GPU, an image needs 0.2 s.
+
+        ``module`` is the address of draw-rate.js.
+        """
         self.command("Page.enable")
         script = self.command(
             "Page.addScriptToEvaluateOnNewDocument",

@@ -54,9 +54,8 @@ def browser(control: FakeControl, tmp_path_factory: pytest.TempPathFactory) -> I
     write_speaking_head(folder / "head.mjpeg")
     gateway = Gateway(control.address)
     browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg", (640, 480))
-    with browser.drawing_seldom():
-        browser.open(gateway.page)
-        yield browser
+    browser.open(gateway.page)
+    yield browser
     browser.close()
     assert gateway.stop() == 0
 
@@ -77,18 +76,16 @@ def start_recording(browser: Browser) -> None:
 
 
 def read_aloud(browser: Browser) -> None:
-    """Record until enough faces were found, however slowly, and wait for the outcome."""
+    """Record until enough images were taken, however slowly, and wait for the outcome."""
     set_min_rate(browser, 0)
     browser.evaluate(
-        "import('/face-recording.js').then(({ FaceRecording: { prototype } }) => {"
-        " window.numFaces = 0; const { addFace } = prototype;"
-        " prototype.addFace = function (takenMs, landmarks) {"
-        "   window.numFaces += landmarks !== null; addFace.call(this, takenMs, landmarks); }; })"
+        "window.numImages = 0; window.takeImage = createImageBitmap;"
+        " window.createImageBitmap = (...args) => { numImages += 1; return takeImage(...args); }; 0"
     )
     browser.evaluate("window.kouxing.readingS = 600")
     start_recording(browser)
     is_due = "document.getElementById('learn-reading').classList.contains('due')"
-    browser.wait_for(f"{is_due} && window.numFaces > {MIN_FRAMES + 5}", 180)
+    browser.wait_for(f"{is_due} && window.numImages > {MIN_FRAMES + 15}", 180)
     browser.evaluate("window.kouxing.readingS = 0.001")
     browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
 
