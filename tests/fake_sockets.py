@@ -45,7 +45,11 @@ class FakeSockets:
 
     def at(self, endpoint: str) -> list[FakeConnection]:
         """Return the open connections to an endpoint, oldest first."""
-        return [one for one in self.connections if one.is_open and endpoint in one.endpoints]
+        return [
+            connection
+            for connection in self.connections
+            if connection.is_open and endpoint in connection.endpoints
+        ]
 
     def publish(self, endpoint: str, *messages: Message) -> None:
         """Deliver messages to all subscribers of an endpoint."""

@@ -97,7 +97,7 @@ def test_a_session_streams_audio_and_receives_results(control: FakeControl, clie
     shapes = [result for result in found if isinstance(result, Shapes)]
     assert [frame.values for frame in frames] == [array("f", [n] * 68) for n in (1.0, 2.0)]
     assert frames[0].time_s == 0.02
-    assert [one.by_name["aa"] for one in shapes] == [0.5, 0.5]
+    assert [frame.by_name["aa"] for frame in shapes] == [0.5, 0.5]
     assert [len(chunk.pcm) for chunk in control.audio_messages] == [32000, 16000, 0]
     assert [chunk.media_time for chunk in control.audio_messages] == [0, 2666, 4000]
     assert control.sessions_of(SetFace) == ["s"], "shapes are requested"

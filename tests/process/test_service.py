@@ -321,8 +321,8 @@ def test_starts_again_when_a_rejected_key_was_replaced(
     path.unlink()
     wait_until(lambda: service.should_exit, step=step)
     assert service.has_new_key
-    for one in (service, control):
-        one.bus.close()
+    for process in (service, control):
+        process.bus.close()
 
 
 def test_reports_draining_before_it_finishes_its_sessions(control: FakeControl) -> None:

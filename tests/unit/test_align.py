@@ -32,8 +32,8 @@ def vowels() -> list[Phone]:
 def test_all_phones_in_order_without_gaps(vowels: list[Phone]) -> None:
     symbols = [phone.symbol for phone in drop_pauses(vowels, load_inventory())]
     assert symbols == ["a", "o", "e", "i", "u", "v"]
-    for one, two in pairwise(vowels):
-        assert one.onset_s + one.duration_s == pytest.approx(two.onset_s)
+    for vowel, following in pairwise(vowels):
+        assert vowel.onset_s + vowel.duration_s == pytest.approx(following.onset_s)
     assert vowels[0].onset_s == pytest.approx(0.0075)
 
 

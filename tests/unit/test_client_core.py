@@ -145,8 +145,8 @@ def test_status_collects_all_pages() -> None:
     assert harness.commands.sent[-1][1]["after"] == 7
     state = {**STATE, "session": "s", "endpoints": {}}
     harness.answer("status-report", services=[], sessions=[state], next=None)
-    assert [one.service for one in status.result().services] == ["control"]
-    assert [one.session for one in status.result().sessions] == ["s"]
+    assert [service.service for service in status.result().services] == ["control"]
+    assert [session.session for session in status.result().sessions] == ["s"]
 
 
 def test_a_moved_session_sends_the_new_recognizer_what_it_needs() -> None:

@@ -100,7 +100,7 @@ def test_drops_copies_from_a_second_connection() -> None:
     old = harness.connection
     for _ in range(2):  # it connects again, and once more before that is complete
         harness.start(1)
-    assert len([one for one in harness.sockets.connections if one.is_open]) == 2
+    assert sum(connection.is_open for connection in harness.sockets.connections) == 2
     harness.complete()
     for connection, number in (
         (old, 1),

@@ -73,7 +73,8 @@ def test_a_list_is_a_list_in_a_file_and_a_text_elsewhere(tmp_path: Path) -> None
 
 def test_a_default_may_depend_on_another_key() -> None:
     given = settings(recognizer__acoustic="gmm")
-    (item,) = (one for one in given.describe(RecognizerConfig) if one.key == "num_stable_frames")
+    items = {item.key: item for item in given.describe(RecognizerConfig)}
+    item = items["num_stable_frames"]
     assert (item.value, item.default) == (1, 2)
     assert item.is_default
     assert item.meaning.endswith("The default is 1 if acoustic is light or gmm.")

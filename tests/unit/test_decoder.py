@@ -155,4 +155,4 @@ def test_limits_the_number_of_tokens() -> None:
     assert max_tokens == frame_search.MAX_TOKENS
     path = decoder.final_path()
     assert (path[0].start, path[-1].end) == (0, 60)
-    assert all(one.end == two.start for one, two in pairwise(path))
+    assert all(segment.end == following.start for segment, following in pairwise(path))

@@ -222,7 +222,9 @@ def test_rejects_too_many_keys_but_revokes_them(
     lines = [f"{n:040} name-{n:055} {' '.join(roles)}\n" for n in range(number + 20)]
     allowed.write_text(text + "".join(lines[:number]), encoding="ascii")
     grants = read_grants().items()
-    keys = {public: AllowedKey(name=one.name, roles=list(one.roles)) for public, one in grants}
+    keys = {
+        public: AllowedKey(name=grant.name, roles=list(grant.roles)) for public, grant in grants
+    }
     reply = HeartbeatReply(
         sent_ns=0, received_ns=0, replied_ns=0, control_instance="control-1", keys=keys
     )

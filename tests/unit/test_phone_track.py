@@ -29,8 +29,8 @@ def restart(track: PhoneTrack, time: int, *, active: bool = True) -> list[tuple[
 def take(track: PhoneTrack, *phones: Phone) -> list[tuple[str, int, bool]]:
     return [
         (changed.symbol, changed.index, changed.final)
-        for one in phones
-        for changed in track.update(one)
+        for phone in phones
+        for changed in track.update(phone)
     ]
 
 

@@ -96,7 +96,7 @@ def test_reads_numbers_units_and_abbreviations(language: str, text: str, as_spok
     transcript = load_inventory(language).read(text)
     assert not transcript.dropped
     spoken, expected = (
-        "".join(word for _, word in words_of(language, one)) for one in (text, as_spoken)
+        "".join(word for _, word in words_of(language, form)) for form in (text, as_spoken)
     )
     assert spoken == expected
 

@@ -110,7 +110,7 @@ def test_cantonese_syllables(syllable: str, phones: str) -> None:
 def test_labels_of_a_stop_are_one_phone(tmp_path: Path) -> None:
     table = tmp_path / "labels.tsv"
     labels = ["<p:>", "_t", "!t", "tasp", "aI", "k", "!k", "k", "."]
-    table.write_text("start_s\tend_s\tsymbol\n" + "".join(f"0\t1\t{one}\n" for one in labels))
+    table.write_text("start_s\tend_s\tsymbol\n" + "".join(f"0\t1\t{label}\n" for label in labels))
     row = {"utt_id": "emodb_1", "text": "", "phones_path": str(table)}
     assert universal_words(row) == [("t", "a", "ih", "k", "k")]
     ends = [end for end, _ in labeled_phones(table)]
