@@ -76,7 +76,7 @@ test("a player forgets the sound of another session, and keeps it in a new epoch
   assert.equal(numCleared, 1);
 });
 
-test("a leap waits until the sound has faded out", () => {
+test("a jump waits until the sound has faded out", () => {
   const player = playerWith(0);
   player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(8000).fill(16384) } });
   play(player, 4);
@@ -89,7 +89,7 @@ test("a leap waits until the sound has faded out", () => {
   assert.equal(output.at(-1), 0.5, "it continues at the new position");
 });
 
-test("a small distance is corrected without a leap", () => {
+test("a small distance is corrected without a jump", () => {
   const player = playerWith(0);
   const tone = Int16Array.from({ length: 16000 }, (_, i) => 16384 * Math.sin(0.3 * i));
   player.port.onmessage({ data: { mediaTime: 0, samples: tone } });

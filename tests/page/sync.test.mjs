@@ -153,7 +153,7 @@ test("sound and image stay in sync for ten minutes with clocks that differ by 20
   const clicks = await simulate({ forS: 600, senderPpm: 100, cardPpm: -100 });
   const settled = clicks.filter(({ atS }) => atS > SETTLE_S);
   assert.ok(settled.length >= 600 - SETTLE_S - 1, `${settled.length}: a click is lost`);
-  assert.ok(settled.every(({ level }) => level > 0.3), "a click was faded by a leap");
+  assert.ok(settled.every(({ level }) => level > 0.3), "a click was faded by a jump");
   const lates = settled.map(({ lateMs }) => lateMs);
   assert.ok(Math.max(...lates.map(Math.abs)) < 5, `${Math.min(...lates)} to ${Math.max(...lates)} ms`);
   const drift = mean(lates.slice(-60)) - mean(lates.slice(0, 60));

@@ -28,7 +28,7 @@ export class Lateness {
 
   /**
    * Record the arrival of a frame. Media time does not advance while the client sends no audio. Media time
-   * leaps if a busy machine skips frames to stay live.
+   * jumps if a busy machine skips frames to stay live.
    */
   frameArrived(nowMs, mediaTime) {
     const stepMs = (mediaTime - this.#newest) / SAMPLES_PER_MS;

@@ -6,11 +6,11 @@ import { SlidingWindow } from "./sliding-window.js";
 export const SAMPLES_PER_MS = 16;
 const FRAME_MS = 20; // between two FAP frames; interpolation needs both
 const FIRST_DELAY_MS = 120; // before anything has been measured
-// percentile: of the arrivals to wait for. marginMs: added for interpolation. leapMs: smaller errors
-// are corrected by gliding. With sound, playback must not run dry or leap audibly. Without sound,
+// percentile: of the arrivals to wait for. marginMs: added for interpolation. jumpMs: smaller errors
+// are corrected by gliding. With sound, playback must not run dry or jump audibly. Without sound,
 // a face that is one frame too old is not visible as late.
-const WITH_SOUND = { percentile: 0.95, marginMs: FRAME_MS, leapMs: 30 };
-const WITHOUT_SOUND = { percentile: 0.8, marginMs: 0, leapMs: 5 };
+const WITH_SOUND = { percentile: 0.95, marginMs: FRAME_MS, jumpMs: 30 };
+const WITHOUT_SOUND = { percentile: 0.8, marginMs: 0, jumpMs: 5 };
 const ADJUST_EVERY_MS = 500;
 const MAX_GLIDE = 0.005; // change of speed; a twelfth of a semitone, which is inaudible
 const WINDOW_MS = 10000; // window of the percentiles; long enough to ignore a single hiccup
@@ -19,7 +19,7 @@ const JUMP_MS = 300; // restart if the stream is late or early by more than this
 const LATE_MS = 100; // and late for this long; less than the delay, so that no sound is lost
 const EARLY_MS = 300; // or if the stream is early for this long
 const START_MS = 300; // in which the earliest arrival sets the offset
-const MAX_BEHIND_MS = 3000; // restart immediately if media time leaps ahead by more than this
+const MAX_BEHIND_MS = 3000; // restart immediately if media time jumps ahead by more than this
 const MAX_FRAMES = 1000;
 
 /** Measures how long a condition has held. Time is injected. */
@@ -48,7 +48,7 @@ class Streak {
  *
  * The drift of the network and of the clocks moves the target. The offset glides toward the target
  * by at most 5 ms per second, and the sound follows by resampling. Only if the error exceeds 30 ms,
- * half of it is corrected immediately, every half second. So one bad second does not cause a leap. After a
+ * half of it is corrected immediately, every half second. So one bad second does not cause a jump. After a
  * stall, the delayed data arrives in a burst. The burst is not measured, so the page is live when it ends.
  */
 export class Playout {
@@ -129,7 +129,7 @@ export class Playout {
     if (this.offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
     if (this.frames.count < MIN_FRAMES) return;
     this.#adjustedMs = nowMs;
-    const { percentile, marginMs, leapMs } = this.isAudible ? WITH_SOUND : WITHOUT_SOUND;
+    const { percentile, marginMs, jumpMs } = this.isAudible ? WITH_SOUND : WITHOUT_SOUND;
     let latestMs = this.frames.percentile(percentile) + this.imageDelayMs;
     if (this.isAudible && this.soundStarts.count) {
       // The lateness of a long chunk of sound is the lateness of its first sample.
@@ -138,7 +138,7 @@ export class Playout {
     }
     this.#targetMs = latestMs + marginMs;
     const errorMs = this.#targetMs - this.offsetMs;
-    if (Math.abs(errorMs) > leapMs) this.offsetMs += errorMs / 2;
+    if (Math.abs(errorMs) > jumpMs) this.offsetMs += errorMs / 2;
   }
 
   #glide(nowMs) {

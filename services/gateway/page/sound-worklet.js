@@ -1,11 +1,11 @@
 // Plays sound at its media time. Runs in the audio thread. The context runs at 16 kHz: media time =
 // context frame + anchor. The target of the anchor moves all the time, because clocks drift. A small
-// distance is corrected by resampling, which is inaudible, a large one by a leap.
+// distance is corrected by resampling, which is inaudible, and a large one by a jump.
 
 const CAPACITY = 1 << 17; // samples, 8 s
 const MASK = CAPACITY - 1; // maps a media time to its index
 const FADE = 1 / 64; // change of the gain per sample; a fade takes 4 ms and avoids clicks
-const MIN_LEAP = 160; // samples, 10 ms; smaller distances are corrected by resampling
+const MIN_JUMP = 160; // samples, 10 ms; smaller distances are corrected by resampling
 const GLIDE_LENGTH = 1600; // samples in which a small distance shrinks to a third
 const MAX_GLIDE = 0.01; // change of speed; a sixth of a semitone
 const TAPS = 16; // length of the interpolation filter
@@ -67,16 +67,16 @@ class SoundPlayer extends AudioWorkletProcessor {
   process(_inputs, [[output]]) {
     if (this.#target === null) return true;
     const distance = this.#anchor === null ? Infinity : this.#target - this.#anchor;
-    let isLeaping = Math.abs(distance) > MIN_LEAP;
-    const glide = isLeaping ? 0 : Math.max(-MAX_GLIDE, Math.min(MAX_GLIDE, distance / GLIDE_LENGTH));
+    let isJumping = Math.abs(distance) > MIN_JUMP;
+    const glide = isJumping ? 0 : Math.max(-MAX_GLIDE, Math.min(MAX_GLIDE, distance / GLIDE_LENGTH));
     for (let i = 0; i < output.length; i++) {
-      if (isLeaping && this.#gain === 0) {
+      if (isJumping && this.#gain === 0) {
         this.#anchor = this.#target;
-        isLeaping = false;
+        isJumping = false;
       }
       this.#anchor += glide;
       const value = this.#at(currentFrame + i + this.#anchor);
-      const isAudible = value !== null && !isLeaping;
+      const isAudible = value !== null && !isJumping;
       this.#gain = isAudible ? Math.min(1, this.#gain + FADE) : Math.max(0, this.#gain - FADE);
       output[i] = value * this.#gain;
       if (value !== null) this.#numPlayed++;
