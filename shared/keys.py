@@ -376,8 +376,12 @@ def _locked_folder() -> Iterator[Path]:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
+        reason = str(error)
+        if isinstance(error, OSError):
+            reason = f"{error.filename}: {error.strerror}"
         raise UserError(
-            f"cannot use the key folder: {error}; set its mode to 700, or set XDG_STATE_HOME"
+            f"cannot use the key folder ({reason}); set XDG_STATE_HOME to a folder that you"
+            " can write to, or create the key folder as your own, with mode 700"
         ) from None
     try:
         _check_private(folder, 0o700)

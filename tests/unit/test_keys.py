@@ -74,7 +74,7 @@ def test_names_an_invalid_key_file_and_an_unusable_folder(
             load_user_key()
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    with pytest.raises(UserError, match="XDG_STATE_HOME"):
+    with pytest.raises(UserError, match=r"file/kouxing: Not a directory\); set XDG_STATE_HOME"):
         load_user_key()
 
 
