@@ -344,7 +344,8 @@ def test_reports_a_browser_without_webgl(browser: Browser, gateway: Gateway, vie
 
 
 def test_reports_missing_services(control: PageControl, page: Browser, gateway: Gateway) -> None:
-    page.open(gateway.page)
+    with page.drawing_seldom("/draw-rate.js"):  # each notice is shown for seconds
+        page.open(gateway.page)
     page.wait_for(f"{NOTICE} === ''")
     control.shown, control.running, control.refuse = None, ["synthesizer"], True
     page.wait_for(f"{NOTICE}.includes('Not running: recognizer')")
@@ -357,6 +358,7 @@ def test_reports_missing_services(control: PageControl, page: Browser, gateway: 
     page.wait_for(f"{NOTICE}.includes('缺少服务')")  # also the error of a service
     page.wait_for(f"{NOTICE}.includes('没有运行')")
     choose(page, "language", "en")
+    page.open(gateway.page)  # which draws all images again
 
 
 def test_reconnects_when_the_gateway_restarts(
