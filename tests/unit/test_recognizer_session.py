@@ -1,12 +1,13 @@
 """A session of the recognizer: the audio that it accepts, the order of messages, its sound."""
 
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import (
@@ -30,13 +31,21 @@ from tests.system import VOWELS_FILE, samples_of_file
 
 RATE_HZ = START.opening.sample_rate_hz
 SOCKET, OTHER_SOCKET = (cast(Socket, object()) for _ in range(2))
-RECOGNIZER = Recognizer(load_model())
-LIPS = load_lip_predictor()
+
+
+@cache
+def recognizer() -> Recognizer:
+    return Recognizer(load_model())
+
+
+@cache
+def lip_predictor() -> LipPredictor:
+    return load_lip_predictor()
 
 
 def make_session(epoch: int = 1, **opening: Any) -> RecognizerSession:
     start = with_opening(replace(START, epoch=epoch), **opening)
-    return RecognizerSession(start, RECOGNIZER, LIPS, SOCKET, SOCKET, 0.0)
+    return RecognizerSession(start, recognizer(), lip_predictor(), SOCKET, SOCKET, 0.0)
 
 
 def chunk(
@@ -106,7 +115,7 @@ def test_audio_after_a_gap_waits_for_the_end_of_scoring() -> None:
     samples = samples_of_file(VOWELS_FILE)[:9600]
     session.audio.append((0, samples[:3200]), 0.0)
     session.accept_waveform(1.0, 0.0, hop=1)
-    RECOGNIZER.decode_streams([session.stream])
+    recognizer().decode_streams([session.stream])
     session.is_scoring = True
     session.stream.start_scoring()
     session.audio.append((3200, samples[3200:6400]), 0.0)
@@ -132,8 +141,8 @@ def test_reports_the_acoustic_model_in_use() -> None:
         session.face.change(FaceSettings(acoustic=light), 0.0)
         session.audio.append((start, samples[start : start + 1600]), start / 16_000)
         session.accept_waveform(1.0, start / 16_000, hop=1)
-        RECOGNIZER.decode_streams([session.stream])
-        message = session.acoustic_message(session.new_results(RECOGNIZER))
+        recognizer().decode_streams([session.stream])
+        message = session.acoustic_message(session.new_results(recognizer()))
         models.append(message.model if message else None)
     reported = [(number, model) for number, model in enumerate(models) if model]
     assert [model for _, model in reported][:2] == ["full", "light"]
@@ -187,12 +196,12 @@ def test_a_session_gets_the_lip_frames_of_its_mouth_profile() -> None:
     profile = MouthProfile(
         scale=np.zeros(15, np.float32),
         offset=np.full(15, 77, np.float32),
-        residual=np.zeros(LIPS.residual_shape, np.float32),
+        residual=np.zeros(lip_predictor().residual_shape, np.float32),
     )
-    session = make_session(mouth_profile=profile.to_bytes(LIPS.digest))
+    session = make_session(mouth_profile=profile.to_bytes(lip_predictor().digest))
     session.stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
-    RECOGNIZER.decode_streams([session.stream])
-    results = session.new_results(RECOGNIZER)
+    recognizer().decode_streams([session.stream])
+    results = session.new_results(recognizer())
     frames = [result for result in results if isinstance(result, LipPositions)]
     assert len(frames) > 5
     assert {frame.faps[0] for frame in frames} == {77.0}

@@ -1,12 +1,14 @@
 """A session's audio and its events: gaps, flushes, chunks, silence, and times in whole samples."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 from kouxing_client.messages import Message
 
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
@@ -28,11 +30,15 @@ from kouxing.shared.wire.events import event_to_message
 from tests.live_streams import LiveStream, recognize_live, recognize_together
 from tests.system import HELLO, VOWELS_FILE, samples_of_file
 
-MODEL = load_model()
 SAMPLES = samples_of_file(VOWELS_FILE)
 RATE_HZ = 16_000
 FACE: dict[str, Any] = {"lip_predictor": load_lip_predictor(), "face_delay_s": 0.1}
 E = TypeVar("E")
+
+
+@cache
+def model() -> AcousticModel:
+    return load_model()
 
 
 def of_kind(kind: type[E], outputs: Sequence[StreamOutput]) -> list[E]:
@@ -56,7 +62,7 @@ def assert_same(
 @pytest.mark.parametrize(("rate_hz", "size"), [(16_000, 97), (44_100, 1021)])
 def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
     expected, outputs = (
-        recognize_live(MODEL, SAMPLES, chunk, sample_rate_hz=rate_hz, **FACE)
+        recognize_live(model(), SAMPLES, chunk, sample_rate_hz=rate_hz, **FACE)
         for chunk in (None, size)
     )
     assert messages_of(outputs) == messages_of(expected)
@@ -65,8 +71,8 @@ def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
 
 
 def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
-    alone = of_kind(Phone, recognize_live(MODEL, SAMPLES))
-    stream = LiveStream(MODEL, **FACE)
+    alone = of_kind(Phone, recognize_live(model(), SAMPLES))
+    stream = LiveStream(model(), **FACE)
     gap = len(SAMPLES) + MAX_JITTER + 1
     stream.stream.accept_waveform(SAMPLES, 0)
     outputs = stream.feed(SAMPLES, gap) + stream.finish()
@@ -88,7 +94,7 @@ def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
 
 
 def test_skips_to_newer_audio() -> None:
-    stream = LiveStream(MODEL, **FACE)
+    stream = LiveStream(model(), **FACE)
     outputs = stream.feed(SAMPLES[:8000])
     stream.stream.skip_to(40_000)
     outputs += stream.feed(SAMPLES, 40_000) + stream.finish()
@@ -102,8 +108,8 @@ def test_skips_to_newer_audio() -> None:
 
 @pytest.mark.parametrize("cuts", [[9600, 14_400], [320, 10_240], [0, 50_000]])
 def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
-    expected = recognize_live(MODEL, SAMPLES, 320, **FACE)
-    stream = LiveStream(MODEL, **FACE)
+    expected = recognize_live(model(), SAMPLES, 320, **FACE)
+    stream = LiveStream(model(), **FACE)
     outputs = []
     for number, part in enumerate(np.split(SAMPLES, cuts)):
         stream.stream.set_light_model(number == 1)
@@ -120,15 +126,15 @@ def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
 
 
 def test_jitter_is_not_a_gap() -> None:
-    stream = LiveStream(MODEL)
+    stream = LiveStream(model())
     outputs = stream.feed(SAMPLES[:8000], 0) + stream.feed(SAMPLES[8000:], 8000 + MAX_JITTER)
     assert stream.stream.num_gaps == 0
-    expected = recognize_live(MODEL, SAMPLES)
+    expected = recognize_live(model(), SAMPLES)
     assert messages_of(outputs + stream.finish()) == messages_of(expected)
 
 
 def test_a_flush_ends_the_speech_and_drops_it() -> None:
-    stream = LiveStream(MODEL)
+    stream = LiveStream(model())
     spoken = of_kind(Phone, stream.feed(SAMPLES[:16_000]))
     assert spoken
     stream.stream.flush()
@@ -139,7 +145,7 @@ def test_a_flush_ends_the_speech_and_drops_it() -> None:
     later = of_kind(Phone, rest)
     assert min(phone.index for phone in later) == 1 + max(phone.index for phone in spoken)
     assert [(p.symbol, p.duration_s) for p in later] == [
-        (p.symbol, p.duration_s) for p in of_kind(Phone, recognize_live(MODEL, SAMPLES))
+        (p.symbol, p.duration_s) for p in of_kind(Phone, recognize_live(model(), SAMPLES))
     ]
     assert min(phone.onset_s for phone in later) > 1.0
     assert rest[-1] == EndOfSound(time_s=1.0 + len(SAMPLES) / RATE_HZ)
@@ -149,7 +155,7 @@ def test_a_flush_ends_the_speech_and_drops_it() -> None:
 def test_lip_frames_are_known_5_ms_before_the_face_frame(rate_hz: int, before_s: float) -> None:
     times_s = np.arange(round((before_s + len(SAMPLES) / RATE_HZ) * rate_hz)) / rate_hz
     samples = np.interp(times_s, before_s + np.arange(len(SAMPLES)) / RATE_HZ, SAMPLES, left=0.0)
-    stream = LiveStream(MODEL, sample_rate_hz=rate_hz, **FACE)
+    stream = LiveStream(model(), sample_rate_hz=rate_hz, **FACE)
     newest_s, is_speaking, lags_s = 0.0, False, []
     for event in stream.feed(samples.astype(np.float32)):
         if isinstance(event, LipPositions):
@@ -164,14 +170,14 @@ def test_lip_frames_are_known_5_ms_before_the_face_frame(rate_hz: int, before_s:
 
 def test_other_sessions_do_not_affect_results() -> None:
     recordings = [SAMPLES, SAMPLES[8000:], SAMPLES[:9000]]
-    together = recognize_together(MODEL, recordings, **FACE)
+    together = recognize_together(model(), recordings, **FACE)
     for samples, outputs in zip(recordings, together, strict=True):
-        assert messages_of(outputs) == messages_of(recognize_live(MODEL, samples, **FACE))
+        assert messages_of(outputs) == messages_of(recognize_live(model(), samples, **FACE))
 
 
 def test_lips_may_be_early_and_phones_are_the_same() -> None:
-    expected = recognize_live(MODEL, SAMPLES, 320, **FACE)
-    recognizer = Recognizer(MODEL)
+    expected = recognize_live(model(), SAMPLES, 320, **FACE)
+    recognizer = Recognizer(model())
     stream = recognizer.create_stream(**FACE)
     outputs: list[StreamOutput] = []
     num_early = 0
@@ -197,7 +203,7 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
     outputs: list[list[StreamOutput]] = []
     num_early = 0
     for continues in (False, True):
-        recognizer = Recognizer(MODEL)
+        recognizer = Recognizer(model())
         stream = recognizer.create_stream(**FACE)
         stream.set_hop(4)
         results: list[StreamOutput] = []
@@ -228,7 +234,7 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
 
 
 def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
-    recognizer = Recognizer(MODEL)
+    recognizer = Recognizer(model())
     stream = recognizer.create_stream(**FACE)
     stream.set_hop(4)
     recognizer.decode_streams([stream])
@@ -249,8 +255,8 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
 
 
 def test_a_longer_hop_changes_only_the_phones() -> None:
-    expected = recognize_live(MODEL, SAMPLES, 320, **FACE)
-    stream = LiveStream(MODEL, **FACE)
+    expected = recognize_live(model(), SAMPLES, 320, **FACE)
+    stream = LiveStream(model(), **FACE)
     stream.stream.set_hop(4)
     outputs = [*stream.feed(SAMPLES, chunk=320), *stream.finish()]
     assert_same((LipPositions, Progress, SpeechChange), outputs, expected)
@@ -262,21 +268,21 @@ def test_a_longer_hop_changes_only_the_phones() -> None:
 
 
 def hello_phones() -> list[Phone]:
-    return of_kind(Phone, recognize_live(MODEL, HELLO, 320))
+    return of_kind(Phone, recognize_live(model(), HELLO, 320))
 
 
 @pytest.mark.slow
 def test_silence_and_noise_have_no_phones() -> None:
     noise = np.random.default_rng(0).normal(0, 0.01, 32_000).astype(np.float32)
-    outputs = recognize_live(MODEL, noise, 320)
+    outputs = recognize_live(model(), noise, 320)
     assert not any(isinstance(output, Phone | SpeechChange) for output in outputs)
-    assert recognize_recording(MODEL, noise) == []
+    assert recognize_recording(model(), noise) == []
 
 
 @pytest.mark.slow
 def test_warm_up_compiles_everything_and_changes_no_result() -> None:
     expected = hello_phones()
-    Recognizer(MODEL).warm_up()
+    Recognizer(model()).warm_up()
     assert frame_search.advance_frames.signatures
     assert path_records.count_record_paths.signatures
     assert path_records.compact_records.signatures
