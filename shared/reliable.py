@@ -28,9 +28,10 @@ class ReliableSender:
     """The sending end for one session."""
 
     def __init__(self, socket: Socket, session: str, epoch: int) -> None:
-        self._socket = socket
-        self._session = session
+        self.socket = socket
+        self.session = session
         self.epoch = epoch
+        self.acknowledged = 0  # the highest acknowledged number
         self._next = 1
         self.unacknowledged: deque[Message] = deque()  # oldest first; the owner limits their number
         self._waiting: list[Message] = []  # messages to send together
@@ -41,7 +42,7 @@ class ReliableSender:
 
         Results wait for the following ``progress``, because only a ``progress`` makes a frame.
         """
-        numbered = replace(message, session=self._session, epoch=self.epoch, sequence=self._next)
+        numbered = replace(message, session=self.session, epoch=self.epoch, sequence=self._next)
         self._next += 1
         if not self.unacknowledged:
             self._progress_s = now_s
@@ -53,11 +54,12 @@ class ReliableSender:
     def flush(self) -> None:
         """Send the waiting messages."""
         if self._waiting:
-            self._socket.send(batch_messages(self._waiting))
+            self.socket.send(batch_messages(self._waiting))
             self._waiting.clear()
 
     def acknowledge(self, up_to: int, now_s: float) -> list[Message]:
         """Drop the acknowledged messages up to a number; return them."""
+        self.acknowledged = max(self.acknowledged, up_to)
         acknowledged = []
         while self.unacknowledged and self.unacknowledged[0].sequence <= up_to:
             acknowledged.append(self.unacknowledged.popleft())
@@ -71,7 +73,7 @@ class ReliableSender:
         self._progress_s = now_s
         oldest = list(islice(self.unacknowledged, MAX_RESENT))
         for begin in range(0, len(oldest), MAX_TOGETHER):
-            self._socket.send(batch_messages(oldest[begin : begin + MAX_TOGETHER]))
+            self.socket.send(batch_messages(oldest[begin : begin + MAX_TOGETHER]))
         return len(oldest)
 
 

@@ -84,6 +84,9 @@ class SynthesizerLink:
         """Return the results that the synthesizer has newly acknowledged."""
         if self._sender is None or ack.epoch != self._sender.epoch:
             return []
+        if ack.sequence == 0 < self._sender.acknowledged:  # it restarted, and waits for number 1
+            self.connect(self._sender.socket, self._sender.session, ack.epoch, now_s)
+            return []
         self._newest_frame = ack.newest_frame or self._newest_frame
         acknowledged = self._sender.acknowledge(ack.sequence, now_s)
         messages = [message for message in acknowledged if not is_state_report(message)]

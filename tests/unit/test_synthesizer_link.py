@@ -1,5 +1,6 @@
 """The messages of a session that a new synthesizer receives."""
 
+import math
 from typing import cast
 
 import pytest
@@ -14,6 +15,8 @@ from kouxing.services.recognizer.synthesizer_link import (
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.fast_record import replace
+from kouxing.shared.keys import Peer
+from kouxing.shared.reliable import ReliableReceiver
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.events import split_batch
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
@@ -65,6 +68,34 @@ def test_a_new_synthesizer_receives_the_newest_frame_and_the_last_messages() -> 
     assert times[-2] - times[0] == KEPT_SAMPLES
     assert [message.sequence for message in (resume, speech, *rest)] == list(range(1, 8))
     assert {message.epoch for message in (resume, speech, *rest)} == {2}
+
+
+def test_a_synthesizer_that_restarts_in_the_same_epoch_receives_the_last_messages_again() -> None:
+    link = FakeSynthesizerLink()
+    link.send_all(progress(1.0), progress(2.0))
+    link.acknowledge_up_to(2, frame=40)
+    acks: list[Acknowledge] = []
+    socket = type("FakeSocket", (), {"send": lambda _, ack, to: acks.append(ack)})()
+    restarted = ReliableReceiver(cast(Socket, socket), "s", Acknowledge)
+
+    def deliver() -> list[int]:
+        messages = link.sent[:]
+        link.sent.clear()
+        received = [message for message in messages if restarted.receive(message, Peer(b"r"))]
+        return [message.media_time for message in received]
+
+    link.sent.clear()
+    link.send_all(progress(3.0), progress(4.0))
+    assert deliver() == []
+    assert [ack.sequence for ack in acks] == [0, 0], "only the first one has an effect"
+    for ack in acks:
+        assert link.acknowledge(ack, 0.0) == []
+    assert deliver() == [12_800, *[to_samples(number) for number in (1.0, 2.0, 3.0, 4.0)]]
+    link.send_all(progress(5.0))
+    assert deliver() == [to_samples(5.0)]
+    restarted.tick(math.inf)
+    assert len(link.acknowledge(acks[-1], 0.0)) == 5
+    assert link.backlog == 0
 
 
 def test_forgets_messages_before_an_interruption() -> None:
