@@ -23,24 +23,35 @@ def open_output(path: Path, *, keep_on_error: bool = False) -> Iterator[BinaryIO
     Raises ``UserError`` if the file cannot be written.
     """
     try:
-        with contextlib.ExitStack() as stack:
-            is_direct = keep_on_error or not _can_replace(path)
-            written = path if is_direct else path.with_name(f".{secrets.token_hex(8)}.part")
-            if not is_direct:
-                stack.callback(written.unlink, missing_ok=True)
-            with written.open("wb") as file:
+        if keep_on_error or not _can_replace(path):
+            with path.open("wb") as file:
                 yield file
-            if not is_direct:
-                if path.exists():
-                    shutil.copymode(path, written)
-                written.replace(path)
+            return
+        part = path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}.part")
+        try:
+            with part.open("wb") as file:
+                yield file
+            _replace(path, part)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
         raise write_error(path, error) from error
 
 
 def _can_replace(path: Path) -> bool:
-    is_special = path.is_symlink() or (path.exists() and not path.is_file())
-    return not is_special and os.access(path.parent, os.W_OK)
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        return False
+    return os.access(path.parent, os.W_OK) and (not path.exists() or os.access(path, os.W_OK))
+
+
+def _replace(path: Path, part: Path) -> None:
+    """Give a complete file its name. It keeps the permissions of an older file."""
+    if path.exists():
+        shutil.copymode(path, part)
+    try:
+        part.replace(path)
+    except OSError:  # a mount point, or another user's file in a shared folder
+        shutil.copyfile(part, path)
 
 
 def write_private(path: Path, content: bytes) -> None:

@@ -53,7 +53,7 @@ class PhaseCancellationGuard:
         if not self._has_warned:
             self._has_warned = True
             self._warnings.append(
-                f"{self._name}: mixing all channels would lose the audio of one;"
+                f"{self._name}: mixing the channels would cancel one of them;"
                 f" only channel {loudest + 1} is used"
             )
         return channels[:, [loudest] * self._num_channels]

@@ -72,7 +72,7 @@ _OTHER = {
     b"GIF8": "a picture, not audio",
     b"glTF": "an avatar, not audio; show it with --head of kouxing run or render",
     **dict.fromkeys((b"#!SILK", b"\2#!SILK"), "a SILK voice message; convert it to wav first"),
-    b"MThd": "a MIDI file: notes without audio; render it to wav with a synthesizer",
+    b"MThd": "a MIDI file, which contains notes, not audio; render it to wav with a synthesizer",
 }
 
 

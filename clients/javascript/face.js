@@ -206,7 +206,7 @@ export class KouxingFace extends HTMLElement {
     const [session, token] = ["session", "token"].map((name) => this.getAttribute(name) ?? "");
     const shapes = this.set === "faps" ? "" : this.set;
     const gateway = this.getAttribute("gateway") ?? location.origin;
-    let shown = null; // the session
+    let shown = { session: null };
     const handlers = {
       frame: (mediaTime, faps) => shapes || this.#player.addFrame(mediaTime, faps),
       rest: (faps) => shapes || this.#setRest(faps, []),
@@ -214,9 +214,10 @@ export class KouxingFace extends HTMLElement {
       restWeights: (weights, names) => this.#setRest(weights, names),
       sound: (mediaTime, samples) => this.#player.addSound(mediaTime, samples),
       session: (message) => {
-        const isOther = message.session !== shown;
-        shown = message.session;
-        if (shown !== null) this.#player.reset(isOther);
+        // A session whose epoch is lower is a new one with the name of an earlier one.
+        const isOther = message.session !== shown.session || message.epoch < shown.epoch;
+        shown = message;
+        if (shown.session !== null) this.#player.reset(isOther);
         this.dispatchEvent(new CustomEvent("session", { detail: message }));
       },
       phone: (message) => this.dispatchEvent(new CustomEvent("phone", { detail: message })),

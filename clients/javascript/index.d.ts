@@ -64,8 +64,8 @@ export class Viewer {
   /** Show another session; "" for the newest. */
   follow(session: string): void;
   /**
-   * Send a command of GATEWAY.md, such as { expressions: { joy: 0.5 } }. It waits for the first connection. It is
-   * dropped while the viewer is disconnected.
+   * Send a command of GATEWAY.md, such as { expressions: { joy: 0.5 } }. It waits while the viewer is
+   * connecting. It is dropped if that fails, or between two attempts.
    */
   send(command: object): void;
   close(): void;
@@ -96,7 +96,7 @@ export class Speaker {
   static open(gateway: string, options?: SpeakerOptions): Promise<Speaker>;
   readonly session: string;
   /** Send interleaved audio. Await it if audio arrives faster than real time. */
-  push(audio: Int16Array | Float32Array | Uint8Array | ArrayBuffer): Promise<void>;
+  push(audio: Int16Array | Float32Array | Uint8Array | ArrayBuffer | DataView): Promise<void>;
   /** Interrupt: drop audio whose face is not shown yet. The face returns to rest. */
   flush(): void;
   /** End the audio. Resolved when all is spoken and the session is closed; rejected if an error ends it first. */

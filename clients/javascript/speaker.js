@@ -11,7 +11,7 @@ const MAX_FLOAT = 8; // smaller values beyond 1 are clipped
 const MESSAGE_BYTES = 32000;
 const MAX_BUFFERED_BYTES = 1 << 18; // above it, push() waits
 const POLL_MS = 10;
-const REFUSED_CODE = 1008; // the last error has ended the session
+const POLICY_VIOLATION = 1008; // the last error has ended the session
 const NORMAL_CODES = [1000, 1005];
 
 /** A session that this program feeds with audio. */
@@ -19,6 +19,7 @@ export class Speaker {
   #socket;
   #encoding;
   #failure = null;
+  #isClosing = false;
   #closed; // a promise
 
   /** Use Speaker.open instead. */
@@ -34,8 +35,8 @@ export class Speaker {
     };
     this.#closed = new Promise((resolve) => {
       socket.onclose = ({ code, reason }) => {
-        if (code === REFUSED_CODE) this.#failure = lastError;
-        else if (!NORMAL_CODES.includes(code)) {
+        if (code === POLICY_VIOLATION) this.#failure = lastError;
+        else if (!this.#isClosing && !NORMAL_CODES.includes(code)) {
           this.#failure ??= new Error(reason || "the connection to the gateway is lost; open another session");
         }
         onClosed(this.#failure);
@@ -113,6 +114,7 @@ export class Speaker {
 
   /** Close the session immediately. */
   close() {
+    this.#isClosing = true;
     this.#socket.close();
   }
 

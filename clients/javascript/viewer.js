@@ -15,7 +15,7 @@ const EVENTS = [
  * @param fields of the query, without empty fields
  */
 export function socketUrl(gateway, path, fields) {
-  if (!/^(http|ws)s?:/.test(gateway)) {
+  if (!/^(http|ws)s?:/i.test(gateway)) {
     throw new TypeError(`${gateway} is not the address of a gateway, such as http://localhost:8080`);
   }
   const url = new URL(path, gateway);

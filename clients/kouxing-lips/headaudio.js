@@ -22,7 +22,8 @@ export class HeadAudio extends GainNode {
   /** Load the models of this package; HeadAudio's own model is ignored. */
   loadModel() {
     this.#loading ??= this.#load().catch((error) => {
-      this.#loading = null;
+      this.#lips?.close();
+      this.#lips = this.#loading = null;
       throw error;
     });
     return this.#loading;

@@ -33,7 +33,7 @@ export class LipSync extends EventTarget {
   /** Return the face at a time of the session, seconds; null before the first frame. */
   at(timeS: number): LipFrame | null;
   /**
-   * Follow the microphone. Rejects with a message for the user if it cannot be opened, and with an AbortError as
+   * Follow the microphone. Rejects with a message for the user if it cannot be opened, and with an AbortError in the same cases as
    * listenTo().
    */
   listenToMicrophone(constraints?: MediaTrackConstraints): Promise<void>;

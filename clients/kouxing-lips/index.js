@@ -4,6 +4,7 @@ import { FrameTrack } from "./frame-track.js";
 
 const SHOW_AFTER_S = 0.1; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
 const DEFAULT_SHAPES = ["arkit"];
+const OPTIONS = ["models", "phones", "context", "shapes", "expressiveness", "feeling", "delayMs"];
 const MAX_LATE_S = 0.5; // from the sound to its face
 const TELEPHONE_HZ = 8000;
 const MODELS = new URL("models/", import.meta.url);
@@ -55,6 +56,8 @@ export class LipSync extends EventTarget {
 
   /** Load the models and the worker. */
   static async create({ models = MODELS, phones = true, context = null, shapes = DEFAULT_SHAPES, ...options } = {}) {
+    const unknown = Object.keys(options).find((name) => !OPTIONS.includes(name));
+    if (unknown !== undefined) throw new TypeError(`unknown option ${unknown}; use ${OPTIONS.join(", ")}`);
     const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
     const lips = new LipSync(worker, context, { shapes, ...options });
     lips.#mayBeSlow = phones === "final";

@@ -49,12 +49,26 @@ test("sound can be turned on again after its worklet could not be loaded", async
   assert.equal(sound.state, "on");
 });
 
+test("sound can be turned on again after the sound card could not be opened", async () => {
+  const sound = new Sound(() => {});
+  const { AudioContext } = globalThis;
+  globalThis.AudioContext = class {
+    constructor() {
+      throw new Error("no device");
+    }
+  };
+  await assert.rejects(sound.turnOn(), /no device/);
+  globalThis.AudioContext = AudioContext;
+  await sound.turnOn();
+  assert.equal(sound.state, "on");
+});
+
 test("a recording that starts while sound is being turned on shares its sound card", async () => {
   let finishLoading;
   load = () => new Promise((resolve) => (finishLoading = resolve));
   const sound = new Sound(() => {});
   const started = Promise.all([sound.turnOn(), sound.tap()]);
-  setTimeout(() => finishLoading());
+  finishLoading();
   await started;
   assert.equal(contexts.length, 1);
   sound.untap();

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -35,6 +36,19 @@ def test_an_existing_output_needs_force(tmp_path: Path) -> None:
         check_output(path)
     check_output(path, force=True)
     assert path.read_text() == "mine"
+
+
+def test_a_file_that_cannot_be_renamed_over_is_overwritten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "mounted.mp4"
+    path.write_text("old")
+    busy = OSError(errno.EBUSY, os.strerror(errno.EBUSY))
+    monkeypatch.setattr(Path, "replace", mock.Mock(side_effect=busy))
+    with open_output(path) as file:
+        file.write(b"new")
+    assert path.read_text() == "new"
+    assert [*tmp_path.iterdir()] == [path]
 
 
 def test_checking_a_link_to_a_new_file_changes_nothing(tmp_path: Path) -> None:

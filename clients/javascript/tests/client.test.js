@@ -68,7 +68,7 @@ test("wrong options, addresses and audio are rejected", async () => {
   await assert.rejects(speaker.finish(), /looks like the start of a WAV file/);
 });
 
-test("a refused session is rejected with the reason", async () => {
+test("a rejected session reports the reason", async () => {
   await assert.rejects(Speaker.open(GATEWAY, { sampleRateHz: 1000 }), /sample_rate_hz must be/);
   await assert.rejects(Speaker.open("http://127.0.0.1:1"), /no gateway at .*kouxing run/);
 });
@@ -87,6 +87,7 @@ test("a session continues after an error, unless the gateway closes the connecti
     send(data) {
       this.sent.push(data);
     }
+    close() {}
     receive(message) {
       this.onmessage({ data: JSON.stringify(message) });
     }
@@ -112,6 +113,11 @@ test("a session continues after an error, unless the gateway closes the connecti
     await reopening;
     socket.onclose({ code: 1006, reason: "" }); // the gateway was killed
     assert.equal(texts.at(-1), "the connection to the gateway is lost; open another session");
+    const last = Speaker.open(GATEWAY, { closed: (error) => texts.push(error) });
+    socket.receive({ type: "opened", session: "voice" });
+    (await last).close();
+    socket.onclose({ code: 1006, reason: "" }); // the gateway did not answer the close
+    assert.equal(texts.at(-1), null);
   } finally {
     globalThis.WebSocket = WebSocket;
   }

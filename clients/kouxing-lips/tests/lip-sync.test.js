@@ -88,7 +88,7 @@ test.beforeEach(() => {
 
 /** Wait until the worker has received a request to open a session. */
 async function opening() {
-  while (FakeWorker.newest.messages.at(-1).type !== "open") await Promise.resolve();
+  while (FakeWorker.newest.messages.at(-1).type !== "open") await new Promise(setImmediate);
 }
 
 /** Answer the request to open a session. */
@@ -96,6 +96,11 @@ async function open() {
   await opening();
   FakeWorker.newest.answer("opened");
 }
+
+test("unknown options are rejected before the worker starts", async () => {
+  await assert.rejects(LipSync.create({ shape: ["arkit"] }), /unknown option shape; use models, .*shapes/);
+  assert.equal(FakeWorker.newest, null);
+});
 
 const aborted = { name: "AbortError" };
 
@@ -152,7 +157,7 @@ test("close() also works while the user is asked for the microphone", async () =
   assert.ok(!stream.track.isLive);
 });
 
-test("the source that was chosen last is followed, though an earlier one takes longer to open", async () => {
+test("the source that was chosen last is followed, even if an earlier one takes longer to open", async () => {
   const lips = await LipSync.create({ context });
   const first = lips.listenToMicrophone();
   const second = lips.listenTo(new FakeBuffer());
@@ -183,7 +188,7 @@ test("a buffer that is replaced does not report its end", async () => {
   assert.equal(numEnded, 1);
 });
 
-test("HeadAudio loads once, though it is asked twice", async () => {
+test("HeadAudio loads its models once if loadModel() is called twice", async () => {
   globalThis.GainNode = class extends FakeAudioNode {
     context = context;
     connect() {}

@@ -60,7 +60,7 @@ export class FaceRecording {
     return isQuiet ? "tooQuiet" : null;
   }
 
-  /** Return the key of the text why nothing can be learned from the recording, or null. */
+  /** Return the key of the text that says why nothing can be learned from the recording, or null. */
   problem() {
     if (this.#numImages === 0 || this.#frames.length < MIN_FACES * this.#numImages) return "noFace";
     if (this.#numLoud <= MIN_LOUD * this.#chunks.length) return "tooQuiet";

@@ -13,7 +13,7 @@ const CHINESE = {
   "a picture, not audio": "图片，不是声音",
   "an avatar, not audio; show it with --head of kouxing run or render": "虚拟形象，不是声音；请用 kouxing run 或 render 的 --head 显示它",
   "a SILK voice message; convert it to wav first": "SILK 语音消息，请先转成 wav",
-  "a MIDI file: notes without audio; render it to wav with a synthesizer": "MIDI 文件，只有音符没有声音；请先用合成器转成 wav",
+  "a MIDI file, which contains notes, not audio; render it to wav with a synthesizer": "MIDI 文件，只有音符没有声音；请先用合成器转成 wav",
   "cannot read audio: the file has only zeros; copy or record it again": "无法读取声音：文件里全是零，请重新复制或录制",
   "cannot read audio: the file is cut off before its index; copy or record it again": "无法读取声音：文件不完整，缺少索引；请重新复制或录制",
   "cannot read audio: the file is damaged or cut off ({reason}); copy it again": "无法读取声音：文件损坏或不完整（{reason}），请重新复制",
@@ -40,7 +40,7 @@ const CHINESE = {
   "the file cannot be read after {read} s; export it again": "{read} 秒之后无法读取，请重新导出",
   "cannot be read to the end: {reason}": "无法读到结尾：{reason}",
   "damaged near {place} s; the damaged part is silent": "{place} 秒附近已损坏，损坏部分无声",
-  "mixing all channels would lose the audio of one; only channel {channel} is used": "如混合所有声道，会丢失其中一个声道的声音，因此只用第 {channel} 声道",
+  "mixing the channels would cancel one of them; only channel {channel} is used": "如混合所有声道，会丢失其中一个声道的声音，因此只用第 {channel} 声道",
   "{share} of the samples are clipped; record at a lower level": "{share} 的采样过载失真，请降低录音音量",
   "{rate} Hz is too low for speech; use {least} Hz or more": "采样率 {rate} Hz 太低，请用 {least} Hz 以上",
   "NaN or infinite samples near {place} s; export the file again, for example as 16-bit PCM":

@@ -38,7 +38,7 @@ export class Sound {
     return this.#node !== null && this.#context.state === "running";
   }
 
-  /** Turn sound on. Without a click the browser may leave it blocked. Rejected if it cannot be opened. */
+  /** Turn sound on. Without a click the browser may leave it blocked. The promise is rejected if sound cannot be opened. */
   async turnOn() {
     this.isWanted = true;
     await this.#run();
@@ -46,7 +46,13 @@ export class Sound {
 
   async #run() {
     this.#opening ??= this.#open();
-    await this.#opening;
+    const opening = this.#opening;
+    try {
+      await opening;
+    } catch (error) {
+      if (this.#opening === opening) this.close();
+      throw error;
+    }
     // Do not wait: without a click, resume() neither succeeds nor fails.
     if (this.isWanted || this.#tap) this.#context?.resume().catch(() => {});
     if (this.#speaker) this.#speaker.gain.value = this.isWanted ? 1 : 0;
@@ -56,12 +62,7 @@ export class Sound {
   async #open() {
     const context = new AudioContext({ sampleRate: RATE_HZ, latencyHint: "interactive" });
     this.#context = context;
-    try {
-      await context.audioWorklet.addModule(new URL("sound-worklet.js", import.meta.url));
-    } catch (error) {
-      if (this.#context === context) this.close();
-      throw error;
-    }
+    await context.audioWorklet.addModule(new URL("sound-worklet.js", import.meta.url));
     if (this.#context !== context) return; // closed in the meantime
     this.#node = new AudioWorkletNode(context, "sound-player", { numberOfInputs: 0, outputChannelCount: [1] });
     this.#node.port.onmessage = ({ data }) => {
@@ -78,9 +79,10 @@ export class Sound {
 
   /** Release the sound card. turnOn() opens it again. */
   close() {
-    if (this.#context === null) return;
-    this.#context.onstatechange = null;
-    this.#context.close();
+    if (this.#context !== null) {
+      this.#context.onstatechange = null;
+      this.#context.close();
+    }
     this.#context = this.#opening = this.#node = this.#speaker = this.#anchor = null;
     this.#starts.reset();
     this.#onChange();
@@ -123,7 +125,7 @@ export class Sound {
     if (this.isPlaying) this.#node.port.postMessage({ mediaTime, samples });
   }
 
-  /** Forget all sound: that of another session has the same media times. */
+  /** Forget the queued sound. Another session's sound has the same media times. */
   clear() {
     this.#node?.port.postMessage({ clear: true });
   }

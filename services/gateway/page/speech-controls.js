@@ -78,7 +78,8 @@ export class SpeechControls {
     try {
       await this.#sound.turnOn();
     } catch (error) {
-      this.#handlers.error({ code: "sound", text: translate("soundFailed", { reason: error.message }) });
+      const text = isSecureContext ? translate("soundFailed", { reason: error.message }) : translate("soundInsecure");
+      this.#handlers.error({ code: "sound", text });
     }
   }
 

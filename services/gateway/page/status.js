@@ -5,7 +5,7 @@ import { element, setText } from "./elements.js";
 import { translate } from "./language.js";
 import { SILENT_DB } from "./level.js";
 
-const TOAST_MS = 8000; // for which a toast is shown
+const TOAST_MS = 8000; // how long a toast is shown
 const SHOWN_AFTER_MS = 1000; // shorter faults are not shown
 
 /** The state that the gateway reports: the connection, the session that is shown, missing services. */
@@ -36,7 +36,8 @@ export class GatewayState {
 
   /** Process a "session" message; return { isRestart, isOther }: whether the epoch or session changed. */
   setSession({ session, epoch, sample, lip_model, acoustic }) {
-    const isOther = session !== this.session;
+    // A session whose epoch is lower is a new one with the name of an earlier one.
+    const isOther = session !== this.session || epoch < this.epoch;
     const isRestart = !isOther && session !== null && epoch > this.epoch;
     this.session = session;
     this.epoch = epoch;

@@ -23,6 +23,10 @@ export const TEXTS = {
   learn: { en: "Learn my mouth", zh: "学我的口型" },
   learnHelp: { en: "Teach the head to move its lips like yours", zh: "让头像学会你的口型" },
   sound: { en: "Sound", zh: "声音" },
+  soundInsecure: {
+    en: "Sound needs https. Open this page at an https address or at http://localhost.",
+    zh: "播放声音需要 https。请用 https 地址或 http://localhost 打开本页。",
+  },
   soundFailed: { en: "The sound could not be turned on: {reason}. Reload the page.", zh: "无法打开声音：{reason}。请重新加载页面。" },
   turnOnSound: { en: "Turn on sound", zh: "打开声音" },
 
@@ -238,8 +242,8 @@ export const TEXTS = {
   cameraUnplugged: { en: "The camera or the microphone was unplugged. Plug it in and try again.", zh: "摄像头或麦克风断开了。请接上后重试。" },
   trackerFailed: { en: "Face tracking does not work in this browser: {reason}", zh: "此浏览器无法跟踪面部：{reason}" },
   gatewaySilent: {
-    en: "The gateway does not answer. Start it with “kouxing run”, then press Send again.",
-    zh: "网关没有应答。请运行 kouxing run 后重发。",
+    en: "The gateway does not answer. Start it with “kouxing run” and try again.",
+    zh: "网关没有应答。请运行 kouxing run 后重试。",
   },
 };
 
