@@ -156,7 +156,7 @@ class ControlService(Service):
 
     def _open_session(self, message: OpenSession, sender: Peer) -> Message | None:
         known = self._sessions.find_by_request(message, sender)
-        if known is not None and known.restored:
+        if known is not None and known.restored_epoch:
             return known.opened_message(self.endpoints["events"])
         if known is not None and not self._commands.is_open(known.client.connection):
             known.client = sender  # the client has reconnected
@@ -288,8 +288,10 @@ class ControlService(Service):
                 record
                 for record in self._sessions
                 if record.name not in heartbeat.sessions
-                # it has another session with this name, whose end it missed
-                or not (record.restored or heartbeat.instance in record.started)
+                # it missed a move, or has another session with this name, whose end it missed
+                or not (
+                    record.epoch == record.restored_epoch or heartbeat.instance in record.started
+                )
             ]
         for record in missed_start:
             self._commands.send(record.start_message(time.monotonic()), to=sender)

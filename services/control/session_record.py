@@ -34,7 +34,7 @@ class SessionRecord:
     epoch: int = 1
     announced: bool = False  # whether the client has the endpoints
     moved: bool = False  # whether it was placed again and the client is not notified yet
-    restored: bool = False  # whether an earlier control process opened it
+    restored_epoch: int = 0  # its epoch when an earlier control process stopped; 0: not restored
     speaking: bool = False
     speech_time: int = 0  # media time at which the newest speech started
     next_sequence: int = 1  # first audio message that a replacement recognizer would need

@@ -180,7 +180,7 @@ class SessionTable:
             lost={*workers.values()} - running,
             epoch=start.epoch,
             announced=True,
-            restored=True,
+            restored_epoch=start.epoch,
             final_until=start.final_until,
         )
         self._add(record, now_s)

@@ -157,9 +157,9 @@ def test_repeats_session_moved_to_the_client(
     assert others == [first, first]
 
 
-@pytest.mark.parametrize("is_moved", [False, True])
+@pytest.mark.parametrize("missed", ["move", "move of a restored session", "end"])
 def test_an_observer_that_was_lost_learns_what_it_missed(
-    harness: ControlHarness, client: Socket, *, is_moved: bool
+    harness: ControlHarness, client: Socket, missed: str
 ) -> None:
     observer = harness.buses[0].connect_dealer(harness.control.endpoints["commands"])
     harness.services.append(observer)
@@ -168,16 +168,20 @@ def test_an_observer_that_was_lost_learns_what_it_missed(
     )
     observer.send(lamp)
     harness.receive(observer)
-    client.send(OpenSession(session="mine", request="1"))
-    harness.step_until(lambda: client.wait(0.0))
-    (opened,) = harness.receive(client)
-    assert isinstance(opened, SessionOpened)
+    if missed == "move of a restored session":
+        harness.services[0].send(report())
+        assert isinstance(harness.receive(observer)[0], StartSession)
+    else:
+        client.send(OpenSession(session="mine", request="1"))
+        harness.step_until(lambda: client.wait(0.0))
+        (opened,) = harness.receive(client)
+        assert isinstance(opened, SessionOpened)
     harness.control._on_service_lost("lamp", "no heartbeat")
     record = harness.control._sessions.find("mine")
-    if is_moved:
+    if missed.startswith("move"):
         assert harness.control._sessions.move(record, time.monotonic())
     else:  # another session with the same name
-        client.send(CloseSession(session="mine", token=opened.token, request="2"))
+        client.send(CloseSession(session="mine", token=record.token, request="2"))
         harness.receive(client)
         client.send(OpenSession(session="mine", request="3"))
         harness.step_until(lambda: client.wait(0.0))
