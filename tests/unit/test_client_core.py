@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 from kouxing_client import SHAPE_NAMES, FapFrame, KouxingError, Phone
 from kouxing_client.audio import ANSWER_LIMITS_S
-from kouxing_client.core import RETRY_S, ClientCore
+from kouxing_client.core import MAX_FAILED_OPENINGS, RETRY_S, ClientCore
 from kouxing_client.inbox import Inbox
 from kouxing_client.messages import EndOfFaps, Joined
 from kouxing_client.reach import NO_LISTENER
@@ -279,6 +279,17 @@ def test_closes_a_session_that_opens_after_its_request_has_failed() -> None:
     kind, closing = harness.commands.sent[-1]
     assert (kind, closing["session"], closing["token"]) == ("close-session", "s", "t")
     assert len(harness.core.sessions) == 1
+
+
+def test_remembers_a_limited_number_of_failed_openings() -> None:
+    harness = CoreHarness()
+    for number in range(MAX_FAILED_OPENINGS + 1):
+        harness.core.open_session({"sample_rate_hz": 16000, "session": f"late-{number}"})
+    requests = [fields["request"] for _, fields in harness.commands.sent[1:]]
+    harness.pass_time(10.1)
+    for request in requests[:2]:  # only the oldest one is forgotten
+        harness.commands.answer("session-opened", request=request, **OPENED)
+    assert [kind for kind, _ in harness.commands.sent].count("close-session") == 1
 
 
 def test_events_can_be_closed_twice() -> None:

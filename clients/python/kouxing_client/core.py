@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import secrets
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
 
 RETRY_S = 1.0  # interval between attempts of an unanswered request
+MAX_FAILED_OPENINGS = 100  # requests
 WATCHED_TOPICS = ("event", "session-moved")  # topics that control publishes about a session
 EVENTS = Decoders(Event)
 T = TypeVar("T")
@@ -63,7 +65,8 @@ class ClientCore:
         self._start_s = start_s
         self._has_started = False  # control has sent something
         self._requests: dict[str, _Request] = {}
-        self._failed_openings: set[str] = set()  # requests that control may still fulfill
+        # Newest requests that failed, but that control may still fulfill
+        self._failed_openings: deque[str] = deque(maxlen=MAX_FAILED_OPENINGS)
         self._refused_s = math.inf  # when control started to reject this key
         self._is_diagnosing = False  # searching for the reason why control does not answer
         self._inboxes: dict[str, list[Inbox]] = {}  # by session
@@ -201,7 +204,7 @@ class ClientCore:
             if self._sockets.now_s > request.end_s or is_unanswerable:
                 self._requests.pop(name).answer.set_exception(failure)
                 if kind_of(request.parts) == "open-session":
-                    self._failed_openings.add(name)
+                    self._failed_openings.append(name)
             request.is_checked = self._sockets.now_s > request.start_s
         if self._is_refused():
             for session in self.sessions:
