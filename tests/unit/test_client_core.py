@@ -249,20 +249,33 @@ def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
     assert "rejects this client" in str(inbox.failure)
 
 
-def test_a_failing_function_of_the_program_does_not_keep_other_sessions_open() -> None:
+@pytest.mark.parametrize("reason", ["closed by control", "closed by the program", "last frame"])
+def test_a_failing_function_of_the_program_does_not_keep_other_sessions_open(reason: str) -> None:
     harness = CoreHarness()
 
     def fail(_result: object) -> None:
         raise ValueError("a bug")
 
     inbox = Inbox(None)
-    failing = Subscription(harness.session, (FapFrame,), "", inbox, fail)
+    failing = Subscription(harness.session, (FapFrame, Phone), "", inbox, fail)
     harness.session.subscribe(failing)
     other = harness.subscribe()
-    frame = FapFrame(session="s", epoch=1, sequence=1, packed_values=bytes(272), mask=bytes(9))
-    harness.sockets.at("faps 1")[0].unread.append(frame)
-    harness.core.close(KouxingError("the client failed"))
+    if reason == "last frame":
+        harness.sockets.publish("faps 1", EndOfFaps(session="s", epoch=1, sequence=1))
+    phone = Phone(
+        session="s",
+        epoch=1,
+        sequence=1,
+        index=0,
+        symbol="a",
+        duration=1600,
+        confidence=1.0,
+        final=True,
+    )
+    harness.sockets.at("phones 1")[0].unread.append(phone)
+    harness.session.end(None if reason == "closed by the program" else KouxingError(reason))
     assert inbox.is_over
+    assert "on_result failed: ValueError('a bug')" in str(inbox.failure)
     assert other.is_over
     assert harness.session.is_over
 

@@ -104,9 +104,9 @@ class Subscription:
         try:
             self.follower.drain()
         except Exception as error:  # of ``on_result``; other subscriptions must also end
-            if failure is None:
-                failure = KouxingError(f"on_result failed: {error!r}")
-                failure.__cause__ = error
+            failure = KouxingError(f"on_result failed: {error!r}")
+            failure.__cause__ = error
+            self.inbox.end(failure)  # even if the last frame has arrived
         self.follower.close()
         self.inbox.end(None if self.follower.has_ended else failure)
         if not self.joined.done():
