@@ -1,5 +1,6 @@
 """A client's audio: conversion to PCM; what it sends, resends and drops."""
 
+import ctypes
 from array import array
 
 import numpy as np
@@ -70,6 +71,9 @@ INTEGERS = array("h", [0, 16384, -32767, 32767])
         FLOATS,
         np.array(FLOATS, np.float32).reshape(2, 2),
         np.array(INTEGERS, np.int16),
+        (ctypes.c_int16 * 4)(*INTEGERS),
+        (ctypes.c_float * 4)(*FLOATS),
+        np.frombuffer(b"-" + INTEGERS.tobytes(), np.int16, offset=1),
     ],
     ids=lambda audio: type(audio).__name__,
 )
@@ -83,6 +87,7 @@ def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
     "audio",
     [
         [0, -16384, 32768],
+        [10**400],
         np.array([0, 16384], np.int32),
         np.array([0.0, -900.0], np.float32),
         np.array([np.nan, 0.5], np.float32),

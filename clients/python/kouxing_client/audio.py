@@ -14,6 +14,7 @@ from kouxing_client.messages import MEDIA_RATE_HZ, Fields
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 _CODES = {"s16le": "h", "f32le": "f"}
+_NATIVE_ORDER = "=<" if sys.byteorder == "little" else "=>"  # prefixes of a buffer's format
 _FULL_SCALE = 32767
 _EXPECTED = "audio must be 16-bit integers (array type int16), or floats within ±1"
 MAX_FLOAT = 8.0  # smaller values beyond 1 are clipped
@@ -52,10 +53,11 @@ def to_pcm(audio: Any, encoding: str) -> bytes:
     except TypeError:
         view = memoryview(_to_array(audio))
     flat = memoryview(view.tobytes())  # a view with any number of dimensions is flattened
-    if view.format in ("B", "b", "c"):
+    kind = view.format.lstrip(_NATIVE_ORDER)
+    if kind in ("B", "b", "c"):
         return flat.tobytes()
     try:
-        numbers = flat.cast(view.format)  # type: ignore[call-overload]
+        numbers = flat.cast(kind)  # type: ignore[call-overload]
     except ValueError:  # such as the other byte order, or complex numbers
         raise KouxingError(
             f"{_EXPECTED}, in this machine's byte order, not the format {view.format!r}"
@@ -70,6 +72,8 @@ def _to_array(numbers: Iterable[float]) -> array[int] | array[float]:
             return array("h", listed)
         except (TypeError, OverflowError):  # floats, or larger integers
             return array("d", listed)
+    except OverflowError:
+        raise KouxingError(f"{_EXPECTED}, not larger integers") from None
     except TypeError:
         raise KouxingError(
             f"audio must be bytes or numbers, not {type(numbers).__name__}"
