@@ -136,13 +136,21 @@ async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
 
 
 @async_test
-async def test_does_not_learn_from_a_recording_that_arrives_after_close(tmp_path: Path) -> None:
-    hanging = fake_learner(HANG)
+async def test_does_not_learn_from_a_recording_that_arrives_after_close(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hanging, is_receiving = fake_learner(HANG), asyncio.Event()
+    receive = hanging.answer
+
+    async def answer(request: web.Request) -> web.StreamResponse:
+        is_receiving.set()
+        return await receive(request)
+
+    monkeypatch.setattr(hanging, "answer", answer)
 
     async def record() -> AsyncIterator[bytes]:
         yield str(tmp_path / "process").encode()
-        while not hanging._is_busy:
-            await asyncio.sleep(0.02)
+        await is_receiving.wait()
         hanging.close()
 
     async with serve(hanging) as post:
