@@ -76,8 +76,7 @@ def open_audio(
     is read as raw samples. ``raw``: the content is raw samples of this format.
 
     Raises ``UserError`` if the file is missing, empty, too large, not audio, not raw samples as
-    stated, or below 8 kHz. While
-    reading, raises it if samples are not finite.
+    stated, or below 8 kHz. While reading, raises it if samples are not finite.
     """
     file = sys.stdin.buffer if path == _PIPE else open_file(path, MAX_FILE_BYTES, pipe=True)
     is_pipe = path == _PIPE or path.is_fifo()

@@ -118,7 +118,7 @@ def check_results(classes: Sequence[object], shape_set: str) -> None:
             raise KouxingError(f"results() expects classes such as FapFrame or Phone, not {cls!r}")
     if not classes or (Shapes in classes and not shape_set):
         raise KouxingError(
-            "results() needs classes, such as results(FapFrame, Phone); Shapes also need the name"
+            "results() needs classes, such as results(FapFrame, Phone); Shapes also needs the name"
             " of a set, such as shapes='arkit'"
         )
 
