@@ -13,6 +13,14 @@ class UserError(Exception):
     """
 
 
+class StartFailure(UserError):
+    """A fault that keeps a service from serving a session; ``code`` is for the client."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
 class Rejected(Exception):
     """A message that a service rejects. The sender receives these fields in ``error``."""
 

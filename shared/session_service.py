@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 from kouxing_client.messages import Message
 
-from kouxing.shared.errors import Rejected, UserError
+from kouxing.shared.errors import Rejected, StartFailure, UserError
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
@@ -20,8 +20,9 @@ class SessionService(Service):
     def start_session(self, start: StartSession) -> bool:
         """Serve a session. Return False if ``session_started`` is called later.
 
-        Raises ``Rejected`` if this service cannot serve the session, or ``UserError`` if it cannot
-        load the models of the session's language. Control then rejects the session.
+        Raises ``Rejected`` if this service may not serve the session, or ``UserError`` if it cannot
+        because of a fault. Control then rejects the session, with the code of a ``StartFailure`` or
+        with ``no-service``.
         """
         return True
 
@@ -75,9 +76,10 @@ class SessionService(Service):
             LOG.info(rejection.text, extra={"session": start.session})
             self._reject(start, rejection)
         except UserError as error:
+            code = error.code if isinstance(error, StartFailure) else ErrorCode.NO_SERVICE
             self.warn("start", str(error), start.session)
-            self.publish_event(EventName.ERROR, start.session, f"{ErrorCode.BAD_LANGUAGE}: {error}")
-            self._reject(start, Rejected(ErrorCode.BAD_LANGUAGE, str(error)))
+            self.publish_event(EventName.ERROR, start.session, f"{code}: {error}")
+            self._reject(start, Rejected(code, str(error)))
 
     def _reject(self, start: StartSession, rejection: Rejected) -> None:
         self.send_to_control(

@@ -6,8 +6,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
+from kouxing.shared.errors import StartFailure, UserError
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.session import ErrorCode
 
 
 class PendingSessions:
@@ -26,7 +28,7 @@ class PendingSessions:
     def add(self, start: StartSession) -> bool:
         """Queue a session whose model is not loaded yet; return whether it was queued.
 
-        Raises ``UserError`` if no model has the language.
+        Raises ``StartFailure`` if no model has the language.
         """
         language = start.facts.language
         if language in (None, self._language):
@@ -35,7 +37,10 @@ class PendingSessions:
             model = self._models[language] = self._executor.submit(_load, language)
             model.add_done_callback(lambda _: self._on_loaded())
         if self._models[language].done():
-            self._models[language].result()
+            try:
+                self._models[language].result()
+            except UserError as error:
+                raise StartFailure(ErrorCode.BAD_LANGUAGE, str(error)) from error
             return False
         self._starts[start.session] = start
         return True

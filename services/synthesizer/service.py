@@ -31,7 +31,7 @@ from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, Synthesiz
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
-from kouxing.shared.errors import Rejected
+from kouxing.shared.errors import Rejected, StartFailure, UserError
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
@@ -109,7 +109,12 @@ class SynthesizerService(SessionService):
                 text = f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}"
                 raise Rejected(ErrorCode.BAD_FACE, text)
             settings = self._known_settings(start.session, start.opening.face)
-            face = self._new_face(start, settings)
+            try:
+                face = self._new_face(start, settings)
+            except UserError as error:
+                is_default = settings.lip_model in (None, self._config.lips)  # loaded at startup
+                code = ErrorCode.BAD_LANGUAGE if is_default else ErrorCode.BAD_FACE
+                raise StartFailure(code, str(error)) from error
             session = SynthesizerSession(
                 start, face, self._input, self._faps, self._config.max_lag_s
             )

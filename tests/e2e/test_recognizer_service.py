@@ -204,3 +204,16 @@ def test_a_session_is_rejected_if_its_model_cannot_be_loaded(
     assert (error.session, error.request) == (UNPACED.session, UNPACED.request)
     assert (error.code, error.text) == ("bad-language", "no model for german")
     assert not service._sessions
+
+
+def test_a_session_is_rejected_if_the_recognizer_cannot_connect_to_its_synthesizer(
+    service: Recognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = list[Message]()
+    monkeypatch.setattr(service, "send_to_control", sent.append)
+    start = replace(UNPACED, endpoints={**UNPACED.endpoints, "phone_input": "nowhere"})
+    service._on_start_session(start, Peer())
+    (error,) = sent
+    assert isinstance(error, Error)
+    assert error.code == "no-service"
+    assert "nowhere" in error.text

@@ -5,15 +5,19 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import pytest
-from kouxing_client.messages import EndOfFaps, FapFrame
+from kouxing_client.messages import EndOfFaps, Event, FapFrame, Message
 
+from kouxing.services.synthesizer import service as synthesizer_service
 from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED_EVENTS, SynthesizerService
 from kouxing.shared.clock import to_samples
+from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
+from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import AudioState, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port
@@ -71,6 +75,29 @@ def test_ignores_and_reports_unknown_face_settings(
     assert events == [("error", "gap", text)]
     service.receive_progress("gap", 1, 1.0)
     assert {tuple(frame.shapes) for frame in service.frames("gap")} == {("vrm",)}
+
+
+@pytest.mark.parametrize(
+    ("lip_model", "code"), [(SynthesizerConfig().lips, "bad-language"), ("ferguson", "bad-face")]
+)
+def test_a_session_is_rejected_if_its_lip_model_cannot_be_loaded(
+    service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch, lip_model: str, code: str
+) -> None:
+    def fail(language: str, name: str) -> LipModel:
+        raise UserError(f"{name} cannot be loaded for {language}")
+
+    sent: list[Message] = []
+    monkeypatch.setattr(synthesizer_service, "load_lip_model", fail)
+    monkeypatch.setattr(service, "send_to_control", sent.append)
+    start = replace(START.with_face(FaceSettings(lip_model=lip_model)), session="new")
+    service._on_start_session(start, Peer())
+    event, error = sent
+    assert isinstance(event, Event)
+    assert event.detail.startswith(code)
+    assert isinstance(error, Error)
+    assert error.code == code
+    assert error.text.startswith(f"{lip_model} cannot be loaded for ")
+    assert "new" not in service._sessions
 
 
 def test_a_gap_does_not_delay_other_sessions(service: RecordingSynthesizer) -> None:
