@@ -9,6 +9,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import aiohttp
 import pytest
@@ -260,7 +261,9 @@ async def test_ends_answers_that_are_never_read(monkeypatch: pytest.MonkeyPatch)
 
 CLIENTS: dict[str, Callable[[float], Handler]] = {
     "viewers": lambda share: (
-        ViewerHandler(OpenWebSockets(), share, Metrics(), *(UNUSED,) * 3).serve
+        ViewerHandler(
+            OpenWebSockets(), share, Metrics(), Mock(session=""), UNUSED, on_connected=Mock()
+        ).serve
     ),
     "microphones": lambda share: MicrophoneHandler(OpenWebSockets(), share, UNUSED).serve,
 }
