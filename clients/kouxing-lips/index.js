@@ -1,5 +1,6 @@
 // Lip sync in a page, from microphone, media or PCM to faces. All sound stays on the device.
 
+import { checkOptions } from "./engine/options.js";
 import { FrameTrack } from "./frame-track.js";
 
 const SHOW_AFTER_S = 0.1; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
@@ -56,8 +57,7 @@ export class LipSync extends EventTarget {
 
   /** Load the models and the worker. */
   static async create({ models = MODELS, phones = true, context = null, shapes = DEFAULT_SHAPES, ...options } = {}) {
-    const unknown = Object.keys(options).find((name) => !OPTIONS.includes(name));
-    if (unknown !== undefined) throw new TypeError(`unknown option ${unknown}; use ${OPTIONS.join(", ")}`);
+    checkOptions(options, OPTIONS);
     const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
     const lips = new LipSync(worker, context, { shapes, ...options });
     lips.#mayBeSlow = phones === "final";

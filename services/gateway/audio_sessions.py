@@ -80,7 +80,7 @@ class AudioSession:
 
 
 class AudioClient:
-    """Opens sessions as a client of control. If ``key`` is None, nothing is encrypted."""
+    """Opens sessions as a client of control. Without a ``key``, nothing is encrypted."""
 
     def __init__(self, control: str, key: Key | None, warn: Warn) -> None:
         self._control = control

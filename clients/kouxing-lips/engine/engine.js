@@ -4,6 +4,7 @@ import { Face } from "./face.js";
 import { BlockScorer } from "./block-scorer.js";
 import { LightScorer } from "./light-scorer.js";
 import { loadModel } from "./model.js";
+import { checkOptions } from "./options.js";
 import { PhoneRecognizer } from "./phone-recognizer.js";
 import { Resampler } from "./resampler.js";
 import { ShapeSet } from "./shapes.js";
@@ -30,8 +31,7 @@ export class LipEngine {
 
   /** Use LipEngine.load instead. */
   constructor(model, { sampleRateHz = 16000, shapes = DEFAULT_SHAPES, expressiveness, feeling, delayMs, ...unknown } = {}) {
-    const [name] = Object.keys(unknown);
-    if (name !== undefined) throw new TypeError(`unknown option ${name}; use ${OPTIONS.join(", ")}`);
+    checkOptions(unknown, OPTIONS);
     if (!Array.isArray(shapes)) throw new TypeError('shapes must be an array of names, such as ["arkit"]');
     const { defaults, constants } = model;
     const delayS = inRange("delayMs", delayMs ?? 1000 * defaults.delayS, 0, MAX_DELAY_MS) / 1000;
