@@ -26,12 +26,13 @@ class Placement:
         language: str | None = None,
         *,
         min_room: int = 0,
+        excluded: Collection[str] = (),
     ) -> dict[str, str]:
         """Return a worker for each endpoint that a client or a chosen worker needs.
 
         A worker that is chosen for one endpoint also serves its other endpoints. Workers in
-        ``kept`` stay. If ``language`` is set, the workers must have this language. A moved session
-        needs no room.
+        ``kept`` stay, and those in ``excluded`` are not chosen. If ``language`` is set, the workers
+        must have this language. A moved session needs no room.
 
         Raises ``Rejected`` if no ready worker provides an endpoint, or no worker has room
         for ``min_room`` sessions.
@@ -41,7 +42,7 @@ class Placement:
         for endpoint in needed:  # grows
             placed = {*kept.values(), *workers.values()}
             instance = kept.get(endpoint) or self._choose(
-                endpoint, placed, now_s, language, min_room=min_room
+                endpoint, placed, now_s, language, min_room=min_room, excluded=excluded
             )
             workers[endpoint] = instance
             needs = self._registry[instance].heartbeat.needs
@@ -58,8 +59,13 @@ class Placement:
         language: str | None,
         *,
         min_room: int,
+        excluded: Collection[str],
     ) -> str:
-        providers = self._registry.providers(endpoint)
+        providers = {
+            name: record
+            for name, record in self._registry.providers(endpoint).items()
+            if name not in excluded
+        }
         names = [name for name, record in providers.items() if _can_serve(record, language)]
         for instance in sorted(placed):
             if instance in names:

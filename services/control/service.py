@@ -325,12 +325,16 @@ class ControlService(Service):
             self._lifecycle.announce_if_started(record)
 
     def _on_start_rejected(self, error: Error, instance: str) -> None:
-        """Reject a session that a service rejected, unless its client already uses it."""
+        """Reject a session that a service rejected, or move it to another worker."""
         record = self._sessions.get(error.session)
-        if record is None or record.announced or error.request != record.start_request:
+        if record is None or error.request != record.start_request:
             return
-        if instance in record.waiting_for:
+        if instance not in record.waiting_for:
+            return
+        if not record.announced:
             self._lifecycle.reject(record, error)
+        elif instance in record.workers.values():
+            self._lifecycle.move_from(record, instance, error)
 
     def _on_speech(self, speech: Speech, instance: str) -> None:
         record = self._sessions.get(speech.session)

@@ -96,6 +96,14 @@ class SessionLifecycle:
         if self._sessions.move(record, time.monotonic()):
             self.send_start(record, record.waiting_for - record.deferred)
 
+    def move_from(self, record: SessionRecord, instance: str, error: Error) -> None:
+        """Move a session away from a worker that rejected it; end it if no other is free."""
+        record.rejected_by.add(instance)
+        record.lost.add(instance)
+        self.move(record)
+        if record.lost:
+            self.end(record, f"{instance} cannot serve the session: {error.text}")
+
     def reject(self, record: SessionRecord, error: Error) -> None:
         """Reject a session that is not announced to its client yet, and end it."""
         request = record.opening.request
@@ -150,6 +158,7 @@ class SessionLifecycle:
     def _announce_move(self, record: SessionRecord) -> None:
         moved = record.moved_message()
         record.moved, record.resume_sequence = False, None
+        record.rejected_by.clear()
         self._commands.send(moved, to=record.client)
         self._events.send(moved)
         self.publish(EventName.SESSION_MOVED, record.name)

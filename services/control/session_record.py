@@ -30,6 +30,7 @@ class SessionRecord:
     waiting_for: set[str]  # instances that have not started the session yet
     deferred: set[str] = field(default_factory=set)  # part of `waiting_for`, notified last
     lost: set[str] = field(default_factory=set)  # lost workers
+    rejected_by: set[str] = field(default_factory=set)  # workers that rejected the current move
     started: set[str] = field(default_factory=set)  # instances that have started the session
     epoch: int = 1
     announced: bool = False  # whether the client has the endpoints

@@ -253,12 +253,16 @@ class SessionTable:
     def move(self, record: SessionRecord, now_s: float) -> bool:
         """Place a session again after it lost workers; return whether that succeeded.
 
+        Workers that rejected this move are not chosen.
+
         The recognizer is notified last. By then the synthesizer has reported its final phones, or a
         new synthesizer has the session, so the recognizer can resume the face there.
         """
         remaining = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:
-            workers = self._placement.place(remaining, now_s, record.facts.language)
+            workers = self._placement.place(
+                remaining, now_s, record.facts.language, excluded=record.rejected_by
+            )
         except Rejected:
             return False
         record.deferred = {workers["audio"]}

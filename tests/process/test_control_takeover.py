@@ -157,6 +157,32 @@ def test_repeats_session_moved_to_the_client(
     assert others == [first, first]
 
 
+@pytest.mark.parametrize("num_free", [1, 2])
+def test_a_session_leaves_a_worker_that_rejects_its_move(
+    harness: ControlHarness, client: Socket, num_free: int
+) -> None:
+    bus = harness.buses[1]
+    free = [bus.connect_dealer(harness.control.endpoints["commands"]) for _ in range(num_free)]
+    for number, synthesizer in enumerate(free):
+        heartbeat = make_heartbeat("synthesizer", f"tcp://127.0.0.1:{10 + number}")
+        synthesizer.send(replace(heartbeat, instance=f"synthesizer-{number}"))
+        harness.receive(synthesizer)
+    client.send(OpenSession(session="mine", request="1"))
+    harness.step_until(lambda: client.wait(0.0))
+    harness.receive(client)
+    record = harness.control._sessions.find("mine")
+    harness.control._on_service_lost("synthesizer", "no heartbeat")
+    for epoch, synthesizer in enumerate(free, 2):
+        (start,) = harness.receive(synthesizer)
+        assert isinstance(start, StartSession)
+        assert start.epoch == epoch
+        synthesizer.send(
+            Error(session="mine", request=start.request, code="no-service", text="no model")
+        )
+    harness.step_until(lambda: harness.control._sessions.get("mine") is None)
+    assert record.rejected_by == {f"synthesizer-{number}" for number in range(num_free)}
+
+
 @pytest.mark.parametrize("missed", ["move", "move of a restored session", "end"])
 def test_an_observer_that_was_lost_learns_what_it_missed(
     harness: ControlHarness, client: Socket, missed: str
