@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from kouxing.services.lip_models import lip_model_info, lip_model_names
-from kouxing.shared.config import BoundEndpoint, KnownNames
+from kouxing.shared.config import BoundEndpoint, KnownNames, ValueHint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig, LiveConfig
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
@@ -20,6 +20,12 @@ def _delay_ms(values: Mapping[str, Any]) -> float:
         return lip_model_info(DEFAULT_LIP_MODEL).delay_ms
 
 
+def _check_milliseconds(value: float) -> float:
+    if 0.0 < value < 1.0:  # surely seconds
+        raise ValueError
+    return value
+
+
 class SynthesizerConfig(FaceConfig, LiveConfig):
     """The synthesizer's configuration keys."""
 
@@ -31,7 +37,12 @@ class SynthesizerConfig(FaceConfig, LiveConfig):
     """FAP frames per second."""
     lips: Annotated[str, KnownNames(lip_model_names)] = DEFAULT_LIP_MODEL
     """Default lip model. A client can choose another one for its session."""
-    delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(default_factory=_delay_ms)
+    delay_ms: Annotated[
+        float,
+        Field(ge=0, le=300),
+        AfterValidator(_check_milliseconds),
+        ValueHint("0, or a number of milliseconds from 1 to 300"),
+    ] = Field(default_factory=_delay_ms)
     """Delay between a frame's audio and the frame, in steps of 20 ms. The default is 160 if
     lips is dynamic-visemes or ferguson."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4

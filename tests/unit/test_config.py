@@ -97,6 +97,7 @@ def test_a_default_may_depend_on_another_key() -> None:
         ("recognizer.control", "here", "an endpoint, tcp://HOST:PORT"),
         ("recognizer.insecure", "yes", "true or false"),
         ("synthesizer.frame_rate_hz", "nan", "a number from 10 to 240"),
+        ("synthesizer.delay_ms", "0.06", "0, or a number of milliseconds from 1 to 300"),
         ("driver.view", "hologram", "one of auto, window, none"),
         ("recognizer.acoustic", "bloks", "or a file such as model.npz; did you mean blocks?"),
         ("driver.head", "womam", "or a file (.glb, .gltf, .vrm or .npz); did you mean woman?"),
