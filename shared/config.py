@@ -54,7 +54,6 @@ PREFIX = "KOUXING_"
 _MAX_FILE_BYTES = 64 << 10
 _MAX_DOTS = 1000  # per line; tomllib's memory grows with the square of a key's parts
 COMMON = "common"  # table of the keys of all services
-_OWN_KEYS = {"instance"}  # keys of every service that [common] lacks: no two values may be equal
 _DEFAULT = "default"  # origin of a value that no source sets
 
 
@@ -64,6 +63,11 @@ class BindAddress(Enum):
     ENDPOINT = auto()  # tcp://HOST:PORT
     HOST = auto()
     PORT = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Unique:
+    """Marks a key that is not in ``[common]``, because each service needs its own value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +151,7 @@ BoundEndpoint = Annotated[Endpoint, BindAddress.ENDPOINT]
 Host = Annotated[str, AfterValidator(_check_host), ValueHint("a host name or address")]
 BoundHost = Annotated[Host, BindAddress.HOST]
 BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
+InstanceName = Annotated[str, Field(max_length=128), ValueHint("up to 128 characters"), Unique()]
 LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_to_lower)]
 TextList = Annotated[tuple[str, ...], BeforeValidator(_split_text)]
 """A list in a TOML file; elsewhere a text with spaces between the items."""
@@ -171,7 +176,7 @@ class ServiceConfig(BaseModel):
     """Accept unencrypted connections from anyone. docs/security.md describes the risks."""
     log_level: LogLevel = "info"
     """Lowest level of log messages to write."""
-    instance: Annotated[str, Field(max_length=128), ValueHint("up to 128 characters")] = ""
+    instance: InstanceName = ""
     """Name of this process, different for each process. If empty, a name is generated."""
     metrics: Annotated[
         str, AfterValidator(_check_metrics), ValueHint("HOST:PORT such as 127.0.0.1:9100, or empty")
@@ -356,7 +361,13 @@ class Settings:
 def _fields(table: str, config_type: type[ServiceConfig]) -> Mapping[str, FieldInfo]:
     """Return the keys of a table."""
     fields = config_type.model_fields
-    return {key: field for key, field in fields.items() if table != COMMON or key not in _OWN_KEYS}
+    return {
+        key: field for key, field in fields.items() if table != COMMON or not _has(field, Unique)
+    }
+
+
+def _has(field: FieldInfo, mark: type) -> bool:
+    return any(isinstance(known, mark) for known in field.metadata)
 
 
 def variable_name(table: str, key: str) -> str:
