@@ -24,6 +24,8 @@ MAX_CLOCK_OFFSET_MS = 1000.0
 MAX_AGE_S = 2.0  # limit for the age of the newest heartbeat
 REQUIRED_SERVICES = ("control", "recognizer", "synthesizer")  # without them, no face moves
 PUBLISHERS = ("phones", "faps", "events")  # accept every allowed key
+CLIENT_NEEDS = ("commands", "audio", "unpaced_audio", *PUBLISHERS)  # endpoints
+INSECURE = "none"  # in place of the name of a key
 # role that a key needs, by router
 ROUTER_ROLES = {"audio": "client", "unpaced_audio": "client", "phone_input": "service"}
 
@@ -46,7 +48,7 @@ def run_checks(address: str) -> Iterator[CheckResult]:
         yield CheckResult(f"control at {endpoint_address}", "cannot be reached", reason)
         return
     yield CheckResult(f"control at {endpoint_address}", "can be reached")
-    keys: Mapping[str, Key | None] = {"none": None}
+    keys: Mapping[str, Key | None] = {INSECURE: None}
     if not config.insecure:
         try:
             keys = load_local_keys() or {CLIENT: load_user_key(control=endpoint_address)}
@@ -128,11 +130,31 @@ def _check_service(
         )
     for name, endpoint in service.endpoints.items():
         address = endpoint.partition(" ")[0]
+        if not _concerns_host(service.service, name, endpoint, buses, is_one_host=is_one_host):
+            continue
         if problem := _endpoint_problem(name, endpoint, buses, is_one_host=is_one_host):
             problems.append(f"{name} at {address}: {problem}")
     endpoints = plural(len(service.endpoints), "endpoint")
     about = f"{endpoints}, clock {service.clock_offset_ms:+z.0f} ms"
     yield CheckResult(service.instance, about, "\n".join(problems))
+
+
+def _concerns_host(
+    service: str, name: str, endpoint: str, keys: Collection[str], *, is_one_host: bool
+) -> bool:
+    """Return whether programs of this host provide an endpoint or connect to it.
+
+    ``keys`` are the names of this host's keys. A service's key has the name of the service.
+    """
+    if INSECURE in keys or service in keys:
+        return True
+    if any(name in KINDS[key].needs for key in keys if key in KINDS):
+        return True
+    if not any(CLIENT in _default_roles(key) for key in keys):
+        return False
+    if endpoint.startswith("http"):  # by default, the page is only for browsers of its own host
+        return is_one_host or not is_loopback(urlsplit(endpoint).hostname or "")
+    return name in CLIENT_NEEDS
 
 
 def _endpoint_problem(
