@@ -25,6 +25,7 @@ from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.lateness import NO_LATENESS
+from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.services.synthesizer.modifiers.speech_motion import IdleMotionSettings
 from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
@@ -109,14 +110,12 @@ class SynthesizerService(SessionService):
                 text = f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}"
                 raise Rejected(ErrorCode.BAD_FACE, text)
             settings = self._known_settings(start.session, start.opening.face)
-            try:
-                face = self._new_face(start, settings)
-            except UserError as error:
-                is_default = settings.lip_model in (None, self._config.lips)  # loaded at startup
-                code = ErrorCode.BAD_LANGUAGE if is_default else ErrorCode.BAD_FACE
-                raise StartFailure(code, str(error)) from error
             session = SynthesizerSession(
-                start, face, self._input, self._faps, self._config.max_lag_s
+                start,
+                self._new_face(start, settings),
+                self._input,
+                self._faps,
+                self._config.max_lag_s,
             )
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session
@@ -126,9 +125,7 @@ class SynthesizerService(SessionService):
 
     def _new_face(self, start: StartSession, settings: FaceSettings) -> FaceAnimator:
         face = FaceAnimator(
-            load_lip_model(
-                start.facts.language or DEFAULT_LANGUAGE, settings.lip_model or self._config.lips
-            ),
+            self._load_lip_model(start, settings.lip_model or self._config.lips),
             frame_rate_hz=self.frame_rate_hz,
             delay_s=self._config.delay_ms / 1e3,
             idle_motion_seed=self._config.idle_motion_seed,
@@ -139,6 +136,23 @@ class SynthesizerService(SessionService):
             face.set_expressions(settings.expressions, settings.hold_s)
         face.set_idle_motion(_idle_motion_settings(settings))
         return face
+
+    def _load_lip_model(self, start: StartSession, name: str) -> LipModel:
+        """Load the lip model of a session.
+
+        A moved session gets the default lip model if its own cannot be loaded. Raises
+        ``StartFailure`` if a new session's lip model cannot be loaded.
+        """
+        language = start.facts.language or DEFAULT_LANGUAGE
+        try:
+            return load_lip_model(language, name)
+        except UserError as error:
+            is_default = name == self._config.lips  # loaded at startup
+            if start.epoch == 1 or is_default:
+                code = ErrorCode.BAD_LANGUAGE if is_default else ErrorCode.BAD_FACE
+                raise StartFailure(code, str(error)) from error
+            self._report_bad_face(start.session, str(error))
+            return self._load_lip_model(start, self._config.lips)
 
     def stop_session(self, session: str) -> None:
         """Remove a session."""
@@ -164,7 +178,10 @@ class SynthesizerService(SessionService):
         settings = self._known_settings(message.session, message.face)
         if settings.lip_model is not None:
             language = session.start.facts.language or DEFAULT_LANGUAGE
-            session.face.set_lip_model(load_lip_model(language, settings.lip_model))
+            try:
+                session.face.set_lip_model(load_lip_model(language, settings.lip_model))
+            except UserError as error:
+                self._report_bad_face(message.session, str(error))
         if settings.expressiveness is not None:
             session.face.set_expressiveness(settings.expressiveness)
         if settings.feeling is not None:
@@ -182,8 +199,7 @@ class SynthesizerService(SessionService):
         if not unknown:
             return settings
         text = f"ignored unknown face settings: {', '.join(sorted(map(str, unknown)))}"
-        self.warn(ErrorCode.BAD_FACE, text, session)
-        self.publish_event(EventName.ERROR, session, f"{ErrorCode.BAD_FACE}: {text}")
+        self._report_bad_face(session, text)
         strengths = (settings.expressions or {}).items()
         return replace(
             settings,
@@ -192,6 +208,10 @@ class SynthesizerService(SessionService):
             and {name: strength for name, strength in strengths if name not in unknown},
             shapes=settings.shapes and [name for name in settings.shapes if name not in unknown],
         )
+
+    def _report_bad_face(self, session: str, text: str) -> None:
+        self.warn(ErrorCode.BAD_FACE, text, session)
+        self.publish_event(EventName.ERROR, session, f"{ErrorCode.BAD_FACE}: {text}")
 
     def on_tick(self, now_s: float) -> float:
         """Acknowledge messages, relax the faces of stalled live streams, and drop old frames."""

@@ -5,16 +5,19 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import pytest
-from kouxing_client.messages import EndOfFaps, Event, FapFrame, Message
+from kouxing_client.messages import EndOfFaps, Event, FapFrame, Message, SessionFacts
 
 from kouxing.services.synthesizer import service as synthesizer_service
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED_EVENTS, SynthesizerService
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import Error
@@ -38,9 +41,9 @@ class RecordingSynthesizer(SynthesizerService):
         )
         cast(Any, self._faps).send = self.sent.append
 
-    def receive_progress(self, session: str, sequence: int, time_s: float) -> None:
+    def receive_progress(self, session: str, sequence: int, time_s: float, epoch: int = 1) -> None:
         """Receive a progress message up to a time."""
-        header: dict[str, Any] = {"session": session, "epoch": 1, "sequence": sequence}
+        header: dict[str, Any] = {"session": session, "epoch": epoch, "sequence": sequence}
         self._on_input(Progress(**header, media_time=to_samples(time_s), level_db=-60.0), Peer())
 
     def report(self, session: str, sequence: int, state: AudioState, media_time: int = 0) -> None:
@@ -77,27 +80,59 @@ def test_ignores_and_reports_unknown_face_settings(
     assert {tuple(frame.shapes) for frame in service.frames("gap")} == {("vrm",)}
 
 
+def fail_to_load(language: str, name: str) -> LipModel:
+    """Load only the default lip model."""
+    if name != DEFAULT_LIP_MODEL or language != DEFAULT_LANGUAGE:
+        raise UserError(f"{name} cannot be loaded for {language}")
+    return load_lip_model(language, name)
+
+
 @pytest.mark.parametrize(
-    ("lip_model", "code"), [(SynthesizerConfig().lips, "bad-language"), ("ferguson", "bad-face")]
+    ("lip_model", "language", "code"),
+    [(DEFAULT_LIP_MODEL, "toy", "bad-language"), ("ferguson", DEFAULT_LANGUAGE, "bad-face")],
 )
 def test_a_session_is_rejected_if_its_lip_model_cannot_be_loaded(
-    service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch, lip_model: str, code: str
+    service: RecordingSynthesizer,
+    monkeypatch: pytest.MonkeyPatch,
+    lip_model: str,
+    language: str,
+    code: str,
 ) -> None:
-    def fail(language: str, name: str) -> LipModel:
-        raise UserError(f"{name} cannot be loaded for {language}")
-
     sent: list[Message] = []
-    monkeypatch.setattr(synthesizer_service, "load_lip_model", fail)
+    monkeypatch.setattr(synthesizer_service, "load_lip_model", fail_to_load)
     monkeypatch.setattr(service, "send_to_control", sent.append)
-    start = replace(START.with_face(FaceSettings(lip_model=lip_model)), session="new")
+    start = replace(
+        START.with_face(FaceSettings(lip_model=lip_model)),
+        session="new",
+        facts=SessionFacts(language=language),
+    )
     service._on_start_session(start, Peer())
     event, error = sent
     assert isinstance(event, Event)
-    assert event.detail.startswith(code)
+    assert event.detail == f"{code}: {lip_model} cannot be loaded for {language}"
     assert isinstance(error, Error)
-    assert error.code == code
-    assert error.text.startswith(f"{lip_model} cannot be loaded for ")
+    assert (error.code, error.text) == (code, f"{lip_model} cannot be loaded for {language}")
     assert "new" not in service._sessions
+
+
+@pytest.mark.parametrize(("change", "epoch"), [("set-face", 1), ("move", 2)])
+def test_a_session_continues_if_its_new_lip_model_cannot_be_loaded(
+    service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch, change: str, epoch: int
+) -> None:
+    events: list[tuple[str, ...]] = []
+    monkeypatch.setattr(synthesizer_service, "load_lip_model", fail_to_load)
+    monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
+    face = FaceSettings(lip_model="ferguson", shapes=["vrm"])
+    if change == "move":
+        service.stop_session("gap")
+        service.start_session(replace(START.with_face(face), session="gap", epoch=epoch))
+    else:
+        service._on_set_face(SetFace(session="gap", face=face), Peer())
+    text = f"bad-face: ferguson cannot be loaded for {DEFAULT_LANGUAGE}"
+    assert events == [("error", "gap", text)]
+    for sequence in (1, 2):
+        service.receive_progress("gap", sequence, 1.0 * sequence, epoch)
+    assert {tuple(frame.shapes) for frame in service.frames("gap")} == {("vrm",)}
 
 
 def test_a_gap_does_not_delay_other_sessions(service: RecordingSynthesizer) -> None:

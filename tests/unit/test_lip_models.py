@@ -83,6 +83,7 @@ def test_an_unknown_lip_model_is_an_error() -> None:
         ("1 / 0", "cannot import the lip model toy .* division by zero"),
         ("LIP_MODEL = 3", r"lip model toy \(package .*\): LIP_MODEL is not a LipModelInfo"),
         (WRONG_LOAD, "lip model toy: load returned object, which is not a LipModel"),
+        (WRONG_LOAD.replace("object()", "{}['jaw']"), "cannot load the lip model toy .*KeyError"),
     ],
 )
 def test_a_faulty_package_spoils_no_other_lip_model_nor_the_configuration(

@@ -16,7 +16,13 @@ def load_lip_model(language: str = DEFAULT_LANGUAGE, name: str = DEFAULT_LIP_MOD
     Raises ``UserError`` if the lip model or the language is not installed, or the lip model is
     faulty or does not support the language.
     """
-    lip_model = lip_model_info(name).load(load_inventory(language))
+    info, inventory = lip_model_info(name), load_inventory(language)
+    try:
+        lip_model = info.load(inventory)
+    except UserError:
+        raise
+    except Exception as error:  # code of another distribution may raise any exception
+        raise UserError(f"cannot load the lip model {name} for {language}: {error!r}") from error
     if not isinstance(lip_model, LipModel):
         raise UserError(
             f"lip model {name}: load returned {type(lip_model).__name__}, which is not a LipModel;"
