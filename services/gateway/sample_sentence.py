@@ -11,6 +11,7 @@ from kouxing_client import KouxingError
 from kouxing.services.gateway.audio_sessions import AudioClient, error_text
 from kouxing.shared.audio_file import open_audio
 from kouxing.shared.errors import UserError
+from kouxing.shared.pcm import as_integers
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.text_captions import Characters, split_characters
 
@@ -74,6 +75,6 @@ class SampleSentence:
                 if lip_model != self.lip_model:
                     lip_model = self.lip_model
                     await session.set_face(lip_model=lip_model)
-                session.send((block * 32767).astype("<i2").tobytes(), len(block))
+                session.send(as_integers(block).tobytes(), len(block))
                 due_s += len(block) / source.sample_rate_hz
                 await asyncio.sleep(due_s - loop.time())

@@ -1,0 +1,47 @@
+"""The sample sentence is sent as it is in its file."""
+
+import contextlib
+import wave
+from collections.abc import AsyncIterator
+from typing import cast
+
+from kouxing.services.gateway.audio_sessions import AudioClient
+from kouxing.services.gateway.sample_sentence import SAMPLE_FILE, SampleSentence
+from tests.fake_time import run
+
+
+class FakeSession:
+    """Collects audio."""
+
+    is_closed = False
+
+    def __init__(self) -> None:
+        self.pcm = b""
+
+    def send(self, pcm: bytes, num_frames: int) -> None:
+        assert len(pcm) == 2 * num_frames
+        self.pcm += pcm
+
+
+class FakeClient:
+    """Opens one session."""
+
+    def __init__(self) -> None:
+        self.session = FakeSession()
+
+    @contextlib.asynccontextmanager
+    async def open(self, **options: object) -> AsyncIterator[FakeSession]:
+        assert options["num_channels"] == 1
+        yield self.session
+
+
+def test_the_samples_of_the_file_are_sent_unchanged() -> None:
+    client = FakeClient()
+
+    async def play() -> None:
+        await SampleSentence(cast("AudioClient", client))._speak()
+
+    run(play())
+    with wave.open(str(SAMPLE_FILE)) as file:
+        assert file.getsampwidth() == 2
+        assert client.session.pcm == file.readframes(file.getnframes())
