@@ -191,7 +191,7 @@ class WebServer:
 
     ``listener`` is from ``bind_port``. One address gets at most ``address_share`` of the
     connections. If the server is full, a new connection replaces the connection that has been idle
-    longest. Connections with a complete request for an unlimited path are never replaced.
+    longest. Connections with a complete request for an unlimited route are never replaced.
     """
 
     def __init__(
@@ -206,14 +206,16 @@ class WebServer:
     async def start(self, application: web.Application, unlimited: Collection[str]) -> None:
         """Start serving an application.
 
-        Handlers of the ``unlimited`` paths have no time limit once the whole request has arrived.
+        Handlers of the ``unlimited`` routes, given by their path patterns, have no time limit once
+        the whole request has arrived.
         """
 
         @web.middleware
         async def limit(request: web.Request, handler: Handler) -> web.StreamResponse:
             connection = cast(_Connection, request.protocol)
             connection.request = request
-            is_unlimited = request.path in unlimited
+            resource = request.match_info.route.resource
+            is_unlimited = resource is not None and resource.canonical in unlimited
             connection.set_timeout(BODY_TIMEOUT_S if is_unlimited else ANSWER_TIMEOUT_S)
             if is_unlimited:
                 request.content.on_eof(lambda: connection.on_body_end(request))

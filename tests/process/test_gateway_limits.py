@@ -93,7 +93,7 @@ async def fail(request: web.Request) -> web.StreamResponse:
 async def serve(
     monkeypatch: pytest.MonkeyPatch, bound: socket.socket | None = None, **limits: float
 ) -> AsyncIterator[LimitedServer]:
-    """Serve with other limits; ``/long`` has no time limit."""
+    """Serve with other limits; ``/long`` and the paths in it have no time limit."""
     for name, limit in {"_CHECK_S": 0.01, "_SHUTDOWN_S": 0.01, **limits}.items():
         monkeypatch.setattr(web_server, name, limit)
     bound = bound or web_server.bind_port("127.0.0.1", 0)
@@ -108,9 +108,10 @@ async def serve(
             web.get("/slow", limited.never_end),
             web.get("/endless", limited.write_endlessly),
             web.route("*", "/long", limited.never_end),
+            web.get("/long/{name}", limited.never_end),
         ]
     )
-    await http_server.start(application, {"/long"})
+    await http_server.start(application, {"/long", "/long/{name}"})
     try:
         yield limited
     finally:
@@ -169,11 +170,12 @@ async def test_closes_connections_without_a_request(
 @async_test
 async def test_ends_slow_answers_except_on_unlimited_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     async with serve(monkeypatch) as server:
+        named = await server.connect(LONG.replace(b"/long", b"/long/name"))
         long, slow = await server.connect(LONG), await server.connect(SLOW)
-        await wait_for_answers(long, slow)
+        await wait_for_answers(named, long, slow)
         server.now_s += web_server.ANSWER_TIMEOUT_S + 1.0
         await asyncio.wait_for(slow.read(), LIMIT_S)
-        await check_open(server, long)
+        await check_open(server, named, long)
 
 
 INCOMPLETE = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1"
