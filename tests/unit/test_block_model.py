@@ -9,6 +9,7 @@ import torch
 from kouxing.services.recognizer.acoustic import blocks as blocks_module
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive
+from kouxing.services.recognizer.acoustic.network import encode_integer_inputs
 from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import export_onnx
@@ -113,6 +114,12 @@ def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:
         write_archive(path, {**arrays, **change})
         with pytest.raises(UserError, match=message):
             load_model(path)
+
+
+def test_rejects_inputs_whose_length_needs_two_bytes() -> None:
+    assert len(encode_integer_inputs({"a": 1})) < 128
+    with pytest.raises(ValueError, match="a2, a3"):
+        encode_integer_inputs({f"a{number}": 1 for number in range(9)})
 
 
 def test_the_hop_may_change_at_any_time() -> None:

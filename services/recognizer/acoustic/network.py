@@ -47,13 +47,16 @@ class NetworkModel(AcousticModel):
 def encode_integer_inputs(num_axes: Mapping[str, int]) -> bytes:
     """Return bytes to append to an ONNX file. They turn its integer constants into inputs.
 
-    ``num_axes`` has the axes of each constant, by name; each axis has length 1. All inputs together
-    need less than 128 bytes. Concatenated messages of Protocol Buffers are merged, so the bytes add
-    inputs to the file's graph. An input with the name of a constant replaces it in a run (ONNX IR,
-    "Graphs").
+    ``num_axes`` has the axes of each constant, by name; each axis has length 1. Concatenated
+    messages of Protocol Buffers are merged, so the bytes add inputs to the file's graph. An input
+    with the name of a constant replaces it in a run (ONNX IR, "Graphs").
+
+    Raises ``ValueError`` if all inputs together need 128 bytes or more: each length is one byte.
     """
 
     def field(number: int, content: bytes) -> bytes:
+        if len(content) >= 128:
+            raise ValueError(f"the inputs {', '.join(num_axes)} are too long")
         return bytes([number << 3 | 2, len(content)]) + content  # type 2: length and content
 
     axis, int64 = field(1, bytes([1 << 3, 1])), bytes([1 << 3, 7])
