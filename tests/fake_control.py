@@ -51,7 +51,7 @@ class FakeControl:
     running
         Services in the status.
     refuse
-        Whether no session is opened.
+        Whether no session is opened, and no face is changed.
     stops
         Sessions to stop, before each answer to a heartbeat.
     heartbeats
@@ -159,9 +159,10 @@ class FakeControl:
         match message:
             case Heartbeat():
                 self._on_heartbeat(message, sender)
-            case OpenSession() if self.refuse:
+            case OpenSession() | SetFace() if self.refuse:
                 refusal = Error(code="no-service", text="start one", request=message.request)
                 self.commands.send(refusal, to=sender)
+                return
             case OpenSession():
                 self._on_open(message, sender)
             case SessionStarted() if message.session in self.openings:

@@ -14,7 +14,12 @@ from kouxing_client.field_types import SessionName, whole_text
 from kouxing_client.options import MAX_RATE_HZ
 from msgspec import Meta, Struct
 
-from kouxing.services.gateway.pcm_format import MAX_OBJECT_BYTES, PcmFormat, check_text
+from kouxing.services.gateway.pcm_format import (
+    MAX_OBJECT_BYTES,
+    PcmFormat,
+    WrongFormat,
+    check_text,
+)
 from kouxing.services.lip_models import lip_model_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, check_expressions
@@ -96,14 +101,14 @@ def parse_command(
 ) -> MicrophoneCommand:
     """Parse a later text message of a microphone, in which the fields ``known`` are allowed.
 
-    Raises ``UserError`` if the message is not a JSON object, a field is out of range, or it
-    describes audio of another format than ``pcm_format``.
+    Raises ``WrongFormat`` if the message describes audio of another format than ``pcm_format``, or
+    looks like base64. Raises ``UserError`` if it is not a JSON object, or a field is out of range.
     """
     check_text(message)
     fields = parse_command_fields(message)
     for name in _FORMAT_FIELDS:
         if name in fields and pcm_format and fields[name] != getattr(pcm_format, name):
-            raise UserError(f"{name} cannot change during a session; open another connection")
+            raise WrongFormat(f"{name} cannot change during a session; open another connection")
     problem = find_unknown([name for name in fields if name not in _FORMAT_FIELDS], known)
     settings = parse_face_settings(fields)
     face = {name: getattr(settings, name) for name in FACE_SETTINGS} if settings else {}

@@ -9,7 +9,7 @@ from kouxing.services.gateway import browser_messages
 from kouxing.services.gateway.audio_input import AudioInput
 from kouxing.services.gateway.audio_sessions import AudioClient, AudioSession, error_text
 from kouxing.services.gateway.limits import ConnectionQuota
-from kouxing.services.gateway.pcm_format import PcmFormat
+from kouxing.services.gateway.pcm_format import PcmFormat, WrongFormat
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
@@ -98,16 +98,36 @@ class MicrophoneHandler:
             if message.type is WSMsgType.BINARY:
                 await audio_input.push(message.data)
             elif message.type is WSMsgType.TEXT:
-                command = browser_messages.parse_command(message.data, pcm_format)
-                if command.problem:
-                    await browser.send_str(browser_messages.error_text(command.problem))
-                if command.skip:
-                    audio_input.skip(command.skip)
-                if command.flush:
-                    await audio_input.flush()
-                if command.face:
-                    await session.set_face(**command.face)
-                if command.last:
-                    await audio_input.end()
+                await self._execute(message.data, browser, session, audio_input, pcm_format)
             for error in session.take_errors():
                 await browser.send_str(error_text(error))
+
+    async def _execute(
+        self,
+        text: str,
+        browser: web.WebSocketResponse,
+        session: AudioSession,
+        audio_input: AudioInput,
+        pcm_format: PcmFormat,
+    ) -> None:
+        """Execute a command. An invalid or rejected one is answered; the session continues."""
+        try:
+            command = browser_messages.parse_command(text, pcm_format)
+        except WrongFormat:
+            raise
+        except UserError as error:
+            await browser.send_str(error_text(error))
+            return
+        if command.problem:
+            await browser.send_str(browser_messages.error_text(command.problem))
+        if command.skip:
+            audio_input.skip(command.skip)
+        try:
+            if command.flush:
+                await audio_input.flush()
+            if command.face:
+                await session.set_face(**command.face)
+        except KouxingError as error:
+            await browser.send_str(error_text(error))
+        if command.last:
+            await audio_input.end()

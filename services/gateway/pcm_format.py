@@ -15,6 +15,10 @@ MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message
 HEADER_BYTES = 12  # enough to recognize a file
 
 
+class WrongFormat(UserError):
+    """A client's text shows that its audio has another format than the announced one."""
+
+
 class PcmFormat(Struct, frozen=True, kw_only=True):
     """Sample rate, number of channels and encoding of raw PCM."""
 
@@ -60,9 +64,9 @@ class PcmFormat(Struct, frozen=True, kw_only=True):
 
 
 def check_text(text: str) -> None:
-    """Raise ``UserError`` if a text message looks like base64."""
+    """Raise ``WrongFormat`` if a text message looks like base64."""
     if len(text) >= 16 and not text.lstrip().startswith("{") and _is_base64(text):
-        raise UserError(
+        raise WrongFormat(
             "expected binary messages of samples, or a JSON object; this text looks like base64:"
             " send the bytes as a binary message"
         )

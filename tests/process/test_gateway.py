@@ -288,6 +288,35 @@ async def test_malformed_messages_do_not_disturb_other_clients(
 
 
 @async_test
+async def test_a_microphone_continues_after_a_bad_command(
+    control: FakeControl, gateway: Gateway
+) -> None:
+    async with open_websockets(gateway.page, "microphone") as (microphone,):
+        await microphone.send_json({"sample_rate_hz": 16000})
+        await receive_json(microphone, "opened")
+        for command, reason in (
+            ("{", "expected a JSON object"),
+            ('{"lip_model": 1}', "lip_model is 1; it must be"),
+            ('{"expressions": {"glee": 1}}', "glee"),
+            ('{"skip": -1}', "skip must be"),
+        ):
+            await microphone.send_str(command)
+            assert reason in (await receive_json(microphone, "error"))["text"]
+        control.refuse = True
+        await microphone.send_json({"expressions": {"joy": 1}, "last": True})
+        assert (await receive_json(microphone, "error"))["text"] == "start one"
+        await microphone.receive(LIMIT_S)
+        assert microphone.close_code == aiohttp.WSCloseCode.OK, "the end of the audio was executed"
+    async with open_websockets(gateway.page, "microphone") as (microphone,):
+        control.refuse = False
+        await microphone.send_json({"sample_rate_hz": 16000})
+        await microphone.send_json({"sample_rate_hz": 48000})
+        assert "cannot change" in (await receive_json(microphone, "error"))["text"]
+        await microphone.receive(LIMIT_S)
+        assert microphone.close_code == aiohttp.WSCloseCode.POLICY_VIOLATION
+
+
+@async_test
 async def test_microphone_and_sample_choose_their_lips(
     control: FakeControl, gateway: Gateway
 ) -> None:
