@@ -19,7 +19,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar
 
 from kouxing_client.keys import Key
-from kouxing_client.messages import Event, Message, SessionFacts
+from kouxing_client.messages import Message, SessionFacts
 from kouxing_client.reach import reach_error
 
 from kouxing.shared import parent_process
@@ -36,7 +36,6 @@ from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import (
     AllowedKey,
-    EventName,
     Heartbeat,
     HeartbeatReply,
     SessionProgress,
@@ -144,13 +143,6 @@ class Service(MessageLoop):
         self.send_to_control(heartbeat)
 
     # --- for subclasses to call ----------------------------------------------------------------
-
-    def publish_event(
-        self, name: EventName, session: str, detail: str = "", media_time: int = 0
-    ) -> None:
-        """Ask control to publish an event about a session."""
-        event = Event(session=session, name=name, detail=detail[:2000], media_time=media_time)
-        self.send_to_control(event)
 
     def send_to_control(self, message: Message) -> None:
         """Send a message to control; do nothing in control itself."""

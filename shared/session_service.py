@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable
 
-from kouxing_client.messages import Message
+from kouxing_client.messages import Event, Message
 
 from kouxing.shared.errors import Rejected, StartFailure, UserError
 from kouxing.shared.keys import Peer
@@ -58,11 +58,24 @@ class SessionService(Service):
             SessionStarted(session=start.session, request=start.request, final_until=final_until)
         )
 
-    def report_skipped(self, session: str, skipped_s: float) -> None:
+    def publish_event(
+        self, name: EventName, start: StartSession, detail: str = "", media_time: int = 0
+    ) -> None:
+        """Ask control to publish an event about a session."""
+        event = Event(
+            session=start.session,
+            session_id=start.session_id,
+            name=name,
+            detail=detail[:2000],
+            media_time=media_time,
+        )
+        self.send_to_control(event)
+
+    def report_skipped(self, start: StartSession, skipped_s: float) -> None:
         """Count and publish the duration of a live session's skipped audio, unless it is 0."""
         if skipped_s > 0.0:
             self.metrics.count("skipped_audio_ms", round(1e3 * skipped_s))
-            self.publish_event(EventName.AUDIO_SKIPPED, session, f"{skipped_s:.2f} s")
+            self.publish_event(EventName.AUDIO_SKIPPED, start, f"{skipped_s:.2f} s")
 
     def _on_start_session(self, start: StartSession, _sender: Peer) -> None:
         if self.should_exit:
@@ -78,7 +91,7 @@ class SessionService(Service):
         except UserError as error:
             code = error.code if isinstance(error, StartFailure) else ErrorCode.NO_SERVICE
             self.warn("start", str(error), start.session)
-            self.publish_event(EventName.ERROR, start.session, f"{code}: {error}")
+            self.publish_event(EventName.ERROR, start, f"{code}: {error}")
             self._reject(start, Rejected(code, str(error)))
 
     def _reject(self, start: StartSession, rejection: Rejected) -> None:

@@ -51,7 +51,7 @@ async function follow(endpoint) {
 }
 
 const control = connectControl(controlAddress);
-const { session, endpoints } = await findSession(control);
+const { session, session_id: sessionId, endpoints } = await findSession(control);
 const [, { services }] = await ask(control, "status-request", "");
 const { events } = services.find(({ service }) => service === "control").endpoints;
 const moves = subscribe(events, session, ["session-moved"]);
@@ -62,6 +62,7 @@ let publisher = endpoints.faps;
 follow(publisher);
 for await (const message of moves) {
   const [, moved] = read(message);
+  if (moved.session_id !== sessionId) continue; // of an earlier session with this name
   ({ epoch } = moved);
   if (moved.faps !== publisher) follow(publisher = moved.faps);
 }

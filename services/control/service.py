@@ -180,7 +180,7 @@ class ControlService(Service):
     def _flush_session(self, message: FlushSession, _sender: Peer) -> Message | None:
         record = self._sessions.find_authorized(message.session, message.token)
         self._lifecycle.send_to_participants(record, replace(message, epoch=record.epoch))
-        self._lifecycle.publish(EventName.SESSION_FLUSHED, record.name)
+        self._lifecycle.publish(EventName.SESSION_FLUSHED, record)
         return _done(message)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
@@ -346,7 +346,7 @@ class ControlService(Service):
             record.speech_time = speech.media_time
         record.speaking = speech.active
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
-        self._lifecycle.publish(name, record.name, media_time=speech.media_time)
+        self._lifecycle.publish(name, record, media_time=speech.media_time)
         for listener in self._sessions.listeners_of(record.name):
             listening = SetFace(
                 session=listener.name,
@@ -357,12 +357,7 @@ class ControlService(Service):
 
     def _on_service_event(self, event: Event, instance: str) -> None:
         if event.name in SERVICE_EVENTS:
-            self._lifecycle.publish(
-                EventName(event.name),
-                event.session,
-                detail=event.detail,
-                media_time=event.media_time,
-            )
+            self._lifecycle.publish_event(event)
         else:
             self.warn("event", f"{instance} may not publish {event.name!r}", event.session)
 

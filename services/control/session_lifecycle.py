@@ -85,7 +85,7 @@ class SessionLifecycle:
             return
         if not record.announced and not record.waiting_for:
             record.announced, record.moved = True, False
-            self.publish(EventName.SESSION_OPENED, record.name)
+            self.publish(EventName.SESSION_OPENED, record)
             opened = record.opened_message(self._events_address)
             self._requests.answer(record.client, record.opening.request, opened)
         elif record.moved and record.announced and not record.missing_workers:
@@ -115,7 +115,7 @@ class SessionLifecycle:
         close = CloseSession(session=record.name, epoch=record.epoch)
         self.send_to_participants(record, close)
         self._sessions.remove(record, time.monotonic())
-        self.publish(EventName.SESSION_CLOSED, record.name, detail=reason)
+        self.publish(EventName.SESSION_CLOSED, record, detail=reason)
         LOG.info("session closed: %s", reason, extra={"session": record.name})
 
     def end_revoked(self) -> None:
@@ -127,20 +127,29 @@ class SessionLifecycle:
                 self.end(record, "its client's key was revoked")
 
     def publish(
-        self, name: EventName, session: str = "", *, detail: str = "", media_time: int = 0
+        self,
+        name: EventName,
+        record: SessionRecord | None = None,
+        *,
+        detail: str = "",
+        media_time: int = 0,
     ) -> None:
-        """Publish an event."""
-        self._num_events += 1
-        self._metrics.count(f"event_{name}")
-        self._events.send(
+        """Publish an event, which may be about a session."""
+        self.publish_event(
             Event(
-                session=session,
-                sequence=self._num_events,
+                session="" if record is None else record.name,
+                session_id=None if record is None else record.session_id,
                 media_time=media_time,
                 name=name,
                 detail=detail[:2000],
             )
         )
+
+    def publish_event(self, event: Event) -> None:
+        """Publish an event with the next number."""
+        self._num_events += 1
+        self._metrics.count(f"event_{event.name}")
+        self._events.send(replace(event, sequence=self._num_events))
 
     def _check_timeout(self, record: SessionRecord, now_s: float) -> None:
         waited_s = now_s - record.started_s
@@ -161,7 +170,7 @@ class SessionLifecycle:
         record.rejected_by.clear()
         self._commands.send(moved, to=record.client)
         self._events.send(moved)
-        self.publish(EventName.SESSION_MOVED, record.name)
+        self.publish(EventName.SESSION_MOVED, record)
         workers = ", ".join(sorted({*record.workers.values()}))
         LOG.info("session moved to %s", workers, extra={"session": record.name})
         now_s = time.monotonic()

@@ -9,7 +9,12 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import CurrentFace
-from kouxing.shared.wire.session import OpenSession, SessionMoved, SessionOpened
+from kouxing.shared.wire.session import (
+    OpenSession,
+    SessionMoved,
+    SessionOpened,
+    session_id_of,
+)
 
 
 @dataclass(slots=True)
@@ -43,6 +48,11 @@ class SessionRecord:
     final_until: int = 0  # media time up to which the phones are final
     lateness: Lateness | None = None  # lateness of the session's frames in the last 10 s
     skipped_s: dict[str, float] = field(default_factory=dict)  # by instance
+
+    @property
+    def session_id(self) -> str:
+        """Public id of the session. It differs for every session with this name."""
+        return session_id_of(self.token)
 
     @property
     def start_request(self) -> str:
@@ -88,6 +98,7 @@ class SessionRecord:
             epoch=self.epoch,
             request=self.opening.request,
             token=self.token,
+            session_id=self.session_id,
             events=events,
             facts=self.facts,
             audio=self._audio_endpoint,
@@ -99,6 +110,7 @@ class SessionRecord:
         """Return the ``session-moved`` message for the client and the subscribers."""
         return SessionMoved(
             session=self.name,
+            session_id=self.session_id,
             epoch=self.epoch,
             next_sequence=self.resume_sequence,
             audio=self._audio_endpoint,
@@ -110,6 +122,7 @@ class SessionRecord:
         """Return the session's part of a status report."""
         return SessionState(
             session=self.name,
+            session_id=self.session_id,
             state="open" if self.announced else "starting",
             age_s=now_s - self.opened_s,
             speaking=self.speaking,

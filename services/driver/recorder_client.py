@@ -14,6 +14,7 @@ from kouxing.services.driver import recorder
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.video.video_writer import remove_unfinished
 from kouxing.shared.keys import MAX_KEY_SHARE
+from kouxing.shared.wire.control import StartSession
 
 MAX_QUEUED = 100_000  # unread commands
 IDLE_S = 10.0  # after this time without a video, the process ends and frees its memory
@@ -54,16 +55,16 @@ class _RecorderProcess:
 class RecorderClient:
     """Passes each session's frames and sound to its video.
 
-    ``on_written`` receives the session and its video's path. ``on_failed`` receives the session and
-    the reason why its video is incomplete or missing.
+    ``on_written`` receives the start of the session and its video's path. ``on_failed`` receives
+    the start and the reason why its video is incomplete or missing.
     """
 
     def __init__(
         self,
         config: DriverConfig,
         *,
-        on_written: Callable[[str, Path], None],
-        on_failed: Callable[[str, str], None],
+        on_written: Callable[[StartSession, Path], None],
+        on_failed: Callable[[StartSession, str], None],
         on_image: Callable[[], None],
     ) -> None:
         self._config = config
@@ -72,7 +73,7 @@ class RecorderClient:
         self._on_image = on_image
         self._numbers = count()
         self._open: dict[str, int] = {}  # numbers of the videos that accept frames, by session
-        self._unfinished: dict[int, tuple[str, str]] = {}  # session and key by number
+        self._unfinished: dict[int, StartSession] = {}  # sessions by number
         self._recorder: _RecorderProcess | None = None
         self._busy_s = 0.0  # when a video was last unfinished
         self._ticked_s = self._silent_s = 0.0  # the last tick; time since the last report
@@ -80,7 +81,7 @@ class RecorderClient:
     @property
     def unfinished(self) -> list[str]:
         """The sessions whose videos are not written yet."""
-        return [session for session, _ in self._unfinished.values()]
+        return [start.session for start in self._unfinished.values()]
 
     def is_open(self, session: str) -> bool:
         """Return whether a session's video still accepts frames."""
@@ -93,25 +94,26 @@ class RecorderClient:
             reason = f"the driver is writing {limit} videos, the maximum (driver.max_videos)"
         else:
             limit = math.ceil(MAX_KEY_SHARE * limit)
-            num_unfinished = sum(owner == key for _, owner in self._unfinished.values())
+            num_unfinished = sum(start.client_key == key for start in self._unfinished.values())
             if not key or num_unfinished < limit:
                 return ""
             reason = f"your key has {limit} unfinished videos, the maximum"
         return f"{reason}; wait until one is written, or open the session without 'record'"
 
-    def begin(self, session: str, key: str) -> None:
+    def begin(self, start: StartSession) -> None:
         """Open a session's video."""
+        session = start.session
         path = Path(self._config.out) / f"{session}.mp4"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            self._on_failed(session, f"cannot create {path.parent}: {error.strerror}")
+            self._on_failed(start, f"cannot create {path.parent}: {error.strerror}")
             return
         number = self._open[session] = next(self._numbers)
-        self._unfinished[number] = session, key
+        self._unfinished[number] = start
         if self._recorder is None:
             self._recorder, self._silent_s = _RecorderProcess(self._config), 0.0
-        self._send(session, "begin", key, path)
+        self._send(session, "begin", start.client_key or "", path)
 
     def add_frame(self, session: str, time_s: float, values: bytes) -> None:
         """Add a FAP frame (68 values), if the session is recorded."""
@@ -175,26 +177,26 @@ class RecorderClient:
         self._silent_s = 0.0
         if kind == "alive":
             return
-        session, _ = self._unfinished[number]
+        start = self._unfinished[number]
         if kind == "image":
             self._on_image()
             return
         if kind != "short":
             del self._unfinished[number]
-        if self._open.get(session) == number:
-            del self._open[session]
+        if self._open.get(start.session) == number:
+            del self._open[start.session]
         if kind == "written":
-            self._on_written(session, detail)
+            self._on_written(start, detail)
         else:
-            self._on_failed(session, detail)
+            self._on_failed(start, detail)
 
     def _fail_all(self, reason: str) -> None:
         self._kill()
-        sessions = self.unfinished
+        starts = list(self._unfinished.values())
         self._open.clear()
         self._unfinished.clear()
-        for session in sessions:
-            self._on_failed(session, reason)
+        for start in starts:
+            self._on_failed(start, reason)
 
     def _kill(self) -> None:
         if self._recorder is not None:

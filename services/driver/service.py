@@ -100,7 +100,7 @@ class DriverService(SessionService):
             self._sessions[start.session] = session
             self.poses.add(start.session, time.monotonic())
             if start.opening.record:
-                self.recorder.begin(start.session, key)
+                self.recorder.begin(start)
         session.follower.session_start = start
         session.follower.follow()
         return False
@@ -194,11 +194,11 @@ class DriverService(SessionService):
 
     # --- videos --------------------------------------------------------------------------------
 
-    def _report_written(self, session: str, path: Path) -> None:
+    def _report_written(self, start: StartSession, path: Path) -> None:
         self.metrics.count("videos")
-        LOG.info("wrote %s", path, extra={"session": session})
-        self.publish_event(EventName.RECORDED, session, str(path))
+        LOG.info("wrote %s", path, extra={"session": start.session})
+        self.publish_event(EventName.RECORDED, start, str(path))
 
-    def _report_failure(self, session: str, reason: str) -> None:
-        LOG.error(reason, extra={"session": session})
-        self.publish_event(EventName.ERROR, session, f"{ErrorCode.NO_VIDEO}: {reason}")
+    def _report_failure(self, start: StartSession, reason: str) -> None:
+        LOG.error(reason, extra={"session": start.session})
+        self.publish_event(EventName.ERROR, start, f"{ErrorCode.NO_VIDEO}: {reason}")

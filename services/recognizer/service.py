@@ -217,8 +217,8 @@ class RecognizerService(SessionService):
             if session.link.check_overdue(now_s):
                 text = "the synthesizer is too slow, so the face misses part of the speech"
                 self.warn(ErrorCode.NO_LINK, text, session.name)
-                self.publish_event(EventName.ERROR, session.name, f"{ErrorCode.NO_LINK}: {text}")
-            self.report_skipped(session.name, session.audio.skip_policy.take_report_s(now_s))
+                self.publish_event(EventName.ERROR, session.start, f"{ErrorCode.NO_LINK}: {text}")
+            self.report_skipped(session.start, session.audio.skip_policy.take_report_s(now_s))
             if session.link.is_full:
                 blocked.add(session.is_paced)
         self._is_live_blocked = True in blocked or self._queued_s(paced=True) > MAX_QUEUED_S
@@ -400,7 +400,7 @@ class RecognizerService(SessionService):
             if isinstance(result, Progress) and result.is_laughter != session.is_laughing:
                 session.is_laughing = result.is_laughter
                 name = EventName.LAUGHTER_START if result.is_laughter else EventName.LAUGHTER_STOP
-                self.publish_event(name, session.name, media_time=to_samples(result.time_s))
+                self.publish_event(name, session.start, media_time=to_samples(result.time_s))
 
     def _on_subscribe(self, session: str) -> None:
         if (joined := self._sessions.get(session)) is not None:

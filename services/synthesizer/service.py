@@ -109,7 +109,7 @@ class SynthesizerService(SessionService):
             if start.epoch == 1 and lip_model not in (None, *lip_model_names()):
                 text = f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}"
                 raise Rejected(ErrorCode.BAD_FACE, text)
-            settings = self._known_settings(start.session, start.opening.face)
+            settings = self._known_settings(start, start.opening.face)
             session = SynthesizerSession(
                 start,
                 self._new_face(start, settings),
@@ -151,7 +151,7 @@ class SynthesizerService(SessionService):
             if start.epoch == 1 or is_default:
                 code = ErrorCode.BAD_LANGUAGE if is_default else ErrorCode.BAD_FACE
                 raise StartFailure(code, str(error)) from error
-            self._report_bad_face(start.session, str(error))
+            self._report_bad_face(start, str(error))
             return self._load_lip_model(start, self._config.lips)
 
     def stop_session(self, session: str) -> None:
@@ -175,13 +175,13 @@ class SynthesizerService(SessionService):
         session = self._sessions.get(message.session)
         if session is None:
             return
-        settings = self._known_settings(message.session, message.face)
+        settings = self._known_settings(session.start, message.face)
         if settings.lip_model is not None:
             language = session.start.facts.language or DEFAULT_LANGUAGE
             try:
                 session.face.set_lip_model(load_lip_model(language, settings.lip_model))
             except UserError as error:
-                self._report_bad_face(message.session, str(error))
+                self._report_bad_face(session.start, str(error))
         if settings.expressiveness is not None:
             session.face.set_expressiveness(settings.expressiveness)
         if settings.feeling is not None:
@@ -191,7 +191,7 @@ class SynthesizerService(SessionService):
             session.face.set_expressions(settings.expressions, settings.hold_s)
         session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))
 
-    def _known_settings(self, session: str, settings: FaceSettings) -> FaceSettings:
+    def _known_settings(self, start: StartSession, settings: FaceSettings) -> FaceSettings:
         """Return the settings without unknown names; report unknown names."""
         unknown = {settings.lip_model} - {None, *lip_model_names()}
         unknown |= (settings.expressions or {}).keys() - EXPRESSION_NAMES
@@ -199,7 +199,7 @@ class SynthesizerService(SessionService):
         if not unknown:
             return settings
         text = f"ignored unknown face settings: {', '.join(sorted(map(str, unknown)))}"
-        self._report_bad_face(session, text)
+        self._report_bad_face(start, text)
         strengths = (settings.expressions or {}).items()
         return replace(
             settings,
@@ -209,9 +209,9 @@ class SynthesizerService(SessionService):
             shapes=settings.shapes and [name for name in settings.shapes if name not in unknown],
         )
 
-    def _report_bad_face(self, session: str, text: str) -> None:
-        self.warn(ErrorCode.BAD_FACE, text, session)
-        self.publish_event(EventName.ERROR, session, f"{ErrorCode.BAD_FACE}: {text}")
+    def _report_bad_face(self, start: StartSession, text: str) -> None:
+        self.warn(ErrorCode.BAD_FACE, text, start.session)
+        self.publish_event(EventName.ERROR, start, f"{ErrorCode.BAD_FACE}: {text}")
 
     def on_tick(self, now_s: float) -> float:
         """Acknowledge messages, relax the faces of stalled live streams, and drop old frames."""
@@ -224,9 +224,9 @@ class SynthesizerService(SessionService):
             for session in self._sessions.values():
                 session.lateness.measure(now_s)
         due_s = self._last_check_s + CHECK_INTERVAL_S
-        for name, session in self._sessions.items():
+        for session in self._sessions.values():
             due_s = min(due_s, session.receiver.tick(now_s))
-            self.report_skipped(name, session.skip_policy.take_report_s(now_s))
+            self.report_skipped(session.start, session.skip_policy.take_report_s(now_s))
             if session.is_paced and not session.is_finished and not session.events:
                 self._relax(session, now_s)
                 due_s = min(due_s, session.relax_at_s + 1.0 / self.frame_rate_hz)

@@ -25,7 +25,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import MAX_KEYS, MAX_ROLES
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import RegisteredMessage
-from kouxing.shared.wire.session import OpenSession
+from kouxing.shared.wire.session import OpenSession, session_id_of
 
 
 class EventName(StrEnum):
@@ -110,6 +110,11 @@ class StartSession(RegisteredMessage, frozen=True, kw_only=True):
     speech_time: Samples | None = None  # start of the speech in progress; None: silence, or unknown
     client: Annotated[bytes, Meta(max_length=255)] = b""  # its routing id at control
     client_key: Name | None = None  # its public key; None: the system is insecure
+
+    @property
+    def session_id(self) -> str:
+        """Public id of the session; other sessions with the same name have other ids."""
+        return session_id_of(self.token)
 
     def with_face(self, face: FaceSettings) -> StartSession:
         """Return this message with other face settings."""

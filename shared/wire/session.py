@@ -1,5 +1,6 @@
 """The messages of a client: to control and back, and its audio."""
 
+import hashlib
 from enum import StrEnum
 from typing import Annotated
 
@@ -63,6 +64,11 @@ class OpenSession(RegisteredMessage, frozen=True, kw_only=True):
     face: FaceSettings = field(default_factory=FaceSettings)
 
 
+def session_id_of(token: str) -> str:
+    """Return the public id of the session with this secret token."""
+    return hashlib.sha256(token.encode()).hexdigest()[:16]
+
+
 class SessionOpened(RegisteredMessage, frozen=True, kw_only=True):
     """The session exists; connect to these endpoints."""
 
@@ -73,6 +79,7 @@ class SessionOpened(RegisteredMessage, frozen=True, kw_only=True):
     faps: Endpoint  # XPUB: fap-frame, end-of-faps
     events: Endpoint  # XPUB: event, session-moved
     facts: SessionFacts
+    session_id: Name | None = None  # differs from the ids of other sessions with the same name
 
 
 class SessionMoved(RegisteredMessage, frozen=True, kw_only=True):
@@ -85,6 +92,7 @@ class SessionMoved(RegisteredMessage, frozen=True, kw_only=True):
     phones: Endpoint
     faps: Endpoint
     next_sequence: Count | None = None  # first audio message to resend; None: the recognizer stays
+    session_id: Name | None = None  # as in session-opened
 
 
 class AudioChunk(RegisteredMessage, frozen=True, kw_only=True):

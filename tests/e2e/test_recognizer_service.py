@@ -49,9 +49,9 @@ class Recognizer(RecognizerService):
         self.events: list[tuple[str, ...]] = []
 
     def publish_event(
-        self, name: EventName, session: str, detail: str = "", media_time: int = 0
+        self, name: EventName, start: StartSession, detail: str = "", media_time: int = 0
     ) -> None:
-        self.events.append((name, session, detail))
+        self.events.append((name, start.session, detail))
 
     def warn(self, reason: str, text: str, session: str = "", level: int = 0) -> None:
         self.warned.append((reason, text))

@@ -15,10 +15,11 @@ from kouxing.services.driver import pose_store, recorder_client
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.service import DriverService
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.control import SessionProgress, SessionStarted
 from kouxing.shared.wire.session import Error
 from tests.fake_control import FakeControl
-from tests.samples import fap_frame
+from tests.samples import START, fap_frame
 from tests.system import wait_until
 
 
@@ -184,7 +185,7 @@ def test_limits_the_videos_of_one_key(harness: DriverHarness) -> None:
     videos = harness.driver.recorder
     for number in range(3):
         assert videos.rejection_reason("greedy") == ""
-        videos.begin(f"film-{number}", "greedy")
+        videos.begin(replace(START, session=f"film-{number}", client_key="greedy"))
     assert "your key has 3 unfinished videos, the maximum" in videos.rejection_reason("greedy")
     assert videos.rejection_reason("other") == ""
 

@@ -65,11 +65,23 @@ def service() -> Iterator[RecordingSynthesizer]:
     service.bus.close()
 
 
+def record_events(
+    service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
+) -> list[tuple[str, ...]]:
+    """Return a list that receives the events that a service publishes."""
+    events: list[tuple[str, ...]] = []
+    monkeypatch.setattr(
+        service,
+        "publish_event",
+        lambda name, start, detail: events.append((name, start.session, detail)),
+    )
+    return events
+
+
 def test_ignores_and_reports_unknown_face_settings(
     service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    events: list[tuple[str, ...]] = []
-    monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
+    events = record_events(service, monkeypatch)
     face = FaceSettings(
         lip_model="muscles", expressions={"glee": 1.0, "joy": 0.5}, shapes=["clay", "vrm"]
     )
@@ -119,9 +131,8 @@ def test_a_session_is_rejected_if_its_lip_model_cannot_be_loaded(
 def test_a_session_continues_if_its_new_lip_model_cannot_be_loaded(
     service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch, change: str, epoch: int
 ) -> None:
-    events: list[tuple[str, ...]] = []
+    events = record_events(service, monkeypatch)
     monkeypatch.setattr(synthesizer_service, "load_lip_model", fail_to_load)
-    monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
     face = FaceSettings(lip_model="ferguson", shapes=["vrm"])
     if change == "move":
         service.stop_session("gap")
@@ -171,9 +182,8 @@ def test_rejects_messages_beyond_the_queue(service: RecordingSynthesizer) -> Non
 def test_a_slow_synthesizer_skips_frames_and_reports_it(
     service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now_s, events = 0.0, list[tuple[str, ...]]()
+    now_s, events = 0.0, record_events(service, monkeypatch)
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
-    monkeypatch.setattr(service, "publish_event", lambda *event: events.append(event))
     service.receive_progress("gap", 1, 0.08)
     now_s = 10.0  # it was stopped
     for sequence in range(2, 150):

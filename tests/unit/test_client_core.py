@@ -11,6 +11,7 @@ from kouxing_client.inbox import Inbox
 from kouxing_client.messages import EndOfFaps, Joined
 from kouxing_client.reach import NO_LISTENER
 from kouxing_client.session_core import (
+    LAST_S,
     MOVE_LIMIT_S,
     RESUBSCRIBE_S,
     SILENT_S,
@@ -22,9 +23,10 @@ from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.fake_sockets import FakeConnection, FakeSockets
 
 START_S = 2.0
+ID = "this session"
 OPENED = {
     "epoch": 1, "token": "t", "audio": "audio 1", "phones": "phones 1", "faps": "faps 1",
-    "events": "events",
+    "events": "events", "session_id": ID,
 }  # fmt: skip
 MOVED = {"epoch": 2, "audio": "audio 2", "phones": "phones 2", "faps": "faps 1"}
 STATE = {"state": "open", "age_s": 1.0, "speaking": False, "workers": {}, "facts": {}}
@@ -215,25 +217,29 @@ def test_an_unknown_session_ends_unless_it_moves() -> None:
     assert "unknown-session" in str(harness.session.failure)
 
 
-@pytest.mark.parametrize("is_there", [True, False])
-def test_asks_where_a_silent_session_of_another_program_is(is_there: bool) -> None:
+@pytest.mark.parametrize("cause", ["moved", "replaced", "ended"])
+def test_asks_where_a_silent_session_of_another_program_is(cause: str) -> None:
     harness = CoreHarness()
     following = harness.core.follow("other", is_live=True)
     endpoints = {"audio": "a", "phones": "phones 1", "faps": "faps 1"}
-    state = {**STATE, "session": "other", "endpoints": endpoints}
+    state = {**STATE, "session": "other", "session_id": ID, "endpoints": endpoints}
     harness.answer("status-report", services=[CONTROL_STATE], sessions=[state])
     harness.session = following.result()
     inbox = harness.subscribe()
     harness.confirm()
     harness.pass_time(SILENT_S + 0.1)
     assert harness.commands.sent[-1][0] == "status-request"
-    if is_there:
+    if cause == "moved":
         state["endpoints"] = {**endpoints, "faps": "faps 2"}
         harness.answer("status-report", services=[], sessions=[state])
         assert harness.sockets.at("faps 2")
         assert not inbox.is_over
     else:
-        harness.answer("error", code="unknown-session", text="x")
+        if cause == "replaced":
+            state["session_id"] = "another session with its name"
+            harness.answer("status-report", services=[], sessions=[state])
+        else:
+            harness.answer("error", code="unknown-session", text="x")
         assert inbox.is_over
         assert inbox.failure is None
 
@@ -308,11 +314,28 @@ def test_remembers_a_limited_number_of_failed_openings() -> None:
 def test_events_can_be_closed_twice() -> None:
     harness, first, second = CoreHarness(), Inbox(None), Inbox(None)
     for inbox in (first, second):
-        harness.core.add_inbox("s", inbox)
+        harness.core.add_inbox(harness.session, inbox)
     for _ in range(2):
-        harness.core.remove_inbox("s", first)
+        harness.core.remove_inbox(harness.session, first)
     assert first.is_over
     assert not second.is_over
+
+
+@pytest.mark.parametrize(
+    ("session_id", "is_same"), [(ID, True), ("an earlier session", False), (None, True)]
+)
+def test_a_late_event_of_an_earlier_session_does_not_concern_a_new_one_with_its_name(
+    session_id: str | None, is_same: bool
+) -> None:
+    harness, inbox = CoreHarness(), Inbox(None)
+    harness.core.add_inbox(harness.session, inbox)
+    (events,) = harness.sockets.at("events")
+    events.answer("session-moved", **MOVED, session_id=session_id)
+    assert harness.session.epoch == (2 if is_same else 1)
+    events.answer("event", name="session-closed", session_id=session_id)
+    assert len(inbox.messages) == is_same
+    harness.pass_time(2 * LAST_S)
+    assert harness.session.is_over == is_same
 
 
 def test_a_diagnosis_may_arrive_after_the_client_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -255,8 +255,8 @@ class BaseSession:
         """Return an inbox, and the function that closes it."""
         thread, core = self._thread, self._thread.core
         inbox = Inbox(MAX_EVENTS)
-        thread.call(lambda: core.add_inbox(self.name, inbox))
-        return inbox, lambda: thread.call(lambda: core.remove_inbox(self.name, inbox))
+        thread.call(lambda: core.add_inbox(self._core, inbox))
+        return inbox, lambda: thread.call(lambda: core.remove_inbox(self._core, inbox))
 
     def _check(self) -> None:
         """Raise the oldest error since the last call."""

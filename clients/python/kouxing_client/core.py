@@ -69,7 +69,7 @@ class ClientCore:
         self._failed_openings: deque[str] = deque(maxlen=MAX_FAILED_OPENINGS)
         self._refused_s = math.inf  # when control started to reject this key
         self._is_diagnosing = False  # searching for the reason why control does not answer
-        self._inboxes: dict[str, list[Inbox]] = {}  # by session
+        self._inboxes: dict[SessionCore, list[Inbox]] = {}
         self._located_s: dict[str, float] = {}  # when a silent session was last located
         self._events: Connection | None = None
         self._closed: KouxingError | None = None  # reason why this client is closed
@@ -127,18 +127,18 @@ class ClientCore:
 
         return map_future(self.status(""), add)  # with the endpoint of control's events
 
-    def add_inbox(self, session: str, inbox: Inbox) -> None:
+    def add_inbox(self, session: SessionCore, inbox: Inbox) -> None:
         """Pass a session's events to an inbox, even after the session has ended."""
         self._inboxes.setdefault(session, []).append(inbox)
-        self._watch(session, on=True)
+        self._watch(session.name, on=True)
         if self._closed is not None:
             inbox.end(self._closed)
 
-    def remove_inbox(self, session: str, inbox: Inbox) -> None:
+    def remove_inbox(self, session: SessionCore, inbox: Inbox) -> None:
         """Stop passing events to an inbox."""
         if inbox in self._inboxes[session]:
             self._inboxes[session].remove(inbox)
-            self._watch(session, on=False)
+            self._watch(session.name, on=False)
         inbox.end(None)
 
     def tick(self) -> None:
@@ -254,6 +254,9 @@ class ClientCore:
         def on_status(answer: Future[Status]) -> None:
             try:
                 state = newest_session(answer.result(), session.name)
+                if not session.is_subject_of(state["session"], state["session_id"]):
+                    session.end(None)  # another session has its name now
+                    return
             except Refused as refusal:
                 if refusal.code == "unknown-session":
                     session.end(None)
@@ -295,18 +298,20 @@ class ClientCore:
         event = EVENTS.decode(parts)
         if not isinstance(event, Event):
             return
-        for inbox in self._inboxes.get(event.session, ()):
-            inbox.add(event)
+        subject = event.session, event.session_id
+        for session, inboxes in self._inboxes.items():
+            for inbox in inboxes if session.is_subject_of(*subject) else ():
+                inbox.add(event)
         if event.name == "session-closed":
-            for session in self._sessions_named(event.session):
+            for session in self._subjects(*subject):
                 session.close_after_results(event.detail)
 
     def _on_moved(self, fields: Fields) -> None:
-        for session in self._sessions_named(fields["session"]):
+        for session in self._subjects(fields["session"], fields.get("session_id")):
             session.move(fields)
 
-    def _sessions_named(self, name: str) -> list[SessionCore]:
-        return [session for session in self.sessions if session.name == name]
+    def _subjects(self, name: str, session_id: str | None) -> list[SessionCore]:
+        return [session for session in self.sessions if session.is_subject_of(name, session_id)]
 
 
 def newest_session(status: Status, name: str) -> Fields:
@@ -333,6 +338,7 @@ def newest_session(status: Status, name: str) -> Fields:
         **newest.endpoints,
         "events": endpoints.get("events", ""),
         "session": newest.session,
+        "session_id": newest.session_id,
         "epoch": 0,
         "facts": msgspec.to_builtins(newest.facts),
     }

@@ -199,6 +199,8 @@ class Event(Message, frozen=True, kw_only=True):
     name: Name
     """such as ``session-closed`` or ``recorded``"""
     detail: Text = ""
+    session_id: Name | None = None
+    """as in ``session-opened``: earlier sessions of the same name have other ids"""
 
 
 class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
@@ -259,6 +261,8 @@ class SessionState(msgspec.Struct, frozen=True, kw_only=True):
     """None if the session is not live, or had no frames in the last 10 s"""
     skipped_s: Seconds = 0.0
     """duration of the audio that was skipped on a busy machine"""
+    session_id: Name | None = None
+    """as in ``session-opened``"""
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):

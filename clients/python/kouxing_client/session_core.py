@@ -190,6 +190,7 @@ class SessionCore:
         self.endpoints = opened
         self.name: str = opened["session"]
         self.epoch: int = opened["epoch"]
+        self.session_id: str | None = opened.get("session_id")
         self.token: str = opened.get("token", "")
         self.is_live = is_live
         self.stream: AudioStream | None = None
@@ -205,6 +206,14 @@ class SessionCore:
         self._resubscribe_end_s = 0.0  # audio waits for subscriptions until this time
         self._unknown: tuple[float, Refused] | None = None  # unknown to the recognizer
         self._closing: tuple[float, str] | None = None  # deadline and reason of control
+
+    def is_subject_of(self, name: str, session_id: str | None) -> bool:
+        """Return whether a message with this session name and id is about this session.
+
+        A late message may be about an earlier session of the same name.
+        """
+        is_known = session_id is not None and self.session_id is not None
+        return name == self.name and (session_id == self.session_id or not is_known)
 
     def connect(self) -> None:
         """Connect to the recognizer, if this client sends audio."""
