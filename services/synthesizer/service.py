@@ -20,23 +20,17 @@ import numpy as np
 from kouxing_client.field_types import MASK_BYTES
 from kouxing_client.messages import EndOfFaps, FapFrame, Message, SessionFacts
 
-from kouxing.services.lip_models import lip_model_names
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
+from kouxing.services.synthesizer.face_animator import REST_S, Frame
+from kouxing.services.synthesizer.face_maker import FaceMaker
 from kouxing.services.synthesizer.lateness import NO_LATENESS
-from kouxing.services.synthesizer.lips.lip_model import LipModel
-from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.services.synthesizer.modifiers.speech_motion import IdleMotionSettings
 from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
 from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
-from kouxing.shared.errors import Rejected, StartFailure, UserError
-from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import MAX_TURN_S, Handler
@@ -52,7 +46,7 @@ from kouxing.shared.wire.events import (
     message_to_event,
     split_batch,
 )
-from kouxing.shared.wire.face import FaceSettings, SetFace
+from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import (
     AudioState,
@@ -65,7 +59,6 @@ MAX_BURST_S = 0.06  # frames of one session at a time, so that a gap does not de
 MAX_QUEUED_EVENTS = 200  # events of a session; the recognizer resends later ones
 CHECK_INTERVAL_S = 1.0  # interval between checks for stopped subscribers and for lateness
 MAX_CATCH_UP_S = 0.2  # limit for making up late frames without sound
-EXPRESSION_NAMES = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
 FAP_MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
@@ -82,6 +75,7 @@ class SynthesizerService(SessionService):
         self.facts = SessionFacts(
             frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lip_model=config.lips
         )
+        self._face_maker = FaceMaker(config, self._report_bad_face)
         self._sessions: dict[str, SynthesizerSession] = {}
         self._turn = 0  # round robin of sessions with queued events
         self._last_check_s = 0.0  # last check for stopped subscribers and for lateness
@@ -93,7 +87,6 @@ class SynthesizerService(SessionService):
             "phone_input": config.advertised_endpoint(self._input.endpoint),
             "faps": config.advertised_endpoint(self._faps.endpoint),
         }
-        load_lip_model(name=config.lips)  # so that the first session does not wait
         self.register(self._input, {Results: self._on_results})
         self.register(self._faps, {})
 
@@ -105,54 +98,16 @@ class SynthesizerService(SessionService):
         """Create a face at rest. A session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
-            lip_model = start.opening.face.lip_model
-            if start.epoch == 1 and lip_model not in (None, *lip_model_names()):
-                text = f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}"
-                raise Rejected(ErrorCode.BAD_FACE, text)
-            settings = self._known_settings(start, start.opening.face)
+            settings = self._face_maker.initial_settings(start)
+            face = self._face_maker.make(start, settings)
             session = SynthesizerSession(
-                start,
-                self._new_face(start, settings),
-                self._input,
-                self._faps,
-                self._config.max_lag_s,
+                start, face, self._input, self._faps, self._config.max_lag_s
             )
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
         self.session_started(start, to_samples(session.final_time.time_s))
         return False
-
-    def _new_face(self, start: StartSession, settings: FaceSettings) -> FaceAnimator:
-        face = FaceAnimator(
-            self._load_lip_model(start, settings.lip_model or self._config.lips),
-            frame_rate_hz=self.frame_rate_hz,
-            delay_s=self._config.delay_ms / 1e3,
-            idle_motion_seed=self._config.idle_motion_seed,
-            expressiveness=settings.expressiveness or self._config.expressiveness,
-            feeling=self._config.feeling if settings.feeling is None else settings.feeling,
-        )
-        if settings.expressions:
-            face.set_expressions(settings.expressions, settings.hold_s)
-        face.set_idle_motion(_idle_motion_settings(settings))
-        return face
-
-    def _load_lip_model(self, start: StartSession, name: str) -> LipModel:
-        """Load the lip model of a session.
-
-        A moved session gets the default lip model if its own cannot be loaded. Raises
-        ``StartFailure`` if a new session's lip model cannot be loaded.
-        """
-        language = start.facts.language or DEFAULT_LANGUAGE
-        try:
-            return load_lip_model(language, name)
-        except UserError as error:
-            is_default = name == self._config.lips  # loaded at startup
-            if start.epoch == 1 or is_default:
-                code = ErrorCode.BAD_LANGUAGE if is_default else ErrorCode.BAD_FACE
-                raise StartFailure(code, str(error)) from error
-            self._report_bad_face(start, str(error))
-            return self._load_lip_model(start, self._config.lips)
 
     def stop_session(self, session: str) -> None:
         """Remove a session."""
@@ -171,43 +126,8 @@ class SynthesizerService(SessionService):
             flushed.face.flush()
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
-        """Change the settings of a face, with continuous transitions."""
-        session = self._sessions.get(message.session)
-        if session is None:
-            return
-        settings = self._known_settings(session.start, message.face)
-        if settings.lip_model is not None:
-            language = session.start.facts.language or DEFAULT_LANGUAGE
-            try:
-                session.face.set_lip_model(load_lip_model(language, settings.lip_model))
-            except UserError as error:
-                self._report_bad_face(session.start, str(error))
-        if settings.expressiveness is not None:
-            session.face.set_expressiveness(settings.expressiveness)
-        if settings.feeling is not None:
-            session.face.set_feeling(settings.feeling)
-        session.face.set_idle_motion(_idle_motion_settings(settings))
-        if settings.expressions is not None:
-            session.face.set_expressions(settings.expressions, settings.hold_s)
-        session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))
-
-    def _known_settings(self, start: StartSession, settings: FaceSettings) -> FaceSettings:
-        """Return the settings without unknown names; report unknown names."""
-        unknown = {settings.lip_model} - {None, *lip_model_names()}
-        unknown |= (settings.expressions or {}).keys() - EXPRESSION_NAMES
-        unknown |= {*(settings.shapes or ())} - SHAPE_SETS.keys()
-        if not unknown:
-            return settings
-        text = f"ignored unknown face settings: {', '.join(sorted(map(str, unknown)))}"
-        self._report_bad_face(start, text)
-        strengths = (settings.expressions or {}).items()
-        return replace(
-            settings,
-            lip_model=None if settings.lip_model in unknown else settings.lip_model,
-            expressions=settings.expressions
-            and {name: strength for name, strength in strengths if name not in unknown},
-            shapes=settings.shapes and [name for name in settings.shapes if name not in unknown],
-        )
+        if (session := self._sessions.get(message.session)) is not None:
+            self._face_maker.change(session, message.face)
 
     def _report_bad_face(self, start: StartSession, text: str) -> None:
         self.warn(ErrorCode.BAD_FACE, text, start.session)
@@ -419,9 +339,3 @@ class SynthesizerService(SessionService):
         subscribed = self._sessions.get(session)
         if subscribed is not None:
             subscribed.replay.repeat(time.monotonic())
-
-
-def _idle_motion_settings(settings: FaceSettings) -> IdleMotionSettings:
-    return IdleMotionSettings(
-        still=settings.still, eye_contact=settings.eye_contact, listening=settings.listening
-    )

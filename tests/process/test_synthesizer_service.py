@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 from kouxing_client.messages import EndOfFaps, Event, FapFrame, Message, SessionFacts
 
-from kouxing.services.synthesizer import service as synthesizer_service
+from kouxing.services.synthesizer import face_maker
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -111,7 +111,7 @@ def test_a_session_is_rejected_if_its_lip_model_cannot_be_loaded(
     code: str,
 ) -> None:
     sent: list[Message] = []
-    monkeypatch.setattr(synthesizer_service, "load_lip_model", fail_to_load)
+    monkeypatch.setattr(face_maker, "load_lip_model", fail_to_load)
     monkeypatch.setattr(service, "send_to_control", sent.append)
     start = replace(
         START.with_face(FaceSettings(lip_model=lip_model)),
@@ -132,7 +132,7 @@ def test_a_session_continues_if_its_new_lip_model_cannot_be_loaded(
     service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch, change: str, epoch: int
 ) -> None:
     events = record_events(service, monkeypatch)
-    monkeypatch.setattr(synthesizer_service, "load_lip_model", fail_to_load)
+    monkeypatch.setattr(face_maker, "load_lip_model", fail_to_load)
     face = FaceSettings(lip_model="ferguson", shapes=["vrm"])
     if change == "move":
         service.stop_session("gap")
