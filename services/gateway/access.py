@@ -14,7 +14,7 @@ _PREFLIGHT = {
     "Access-Control-Allow-Methods": "GET, POST, DELETE",
     "Access-Control-Allow-Headers": "Authorization, Content-Type",
 }
-_READABLE = {"Access-Control-Expose-Headers": "Location"}
+_READABLE = {"Access-Control-Expose-Headers": "Location, Retry-After, Kouxing-Remarks"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,9 +48,13 @@ class AccessPolicy:
             pattern = resource.canonical if resource is not None else ""
             if request.path not in private_paths and pattern not in private_paths:
                 return await handler(request)
-            self._check_origin(request)
-            self._check_token(request)
-            response = await handler(request)
+            try:
+                self._check_origin(request)
+                self._check_token(request)
+                response = await handler(request)
+            except web.HTTPException as error:
+                error.headers.update(self._cors(request))
+                raise
             if not response.prepared:
                 response.headers.update(self._cors(request))
             return response

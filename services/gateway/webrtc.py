@@ -6,15 +6,19 @@ import re
 from collections.abc import AsyncIterator, Callable, Sequence
 
 import aioice
+import aiortc.rtcrtpreceiver
 import numpy as np
 from aiortc import (
     MediaStreamTrack,
     RTCConfiguration,
     RTCDataChannel,
     RTCPeerConnection,
+    RTCRtpCodecCapability,
     RTCSessionDescription,
 )
+from aiortc.jitterbuffer import JitterBuffer, JitterFrame
 from aiortc.mediastreams import MediaStreamError
+from aiortc.rtp import RtpPacket
 from av import AudioFrame
 
 from kouxing.shared.errors import UserError
@@ -23,12 +27,35 @@ CONNECT_LIMIT_S = 20.0  # limit from the answer to the first sound
 MAX_CONCEALED_SAMPLES = 14_400  # lost samples that are concealed, so that speech continues
 MAX_GAP = 600 * 48_000  # samples; after a longer gap, timestamps restart
 _TIMESTAMP_RANGE = 2**32  # RTP timestamps wrap around at this value
-_OPUS = re.compile(r"^a=rtpmap:\d+ opus/48000/2\s*$", re.IGNORECASE | re.MULTILINE)
+_OPUS = RTCRtpCodecCapability("audio/opus", 48_000, 2)
+_OPUS_LINE = re.compile(r"^a=rtpmap:\d+ opus/48000/2\s*$", re.IGNORECASE | re.MULTILINE)
+_NOT_OPUS = "expected an offer that sends an audio track in Opus (opus/48000/2)"
 
 
 def use_addresses(addresses: Sequence[str]) -> None:
     """Restrict all connections of this process to these addresses of the machine."""
     aioice.ice.get_host_addresses = lambda use_ipv4, use_ipv6: [*addresses]
+
+
+class _NoJitterBuffer(JitterBuffer):
+    """Passes each packet on when it arrives. An Opus packet is a whole frame.
+
+    aiortc's buffer holds 80 ms of audio; after a lost packet, 0.32 s. If the client stops sending
+    in pauses, it holds the end of the speech until the next packets arrive.
+    """
+
+    def add(self, packet: RtpPacket) -> tuple[bool, JitterFrame | None]:
+        return False, JitterFrame(packet._data, packet.timestamp)  # type: ignore[attr-defined]
+
+
+def _make_jitter_buffer(
+    capacity: int, prefetch: int = 0, *, is_video: bool = False
+) -> JitterBuffer:
+    kind = JitterBuffer if is_video else _NoJitterBuffer
+    return kind(capacity, prefetch, is_video)
+
+
+aiortc.rtcrtpreceiver.JitterBuffer = _make_jitter_buffer  # type: ignore[attr-defined,assignment]
 
 
 class WebRtcPeer:
@@ -42,6 +69,8 @@ class WebRtcPeer:
     def __init__(self, on_channel: Callable[[RTCDataChannel], None]) -> None:
         # No STUN or TURN servers: this machine's addresses are not reported to any server.
         self._connection = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+        # Without this, a client that prefers another codec would send audio in that codec.
+        self._connection.addTransceiver("audio", "recvonly").setCodecPreferences([_OPUS])
         self._connection.on("datachannel", on_channel)
         self._connection.on("track", self._on_track)
         self._track: MediaStreamTrack | None = None
@@ -51,6 +80,8 @@ class WebRtcPeer:
 
         Raises ``UserError`` if the text is not an offer with an audio track in Opus.
         """
+        if not _OPUS_LINE.search(offer):
+            raise UserError(_NOT_OPUS)
         try:
             await self._connection.setRemoteDescription(RTCSessionDescription(offer, "offer"))
             for transceiver in self._connection.getTransceivers():
@@ -59,15 +90,15 @@ class WebRtcPeer:
             await self._connection.setLocalDescription(await self._connection.createAnswer())
         except Exception as error:  # aiortc raises various types for malformed lines
             raise UserError(f"cannot answer this SDP offer: {error}") from None
-        if self._track is None or not _OPUS.search(offer):
-            raise UserError("expected an offer with an audio track in Opus (opus/48000/2)")
+        if self._track is None:
+            raise UserError(_NOT_OPUS)
         return self._connection.localDescription.sdp
 
     async def receive_audio(self) -> AsyncIterator[tuple[int, bytes, int]]:
         """Yield received audio until the connection ends.
 
         Up to ``MAX_CONCEALED_SAMPLES`` lost samples are concealed: the audio before the gap is
-        repeated and fades out.
+        repeated and fades out. Packets that arrive after a later packet are dropped.
 
         Yields
         ------

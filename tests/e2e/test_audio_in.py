@@ -3,24 +3,35 @@
 import asyncio
 import difflib
 import json
+import re
 from collections.abc import Callable, Coroutine
+from fractions import Fraction
 from random import Random
 
 import aiohttp
 import aioice
 import numpy as np
 import pytest
-from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription
+from aiortc import (
+    MediaStreamTrack,
+    RTCConfiguration,
+    RTCPeerConnection,
+    RTCRtpSender,
+    RTCSessionDescription,
+)
 from aiortc.contrib.media import MediaPlayer
 from aiortc.rtcdtlstransport import RTCDtlsTransport
+from av import AudioFrame
 
 from kouxing.services.gateway.browser_messages import FAP_TYPE, SHAPES_TYPE
+from kouxing.services.gateway.webrtc import WebRtcPeer
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.inventory import load_inventory
 from tests.e2e.streaming import stream_audio
 from tests.system import DEMO, LIMIT_S, System, samples_of_file
 
 SDP = "application/sdp"
+RTP_UNIT = Fraction(1, 48_000)
 OPEN_JAW = 2  # index of FAP 3
 SPEECH = DEMO / "lake-male.wav"
 Send = Callable[[RTCDtlsTransport, bytes], Coroutine[None, None, None]]
@@ -103,7 +114,7 @@ def test_webrtc_streams_sound_and_returns_frames_despite_lost_packets(
         ("{}", "application/json", 415, "expected an SDP offer (application/sdp)"),
         ("hello", SDP, 422, "expected"),
         ("v=0\r\n", SDP, 422, "an audio track in Opus"),
-        ("v=0\r\nm=audio x", SDP, 422, "cannot answer this SDP offer"),
+        ("v=0\r\nm=audio x\r\na=rtpmap:96 opus/48000/2", SDP, 422, "cannot answer this SDP offer"),
         (b"\xff\xfe", SDP, 422, "expected"),
     ],
 )
@@ -119,3 +130,81 @@ def test_whip_rejects_bodies_that_are_not_opus_offers(
             assert (answer.status, text in await answer.text()) == (status, True)
 
     asyncio.run(post())
+
+
+@pytest.mark.parametrize(
+    ("codecs", "status", "answered"),
+    [(["PCMU", "opus"], 201, {"opus/48000/2"}), (["PCMU"], 422, set())],
+)
+def test_whip_answers_with_opus_even_if_the_client_prefers_another_codec(
+    system: System, codecs: list[str], status: int, answered: set[str]
+) -> None:
+    async def post() -> None:
+        offered = {codec.mimeType: codec for codec in RTCRtpSender.getCapabilities("audio").codecs}
+        peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+        peer.addTransceiver("audio").setCodecPreferences(
+            [offered[f"audio/{name}"] for name in codecs]
+        )
+        await peer.setLocalDescription(await peer.createOffer())
+        async with (
+            aiohttp.ClientSession() as http,
+            http.post(
+                f"{system.page}whip",
+                data=peer.localDescription.sdp,
+                headers={"Content-Type": SDP},
+            ) as answer,
+        ):
+            text = await answer.text()
+            assert answer.status == status
+            assert set(re.findall(r"^a=rtpmap:\d+ (\S+)", text, re.MULTILINE)) == answered
+            if status == 201:
+                resource = system.page.rstrip("/") + answer.headers["Location"]
+                await http.delete(resource)
+        await peer.close()
+
+    asyncio.run(post())
+
+
+class _SpeechThenNothing(MediaStreamTrack):
+    """Silence, a loud end, and then no packets, like a client that does not transmit pauses."""
+
+    kind = "audio"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._num_frames = 0
+
+    async def recv(self) -> AudioFrame:
+        if self._num_frames == 30:
+            await asyncio.Event().wait()
+        samples = np.zeros((1, 960), np.int16)
+        if self._num_frames >= 28:
+            samples[:] = 20_000 * np.sin(np.arange(960) / 20)
+        frame = AudioFrame.from_ndarray(samples, format="s16", layout="mono")
+        frame.sample_rate, frame.pts, frame.time_base = 48_000, self._num_frames * 960, RTP_UNIT
+        self._num_frames += 1
+        return frame
+
+
+def test_the_end_of_speech_arrives_although_no_packet_follows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
+
+    async def call() -> None:
+        client = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+        client.addTrack(_SpeechThenNothing())
+        await client.setLocalDescription(await client.createOffer())
+        gateway = WebRtcPeer(lambda _: None)
+        answer = await gateway.answer(client.localDescription.sdp)
+        await client.setRemoteDescription(RTCSessionDescription(answer, "answer"))
+        async with asyncio.timeout(LIMIT_S):
+            async for _, pcm, _ in gateway.receive_audio():
+                if np.frombuffer(pcm, "<i2").max() > 5_000:
+                    break
+            else:
+                pytest.fail("the connection has ended")
+        await gateway.close()
+        await client.close()
+
+    asyncio.run(call())

@@ -156,7 +156,11 @@ def test_whip_accepts_bearer_tokens_from_trusted_origins(public_gateway: HttpGat
     assert public_gateway.ask("whip", "OPTIONS", Origin="https://evil.example").status == 403
     for token, status in (("wrong", 403), ("secret", 404)):
         headers = {"Origin": "https://tool.example", "Authorization": f"Bearer {token}"}
-        assert public_gateway.ask("whip/unknown", "DELETE", **headers).status == status
+        answer = public_gateway.ask("whip/unknown", "DELETE", **headers)
+        assert answer.status == status
+        # Without these headers, the browser hides the answer from the page.
+        assert answer.headers["Access-Control-Allow-Origin"] == "https://tool.example"
+        assert "Retry-After" in answer.headers["Access-Control-Expose-Headers"]
 
 
 @pytest.mark.parametrize(
