@@ -43,7 +43,7 @@ class EmotionRecording:
 
 
 def read_emotions(folder: Path, *, any_license: bool = True) -> list[EmotionRecording]:
-    """Read the list of a folder; ``UserError`` if it is missing or names no known emotion.
+    """Read the list of a folder; raises ``UserError`` if it is missing or names no known emotion.
 
     Without ``any_license``, recordings whose license does not allow distributing a model are
     skipped.

@@ -31,7 +31,7 @@ def recognize_events(
 ) -> list[SoundEvent]:
     """Return the events of a whole sound, 16 kHz mono, shape (n,).
 
-    With ``lip_predictor``, they include lip frames for a face with the delay ``face_delay_s``.
+    With ``lip_predictor``, they include lip positions for a face with the delay ``face_delay_s``.
     Without ``config``, the default settings are used.
     """
     config = config or RecognizerConfig()

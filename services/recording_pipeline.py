@@ -1,7 +1,7 @@
 """Animates a face from a whole recording.
 
     sound -> phones, recognized as in live audio, or by forced alignment of a known text
-          -> lip frames with the longest delay
+          -> lip positions with the longest delay
           -> face
 
 The live pipeline's ``FaceAnimator`` makes the face, with the same lip models and modifiers. It has
@@ -56,7 +56,7 @@ class AnalyzedRecording:
     """All inputs of a face, for a whole recording."""
 
     duration_s: float
-    events: Sequence[SoundEvent]  # phones, lip frames, voice activity and levels; not sorted
+    events: Sequence[SoundEvent]  # phones, lip positions, voice activity and levels; not sorted
     is_text_known: bool
 
     @property
@@ -73,10 +73,10 @@ def analyze_recording(
     is_text_known: bool = True,
     with_progress: WithProgress = iter,
 ) -> AnalyzedRecording:
-    """Find the lip frames, voice activity and levels of a recording, 16 kHz mono, shape (n,).
+    """Find the lip positions, voice activity and levels of a recording, 16 kHz mono, shape (n,).
 
     ``phones`` are recognized, or come from a known text. Without ``lip_predictor``, there are no
-    lip frames. ``with_progress`` wraps the loop to show progress.
+    lip positions. ``with_progress`` wraps the loop to show progress.
     """
     lip_stream = None
     if lip_predictor is not None:

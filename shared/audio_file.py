@@ -227,7 +227,7 @@ def read_audio(path: Path) -> tuple[Samples, int]:
 def limited_blocks(
     source: AudioSource, max_duration_s: float = MAX_DURATION_S
 ) -> Iterator[Samples]:
-    """Yield the blocks of a recording; ``UserError`` if it is too long."""
+    """Yield the blocks of a recording; raises ``UserError`` if it is too long."""
     num_samples = 0
     for block in source.blocks:
         num_samples += len(block)

@@ -46,14 +46,14 @@ class ProbeResult(Enum):
     """Result of an attempt to connect to an endpoint."""
 
     ACCEPTED = "accepted"
-    REFUSED = "refused"  # the service rejects this key, or uses another key
+    REFUSED = "refused"  # the service rejects this key, or has another key
     UNREACHABLE = "unreachable"
 
 
 class Bus:
     """The sockets of one process.
 
-    With a key, the sockets accept only the allowed keys, ``zap``. Without a key, nothing is
+    With a key, the sockets accept only the allowed keys (see ``Zap``). Without a key, nothing is
     encrypted, and every peer is accepted. ``extra_connections`` are allowed in addition to the
     usual limit. Raises ``UserError`` if the allowed keys cannot be read.
     """

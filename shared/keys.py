@@ -107,7 +107,10 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
 
 
 def _create_control_key(folder: Path, path: Path, roles: Collection[str], control: str) -> None:
-    """Create control's key because ``path`` is missing; ``UserError`` if control runs elsewhere."""
+    """Create control's key because ``path`` is missing.
+
+    Raises ``UserError`` if control runs elsewhere.
+    """
     has_keys = any(folder.glob("*.key"))
     if path.stem == CONTROL and has_keys:
         raise UserError(

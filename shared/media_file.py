@@ -336,7 +336,10 @@ def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:
 
 
 class _GuardedFile:
-    """A file that keeps exceptions such as Ctrl-C, because FFmpeg would take them for the end."""
+    """A file that keeps exceptions such as Ctrl-C for later.
+
+    FFmpeg would treat them as the end of the file.
+    """
 
     def __init__(self, file: BinaryIO, *, can_seek: bool) -> None:
         self.name = str(getattr(file, "name", ""))
@@ -348,7 +351,7 @@ class _GuardedFile:
             self.seek, self.tell = partial(self._call, file.seek), partial(self._call, file.tell)
 
     def check(self) -> None:
-        """Raise the exception, if any; ``UserError`` if the system cannot read the file."""
+        """Raise the exception, if any; raises ``UserError`` if the system cannot read the file."""
         if is_interrupted():
             raise KeyboardInterrupt
         if isinstance(self._failure, OSError):

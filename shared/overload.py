@@ -71,7 +71,7 @@ class SkipPolicy:
     def update(self, waiting_s: float, now_s: float) -> bool:
         """Return whether the session must now skip all audio except the newest.
 
-        ``waiting_s`` is the duration of the audio that is queued after the oldest piece.
+        ``waiting_s`` is the duration of the audio that is queued after the oldest chunk.
         """
         self.is_behind = False
         if now_s < self._start_s:

@@ -34,9 +34,9 @@ class PeerQuota:
     def excess(self, connections: Sequence[PeerConnection]) -> Iterator[tuple[PeerConnection, str]]:
         """Yield the connections that must end, with the reason.
 
-        ``connections`` are sorted from the oldest. Silent connections end first, starting with the
-        owner that has the most. An owner first loses its oldest silent connection, then its newest
-        connection.
+        ``connections`` are sorted from the oldest. Silent connections end first. The owner with the
+        most connections loses one first: its oldest silent connection, or else its newest
+        connection that has sent messages.
         """
         if len(connections) <= MAX_KEY_SHARE * self.max_clients:
             return

@@ -132,7 +132,7 @@ class Service(MessageLoop):
         return {}
 
     def on_control_restart(self) -> None:
-        """React to a restart of control, which has only the data of heartbeats."""
+        """Handle a restart of control, which then has only the data of heartbeats."""
 
     def gauges(self) -> dict[str, float]:
         """Return additional figures by name, for heartbeats and Prometheus."""

@@ -61,7 +61,10 @@ def read_text(path: Path, max_bytes: int) -> str:
 
 
 def split_lines(path: Path, text: str) -> Iterator[str]:
-    """Yield the lines of a file's text; ``UserError`` if one is too long to split into columns."""
+    """Yield the lines of a file's text.
+
+    Raises ``UserError`` if a line is too long to split into columns.
+    """
     for number, line in enumerate(io.StringIO(text, None), start=1):
         if len(line) > _MAX_LINE:
             raise UserError(f"{path}: line {number} has more than {_MAX_LINE} characters; cut it")

@@ -55,7 +55,10 @@ _MIN_DEVIATION = 1e-3
 def train_traits(
     recordings: Path, sounds: Sequence[Path], output: Path, *, any_license: bool
 ) -> None:
-    """Train the readout, and write it with its card; ``UserError`` if a file cannot be read."""
+    """Train the readout, and write it with its card.
+
+    Raises ``UserError`` if a file cannot be read.
+    """
     rng = np.random.default_rng(SEED)
     speech = read_emotions(recordings, any_license=any_license)
     labeled = [recording for recording in speech if recording.emotion]

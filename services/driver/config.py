@@ -26,7 +26,7 @@ class Framing(StrEnum):
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Return width and height of ``WIDTHxHEIGHT``, pixels; ``ValueError`` if the text is not one.
+    """Return width and height of ``WIDTHxHEIGHT``, pixels; raises ``ValueError`` for other texts.
 
     Limits are 16x16 and 7680x4320.
     """

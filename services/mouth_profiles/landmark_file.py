@@ -33,7 +33,7 @@ _MAX_PIXEL = 1e5
 
 
 def parse_landmark_file(content: bytes) -> FilmedSpeech:
-    """Parse a landmark file; ``UserError`` if it is invalid or does not show a face."""
+    """Parse a landmark file; raises ``UserError`` if it is invalid or does not show a face."""
     try:
         time_s, landmarks, samples = _parse(content)
     except ValueError as error:

@@ -10,7 +10,7 @@ t        tracked FAPs                                                 (n, delays
 P        hidden values [h, u] of the lip model                        (n, 2 units)
 s, b     scale and offset of each FAP, s shrunk toward 1              (15,)
 r        residual, shrunk toward 0                                    (2 units, delays, 15)
-k        strength of the ridge, positions                             1
+k        strength of the ridge, encoder frames                        1
 v        mean variance of the hidden values                           1
 ======== ============================================================ ===================
 
@@ -45,14 +45,14 @@ from kouxing.shared.errors import UserError
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # ridge parameters to try, positions
+STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # ridge strengths to try, encoder frames
 FACE_DELAY_S = 0.06  # delay of the face for which the gain is measured
 MIN_SPEECH_S = 10.0
 
 _NUM_FAPS = len(LIP_FAPS)
-_BLOCK = 250  # adjacent positions that stay in one fold
+_BLOCK = 250  # adjacent encoder frames that stay in one fold
 _MAX_FOLDS = 5
-_SCALE_SHRINKAGE = 250.0  # weight of a scale of 1, positions
+_SCALE_SHRINKAGE = 250.0  # weight of a scale of 1, encoder frames
 _HELD_OUT = 0.25  # fraction at the end of the speech
 _LAGS_S = np.arange(-20, 21) / 100  # possible lags of a camera
 _MIN_LAG_CORRELATION = 0.3  # below this correlation, the lag of a camera is not estimated
@@ -69,7 +69,7 @@ class FilmedSpeech:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observations:
-    """Predicted and tracked lips at the positions of speech."""
+    """Predicted and tracked lips at the encoder frames of speech."""
 
     known_s: Array  # (n,)
     predicted: Floats  # (n, delays, 15)
@@ -198,7 +198,7 @@ def _is_tracked(observations: Observations) -> NDArray[np.bool_]:
 
 
 def _is_known(observations: Observations) -> NDArray[np.bool_]:
-    """Mask of the positions where these FAPs are known for all delays, (n,)."""
+    """Mask of the encoder frames where these FAPs are known for all delays, (n,)."""
     unknown = np.isnan(observations.tracked[..., _is_tracked(observations)])
     known: NDArray[np.bool_] = ~unknown.any(axis=(1, 2)) & (unknown.shape[2] > 0)
     return known
@@ -270,7 +270,7 @@ class LearnedProfile:
 
 
 def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
-    """Learn a mouth profile; ``UserError`` if too little speech shows the lips."""
+    """Learn a mouth profile; raises ``UserError`` if too little speech shows the lips."""
     lip_predictor = load_lip_predictor()
     observations = Observations.join([observe(lip_predictor, filmed) for filmed in recordings])
     return LearnedProfile(

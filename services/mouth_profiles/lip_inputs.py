@@ -23,14 +23,14 @@ class LipInputs:
     """Records the lip predictor's inputs over one recording; implements ``LipFrameStream``."""
 
     def __init__(self) -> None:
-        self.starts: list[int] = []  # first position of each segment of speech
+        self.starts: list[int] = []  # first encoder frame of each segment of speech
         self.known_s: list[float] = []  # media time up to which the audio is known
-        self.features: list[NDArray[np.float16]] = []  # features of each position, (features,)
+        self.features: list[NDArray[np.float16]] = []  # of each encoder frame, (features,)
 
     def process_position(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
-        """Store the encoder's features at a position."""
+        """Store the features of an encoder frame."""
         self.known_s.append(known_s)
         self.features.append(join_features(frames, features).astype(np.float16))
         return []
@@ -45,5 +45,5 @@ def record_lip_inputs(samples: Floats) -> LipInputs:
     positions = LipInputs()
     segmenter = SpeechSegmenter(WhisperMel(), positions)
     for _ in segmenter.accept_waveform(to_16_khz(samples, SAMPLE_RATE_HZ)):
-        pass  # only the positions are needed
+        pass  # only the encoder frames are needed
     return positions

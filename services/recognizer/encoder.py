@@ -1,12 +1,12 @@
 """The audio encoder: a recurrent network that processes all audio, with and without speech.
 
-It computes the inputs of the voice activity detector and the lip predictor. A position is 20 ms of
-audio, two log-mel frames.
+It computes the inputs of the voice activity detector and the lip predictor. An *encoder frame* is
+20 ms of audio, two log-mel frames.
 
 ======== ======================================================== ==================
 symbol   meaning                                                  shape
 ======== ======================================================== ==================
-x        the two frames of a position                             (160,)
+x        the two log-mel frames of an encoder frame               (160,)
 h        state of the recurrent layers                            (state width,)
 f        features for a lip predictor                             (features,)
 q        log posteriors of the phones of the default language,    (phones,)
@@ -59,20 +59,20 @@ class VoiceKind(IntEnum):
 
 
 class EncoderOutput(NamedTuple):
-    """The encoder's outputs at a position; shapes as above."""
+    """The encoder's outputs for an encoder frame; shapes as above."""
 
     frames: Floats  # x as (2, 80)
     features: Floats
     phones: Floats
     voice: Floats
-    state: Floats  # h after the position
+    state: Floats  # h after the encoder frame
 
 
 class AudioEncoder:
     """The encoder network, shared by any number of streams."""
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
-        """Open an ONNX file; ``ValueError`` if it does not contain an audio encoder."""
+        """Open an ONNX file; raises ``ValueError`` if it does not contain an audio encoder."""
         self._session = open_onnx_session(file)
         nodes = [*self._session.get_inputs(), *self._session.get_outputs()]
         widths = {node.name: node.shape[-1] for node in nodes}
@@ -90,9 +90,9 @@ class AudioEncoder:
         check_outputs(values, [(1, size) for size in sizes])
 
     def run(self, frames: Floats, states: Floats) -> list[Floats]:
-        """Compute f, q, v and the new state of n positions from x as (n, 2, 80) and h as (n, -).
+        """Compute f, q, v and the new state of n encoder frames: x is (n, 2, 80), h is (n, -).
 
-        Other positions do not affect a position's results.
+        Other encoder frames do not affect the results of one.
         """
         inputs = {"frames": frames.reshape(len(frames), -1), "state": states}
         outputs: list[Floats] = run_onnx_session(self._session, _OUTPUTS, inputs)
@@ -104,21 +104,21 @@ class AudioEncoder:
 
 
 class EncoderStream:
-    """Runs the encoder on one session's audio, position by position."""
+    """Runs the encoder on one session's audio, one encoder frame at a time."""
 
     def __init__(self, encoder: AudioEncoder) -> None:
         self.encoder = encoder
         self.state = np.zeros(encoder.state_width, np.float32)
 
     def process_position(self, frames: Floats) -> EncoderOutput:
-        """Process the next position's frames, (2, 80)."""
+        """Process the next encoder frame: its two feature frames, (2, 80)."""
         return process_positions([self], [frames])[0]
 
 
 def process_positions(
     streams: Sequence[EncoderStream], frames: Sequence[Floats]
 ) -> list[EncoderOutput]:
-    """Process the next frames, (2, 80), of several streams of one encoder in one run."""
+    """Process the next encoder frame, (2, 80), of several streams of one encoder in one run."""
     states = np.array([stream.state for stream in streams])
     outputs = streams[0].encoder.run(np.array(frames), states)
     positions = []
@@ -131,7 +131,7 @@ def process_positions(
 
 @cache
 def load_encoder(path: Path = ENCODER_PATH) -> AudioEncoder:
-    """Read a model file; ``UserError`` if it is missing, broken or of another format."""
+    """Read a model file; raises ``UserError`` if it is missing, broken or of another format."""
     return load_component(
         path,
         FORMAT,

@@ -52,7 +52,7 @@ class HopController:
     def update(self, work: ProcessorTime, now_s: float, *, is_behind: bool) -> int:
         """Return the hop for the total work on live sessions so far.
 
-        ``is_behind`` tells whether a session is behind.
+        Set ``is_behind`` if a session's results are late.
         """
         self._is_behind |= is_behind
         passed_s = now_s - self._since_s

@@ -1,7 +1,8 @@
-"""The interface of a model that predicts lip frames from the audio.
+"""The interface of a model that predicts lip positions from the audio.
 
-The audio encoder computes features at every position, 50 times a second. From these features, the
-model predicts lip frames during speech. A model offers several delays; the recognizer chooses one.
+The audio encoder computes features for every encoder frame, 50 times a second. From these features,
+the model predicts lip positions during speech. A model offers several delays; the recognizer
+chooses one.
 """
 
 from collections.abc import Sequence
@@ -12,25 +13,25 @@ from numpy.typing import NDArray
 
 from kouxing.shared.phones.events import LipPositions
 
-# FAP frames are due every 20 ms of audio. The network's positions end this much earlier: windows
+# FAP frames are due every 20 ms of audio. An encoder frame ends this much earlier, because windows
 # of 25 ms in steps of 20 ms cannot end closer.
 POSITION_LAG_S = 0.005
 
 
 class LipFrameStream(Protocol):
-    """Predicts the lip frames of one session, segment by segment."""
+    """Predicts the lip positions of one session, segment by segment."""
 
     def process_position(
         self, known_s: float, frames: NDArray[np.float32], features: NDArray[np.float32]
     ) -> list[LipPositions]:
-        """Return the lip frames that a position's features determine.
+        """Return the lip positions that an encoder frame determines.
 
         Parameters
         ----------
         known_s
-            Media time of the position's last sample, seconds.
+            Media time of the encoder frame's last sample, seconds.
         frames
-            The position's two log-mel frames, shape (2, 80).
+            Its two log-mel frames, shape (2, 80).
         features
             The encoder's features, shape (features,).
         """
@@ -50,10 +51,10 @@ class LipFrameModel(Protocol):
         """Create a session's stream with some of the delays."""
 
     def with_mouth_profile(self, content: bytes) -> Self:
-        """Adapt the model to the speaker of a mouth profile; ``UserError`` if it does not fit."""
+        """Adapt the model to a mouth profile's speaker; raises ``UserError`` if it does not fit."""
 
 
 def choose_delay(delays_s: Sequence[float], face_delay_s: float) -> float:
-    """Choose the longest delay whose lip frames are in time for a face with this delay."""
+    """Choose the longest delay whose lip positions are in time for a face with this delay."""
     in_time = [delay for delay in delays_s if delay + POSITION_LAG_S <= face_delay_s + 1e-6]
     return max(in_time, default=min(delays_s))

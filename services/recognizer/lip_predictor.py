@@ -21,9 +21,9 @@ The last features are the encoder's own estimate of the lips. This estimate was 
 voices, so it generalizes best and contributes most to the FAPs. A also contains linear regressions
 to the lips of filmed speakers. B [h, u] follows these speakers more closely.
 
-There is a position every 20 ms during speech, and no lip frames elsewhere. A position that has seen
-the audio up to T gives, for every delay d, the mouth at T - d. Every position is one step, so
-neither the chunking nor other sessions affect the lip frames.
+During speech, there is an encoder frame every 20 ms. From the audio up to T, it gives the mouth at
+T - d for every delay d. Elsewhere, there are no lip positions. Every encoder frame is one step, so
+neither the chunking nor other sessions affect the lip positions.
 
 Cost: about 4 ms of one core per second of speech.
 """
@@ -105,7 +105,7 @@ class LipPredictor:
         return self._weights_by_delays[key]
 
     def create_stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
-        """Create a session's stream; ``UserError`` if the model lacks one of the delays."""
+        """Create a session's stream; raises ``UserError`` if the model lacks one of the delays."""
         unknown = [delay_s for delay_s in delays_s if delay_s not in self.delays_s]
         if unknown:
             choices = ", ".join(f"{1e3 * delay_s:g}" for delay_s in self.delays_s)
@@ -146,7 +146,7 @@ class LipPredictor:
 
 
 class LipPredictorStream:
-    """Predicts the lip frames of one session, segment by segment."""
+    """Predicts the lip positions of one session, segment by segment."""
 
     def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
         self._model = model
@@ -158,13 +158,13 @@ class LipPredictorStream:
     def reset(self) -> None:
         """Start a new segment of speech."""
         self._state = np.zeros(len(self._model.state_weights), np.float32)
-        # [h, u] at the last position
+        # [h, u] at the last encoder frame
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
     def process_position(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
-        """Return a position's lip frames; see ``LipFrameStream``."""
+        """Return the lip positions of an encoder frame; see ``LipFrameStream``."""
         outputs = self.step(join_features(frames, features))
         return [
             LipPositions(
@@ -218,12 +218,12 @@ def _sigmoid(x: Floats) -> Floats:
 
 
 def load_lip_predictor(path: Path = LIP_PREDICTOR_PATH) -> LipPredictor:
-    """Read a file; ``UserError`` if it is missing, broken or of another format."""
+    """Read a file; raises ``UserError`` if it is missing, broken or of another format."""
     return load_component(path, FORMAT, "lip predictor", _parse_lip_predictor)
 
 
 def _parse_lip_predictor(archive: Archive) -> LipPredictor:
-    """Build the predictor after checking every size; ``ValueError`` if an array does not fit."""
+    """Build the predictor after checking every size; raises ``ValueError`` if a size is wrong."""
     delays = archive.floats("delays", *_read_shape(archive, "delays", 1))
     if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:
         raise ValueError(f"its delays are {delays.tolist()}")

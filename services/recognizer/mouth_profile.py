@@ -92,7 +92,7 @@ def parse_mouth_profile(
 
 
 def read_mouth_profile(path: Path) -> bytes:
-    """Read a file that starts like a mouth profile; ``UserError`` if it does not."""
+    """Read a file that starts like a mouth profile; raises ``UserError`` if it does not."""
     content = read_file(path, MAX_MOUTH_PROFILE_BYTES)
     if content[: len(_MAGIC)] != _MAGIC:
         raise UserError(f"{path} is not a mouth profile; make one with 'kouxing adapt'")

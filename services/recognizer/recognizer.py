@@ -1,4 +1,4 @@
-"""The recognizer: live audio in, phones, lip frames and speech events out.
+"""The recognizer: live audio in, phones, lip positions and speech events out.
 
 The five verbs come from sherpa-onnx: create_stream, accept_waveform, is_ready, decode_streams
 and get_result.
@@ -51,11 +51,11 @@ class Recognizer:
         """Create the stream of one session.
 
         The rate is 8000 to 48000 Hz. Channels are averaged. Without ``lip_predictor``, there are no
-        lip frames. Otherwise, they get the longest delay that is in time for a face with the delay
-        ``face_delay_s``. ``speech_time`` is the media time, samples at 16 kHz, at which the current
-        speech started at another recognizer. The networks' blocks then align with the other
-        recognizer's. ``language`` is the language of the phones; None is the recognizer's own.
-        Other models are loaded at their first use.
+        lip positions. With it, they have the longest available delay that is still in time for a
+        face with the delay ``face_delay_s``, seconds. ``speech_time`` is the media time, samples at
+        16 kHz, at which the current speech started at another recognizer. The networks' blocks then
+        align with the other recognizer's. ``language`` is the language of the phones; None is the
+        recognizer's own. Other models are loaded at their first use.
 
         Raises ``UserError`` if no model has the language.
         """

@@ -224,7 +224,7 @@ class SpeechScorer:
                 self._num_unscored = 0
 
     def take_early_events(self) -> list[EarlyEvent]:
-        """Return lip frames and levels of unscored speech, before its phones."""
+        """Return lip positions and levels of unscored speech, before its phones."""
         unscored: list[SpeechFrames] = []
         early: list[EarlyEvent] = []
         while self._detected and isinstance(item := self._detected[0], SpeechFrames | EarlyEvent):

@@ -1,10 +1,10 @@
 """Finds the speech in one session's audio, and predicts the lips during speech.
 
-    samples -> front ends -> audio encoder -> [speech only] frames, lip frames
+    samples -> front ends -> audio encoder -> [speech only] feature frames, lip positions
 
 Time is media time, counted from the first sample. Feature frame ``t`` covers the 10 ms around the
 middle of its window. Any chunking of the same audio gives the same result, because every step
-processes whole positions, in order.
+processes whole encoder frames, in order.
 """
 
 from collections import deque
@@ -25,11 +25,11 @@ from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import LipPositions
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
-_DETECTION_S = 0.06  # the encoder's look-ahead, and a position
-# Positions end at odd frames, POSITION_LAG_S before a multiple of 20 ms. So speech starts at an
-# odd frame.
+_DETECTION_S = 0.06  # the encoder's look-ahead, and an encoder frame
+# Encoder frames end at odd feature frames, ``POSITION_LAG_S`` before a multiple of 20 ms. Therefore
+# speech starts at an odd frame.
 _FIRST_FRAME_PARITY = 1
-_SEEN_AFTER_FRAMES = 2  # frames after speech starts that its first lip frame needs
+_SEEN_AFTER_FRAMES = 2  # frames after speech starts that its first lip positions need
 _BLOCK_FRAMES = 4  # frames in a block of the network; blocks start with the speech
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + _DETECTION_S) / HOP_S)
 _MAX_RECENT = (_PRE_ROLL_FRAMES + _BLOCK_FRAMES) // FRAMES_PER_POSITION
@@ -67,7 +67,7 @@ SpeechItem: TypeAlias = SpeechStart | SpeechEnd | SpeechFrames | LipPositions
 class SpeechSegmenter:
     """Divides the audio of one session into speech and pauses.
 
-    ``front_end`` computes the feature frames. Without ``lip_stream``, there are no lip frames.
+    ``front_end`` computes the feature frames. Without ``lip_stream``, there are no lip positions.
     ``start_frame`` is the frame at which speech started at another recognizer, negative before the
     audio. The first speech then starts where the network's blocks align with the other
     recognizer's.
@@ -172,7 +172,7 @@ class SpeechSegmenter:
         return SpeechEnd(self._num_frames)
 
     def _predict_lips(self, position: EncoderOutput, newest_frame: int) -> list[LipPositions]:
-        """Return the lip frames of a position; ``newest_frame`` is its last feature frame."""
+        """Predict from an encoder frame, whose last feature frame is ``newest_frame``."""
         if self._lip_stream is None:
             return []
         known_s = newest_frame * HOP_S + WINDOW_S
@@ -180,7 +180,7 @@ class SpeechSegmenter:
 
 
 def _frames_of(positions: Sequence[tuple[Floats, EncoderOutput]]) -> SpeechFrames:
-    """Return the frames of some positions."""
+    """Return the feature frames of some encoder frames."""
     phones = np.array([position.phones for _, position in positions])
     features = np.concatenate([features for features, _ in positions])
     return SpeechFrames(features, phones.repeat(FRAMES_PER_POSITION, axis=0))

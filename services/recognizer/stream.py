@@ -1,6 +1,6 @@
 """Holds one session's audio and results between the recognizer's calls.
 
-    chunks -> gaps -> resampler -> 20 ms slices -> scores -> phones, lip frames, level
+    chunks -> gaps -> resampler -> 20 ms slices -> scores -> phones, lip positions, level
 
 The chunk sizes do not affect the results. Times are whole samples at 16 kHz, so that messages carry
 them without loss.
@@ -153,7 +153,7 @@ class SpeechStream:
         self._segments = self._segments[-1:]
 
     def decode_early(self) -> None:
-        """Return lip frames and levels of unscored speech, before its phones."""
+        """Add lip positions and levels of unscored speech to the results, before its phones."""
         if self._early_results is not None:
             self._early_results += self._segments[0].decode_early()
         elif len(self._segments) == 1:
@@ -257,11 +257,11 @@ class _AudioSegment:
             self.scorer.accept_waveform(piece, progress)
 
     def decode(self) -> list[StreamOutput]:
-        """Return the new results at the session's times, without lip frames before the audio."""
+        """Return the new results at the session's times, without lip positions before the audio."""
         return self._to_session_times(self._decoder.decode(self.scorer.get_events()))
 
     def decode_early(self) -> list[StreamOutput]:
-        """Return the lip frames and levels of unscored speech, as ``decode`` would later."""
+        """Return the lip positions and levels of unscored speech, as ``decode`` would later."""
         return self._to_session_times(self.scorer.take_early_events())
 
     def _to_session_times(self, results: Iterable[StreamOutput]) -> list[StreamOutput]:

@@ -40,10 +40,10 @@ _FEELING = slice(0, 2)
 _MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # memory of mean arousal and valence; weight of the prior
 _PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # voice: weight of the prior mean, memory of m
 _DIGITS = 2  # feelings change slowly, so that equal messages compress well
-_EVIDENCE_FRACTION = 0.1  # weight of a new position
+_EVIDENCE_FRACTION = 0.1  # weight of a new encoder frame
 _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and stops
 _MIN_LAUGHTER = 0.3  # minimum probability of a laugh
-_LAUGH_POSITIONS = 50  # laughter ends after this many positions without a laugh
+_LAUGH_POSITIONS = 50  # laughter ends after this many encoder frames without a laugh
 
 
 class VoiceTraits(NamedTuple):
@@ -76,12 +76,12 @@ class VoiceTraitsStream:
         self._readout = readout
         self._feeling: list[float] = readout.mean.tolist()
         self._mean = self._feeling
-        self._num_voiced = 0  # positions with a voice
+        self._num_voiced = 0  # encoder frames with a voice
         self._evidence = [0.0] * (NUM_TRAITS - 2)  # evidence of laughter and of breath
-        self._since_laugh = _LAUGH_POSITIONS  # positions since a laugh
+        self._since_laugh = _LAUGH_POSITIONS  # encoder frames since a laugh
 
     def process_position(self, position: EncoderOutput) -> None:
-        """Process the encoder's next position."""
+        """Process the next encoder frame."""
         # For so few numbers, lists are faster than arrays.
         outputs: list[float] = (
             position.state @ self._readout.weights + self._readout.bias
@@ -116,7 +116,7 @@ class VoiceTraitsStream:
 
 @cache
 def load_voice_readout(path: Path = TRAITS_PATH) -> VoiceReadout:
-    """Read a model file; ``UserError`` if it is missing, broken or of another format."""
+    """Read a model file; raises ``UserError`` if it is missing, broken or of another format."""
     return load_component(path, FORMAT, "readout of voice traits", _parse_readout)
 
 

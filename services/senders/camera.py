@@ -49,7 +49,7 @@ class CameraInput(asyncio.DatagramProtocol):
 async def open_camera(
     host: str, port: int, forward: Callable[[bytes], bool]
 ) -> tuple[asyncio.DatagramTransport, CameraInput]:
-    """Receive the packets of a tracker; ``OSError`` if the port is not free."""
+    """Receive the packets of a tracker; raises ``OSError`` if the port is not free."""
     loop = asyncio.get_running_loop()
     return await loop.create_datagram_endpoint(
         lambda: CameraInput(forward), local_addr=(host, port)

@@ -85,12 +85,12 @@ def split_packet(packet: bytes, depth: int = 0) -> Iterator[bytes]:
 
 
 def parse_address(content: bytes) -> str:
-    """Return the address of a message; ``ValueError`` if it is malformed."""
+    """Return the address of a message; raises ``ValueError`` if it is malformed."""
     return _text_at(content, 0)[0]
 
 
 def parse_first_text(content: bytes) -> str:
-    """Return the first argument of a message; ``ValueError`` if it is not a string."""
+    """Return the first argument of a message; raises ``ValueError`` if it is not a string."""
     _, start = _text_at(content, 0)
     kinds, start = _text_at(content, start)
     if not kinds.startswith(",s"):

@@ -1,1 +1,1 @@
-"""The synthesizer service: turns phones and lip frames into FAP frames."""
+"""The synthesizer service: turns phones and lip positions into FAP frames."""

@@ -1,4 +1,4 @@
-"""The synthesizer service: receives phones and lip frames, sends FAP frames.
+"""The synthesizer service: receives phones and lip positions, sends FAP frames.
 
 Handles: results (recognizer), start-session, close-session, flush-session, set-face (control).
 Sends: fap-frame, end-of-faps (subscribers), acknowledge (recognizer).
@@ -117,7 +117,7 @@ class SynthesizerService(SessionService):
             self._end(stopped)
 
     def flush_session(self, session: str) -> None:
-        """Drop queued phones and lip frames; the next frames return to rest."""
+        """Drop queued phones and lip positions; the next frames return to rest."""
         flushed = self._sessions.get(session)
         if flushed is not None:
             flushed.events = deque(

@@ -9,14 +9,15 @@ symbol  meaning                                               unit      shape
 g       gap between the lips in speech                        FAP       (6,)
 d       change of the gap by the expression                   FAP       (6,)
 c       upward movement of both lips by the expression        FAP       (6,)
-a       freedom of the lips, 0 to 1                           1         (6,)
+a       weight of the expression on the lips, 0 to 1          1         (6,)
 ======  ====================================================  ========  =====
 
     g' = g + a d    min(20 - g, 0) <= a d <= max(900 - g, 0)
     both lips move up by c if c > 0, else by a c
 
 ``a`` is 0 where the gap is at most 20 or the lower lip is this close to its closure (f), and 1 from
-80 upwards. Without speech, all lips are free. They are bound again when speech starts.
+80 upwards. Without speech, the expression moves the lips fully: ``a`` is 1. When speech starts,
+``a`` falls again.
 """
 
 from collections.abc import Mapping
@@ -84,7 +85,7 @@ class ExpressionMotion:
 
     @property
     def free(self) -> float:
-        """Freedom of the lips: 1 without speech, 0 shortly after speech starts."""
+        """The least weight of the expression on the lips: 1 without speech, 0 in speech."""
         return self._free
 
     def add(self, faps: NDArray[np.float32], step_s: float, *, is_speaking: bool) -> None:
@@ -103,7 +104,7 @@ class ExpressionMotion:
 
 
 def mix_expression(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:
-    """Add an expression (68,) to a face (68,), in place; ``free`` is the minimum of ``a``."""
+    """Add an expression (68,) to a face (68,), in place; ``free`` is the least ``a``, 0 to 1."""
     gap = -(faps[UPPER] + faps[LOWER])
     room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - CLOSED
     room = np.concatenate([np.minimum(room[:3], room[3:])] * 2)  # inner and outer lip

@@ -19,7 +19,7 @@ r       ridge: keeps similar shapes from rising together        mm        1
 ======  ======================================================  ========  ========
 
 Equation (2) ignores FAPs that a set has no shape for: the head rotation (FAPs 48 to 50), FAPs 1 and
-2 (`high_level` expands them), and for the visemes everything outside the mouth.
+2 (``high_level_faps`` expands them), and for the visemes everything outside the mouth.
 
 ``arkit.tsv`` was measured on MakeHuman's face units (CC0). Its
 column ``live_link`` is the shape's position in Live Link Face. The Oculus visemes are the 15

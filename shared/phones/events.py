@@ -1,4 +1,4 @@
-"""The live results of a recognizer: phones, lip frames, voice activity and level.
+"""The live results of a recognizer: phones, lip positions, voice activity and level.
 
 Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
 """
@@ -99,7 +99,7 @@ class EndOfSound(Record, frozen=True, kw_only=True):
 
 
 class Waveform(Record, frozen=True, kw_only=True):
-    """A piece of the session's audio, as the recognizer processes it."""
+    """A chunk of the session's audio, as the recognizer processes it."""
 
     time_s: float  # time of the first sample
     samples: NDArray[np.float32]  # (n,) 16 kHz mono

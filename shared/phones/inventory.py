@@ -71,7 +71,7 @@ VisemeFractions = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class PhoneInventory:
-    """The phones, visemes and lexicon of a language; ``UserError`` if they are not valid."""
+    """The phones, visemes and lexicon of a language; raises ``UserError`` if they are not valid."""
 
     language: str
     phones: tuple[str, ...]  # (num_phones,) in the order of the acoustic models' outputs

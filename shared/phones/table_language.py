@@ -75,7 +75,7 @@ class TableLanguage:
     phones: tuple[str, ...]
 
     def pronounce(self, text: str) -> list[tuple[str, ...]]:
-        """Return the phones of each word of a text; ``UserError`` if a part cannot be read."""
+        """Return the phones of each word of a text; raises ``UserError`` if one cannot be read."""
         transcript = self.transcribe(text)
         if transcript.dropped:
             raise UserError(

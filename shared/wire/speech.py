@@ -23,7 +23,7 @@ class AudioState(StrEnum):
     RUNNING = "running"
     STALLED = "stalled"  # the client sends no audio, so media time does not advance
     RESUMED = "resumed"  # the client sends audio again, which is not processed yet
-    SKIPPED = "skipped"  # the audio before was too old: the face continues here
+    SKIPPED = "skipped"  # the audio before this time was too old, and was skipped
     ENDED = "ended"  # no more results follow
 
 
@@ -31,7 +31,7 @@ class AcousticModelName(StrEnum):
     """The acoustic models of a session."""
 
     FULL = "full"  # the recognizer's
-    LIGHT = "light"  # fewer right phones, in less time
+    LIGHT = "light"  # more errors, less processor time
 
 
 class Acoustic(RegisteredMessage, frozen=True, kw_only=True):

@@ -125,7 +125,7 @@ def test_services_send_the_frames_of_the_chain(
 
 
 def lip_frames_of(streamed: StreamedSession) -> list[speech.LipPositions]:
-    """Lip frames without session, epoch and sequence."""
+    """Lip positions without session, epoch and sequence."""
     return [
         speech.LipPositions(
             media_time=lips.media_time,

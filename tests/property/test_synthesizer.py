@@ -199,7 +199,7 @@ def test_flush_rests_within_150_ms(phones: list[Phone], frame: int, delay_s: flo
 
 
 def sound(seed: int) -> list[SoundEvent]:
-    """Draw lip frames with pauses and losses, with phones and progress in between."""
+    """Draw lip positions with pauses and losses, with phones and progress in between."""
     rng = np.random.default_rng(seed)
     events: list[SoundEvent] = []
     opening, is_speaking = 0.0, False
@@ -208,7 +208,7 @@ def sound(seed: int) -> list[SoundEvent]:
         if rng.random() < 0.05 or number == 5:
             is_speaking = not is_speaking
             events.append(SpeechChange(active=is_speaking, time_s=now_s))
-        if rng.random() < 0.15 and number > 8:  # after a lip frame, visemes do not move the mouth
+        if rng.random() < 0.15 and number > 8:  # after lip positions, visemes do not move the mouth
             symbol = str(rng.choice(["b", "p", "m", "f", "a", "u", "t"]))
             onset_s, final = max(0.0, now_s - 0.12), bool(rng.random() < 0.5)
             events.append(lips.phone(number, symbol, onset_s, 0.08, final=final))

@@ -1,4 +1,4 @@
-"""Learned lips follow lip frames smoothly, close for closures, and rest."""
+"""Learned lips follow lip positions smoothly, close for closures, and rest."""
 
 from collections.abc import Callable, Sequence
 
@@ -51,7 +51,7 @@ def run(
     lip_frame_at: Callable[[float], LipPositions | None],
     phones: Sequence[tuple[float, Phone]] = (),
 ) -> list[Frame]:
-    """Process sound with lip frames 5 ms before its slices, like a recognizer's output."""
+    """Process sound with lip positions 5 ms before its slices, like a recognizer's output."""
     frames = []
     for number in range(round(begin_s / 0.02) + 1, round(end_s / 0.02) + 1):
         now_s = number * 0.02

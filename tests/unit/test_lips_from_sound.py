@@ -1,4 +1,4 @@
-"""The lip predictor: its steps, its file, and the lip frames of a session."""
+"""The lip predictor: its steps, its file, and the lip positions of a session."""
 
 from dataclasses import fields
 from pathlib import Path

@@ -13,31 +13,31 @@ symbol         meaning                                                unit, shap
 x              log-mel bands, at most eight decades below the         (frames, 80)
                loudest so far
 y              log posteriors of the states                           (frames, states)
-B, R           positions of a block, and of its right context         positions
-H              positions from one run to the next, the hop            positions
-PAST           positions before a block that it attends to            positions
+B, R           encoder frames of a block, and of its right context    encoder frames
+H              encoder frames from one run to the next, the hop       encoder frames
+PAST           encoder frames before a block that it attends to       encoder frames
 prior          prior of the states, to a power below one              (states,)
 acoustic_scale weight of the log scores, chosen on development data   1
 ============== ====================================================== ========================
 
     log b(x) = acoustic_scale * (y - log prior)
 
-Position ``p`` of a segment has the frames ``2 p`` and ``2 p + 1``. It sees the frames from
-``2 p - 2`` to ``2 p + 2`` (zeros precede the first). Whenever ``H`` more positions are complete,
-the network runs on the newest positions, up to ``B + R``. It settles the scores of the first
-positions, to make room for ``H`` more in the next run, and keeps their keys and values.
-The scores of the other positions, the right context, are provisional. ``H`` is ``B``, and on a
-busy machine a multiple of ``B``: there are fewer runs, and right contexts are shorter. When speech
-starts, the first runs have fewer positions and settle none. The last run repeats the segment's last
-frame once or twice and settles all positions.
+Encoder frame ``p`` of a segment has the feature frames ``2 p`` and ``2 p + 1``. It depends on the
+feature frames from ``2 p - 2`` to ``2 p + 2`` (zeros precede the first). Whenever ``H`` more
+encoder frames are complete, the network runs on the newest ones, up to ``B + R``. It settles the
+scores of the first encoder frames, to make room for ``H`` more in the next run, and keeps their
+keys and values. The scores of the others, the right context, are provisional. ``H`` is ``B``, and
+on a busy machine a multiple of ``B``: there are fewer runs, and right contexts are shorter. When
+speech starts, the first runs have fewer encoder frames and settle none. The last run repeats the
+segment's last feature frame once or twice and settles all encoder frames.
 
 The table of positions ends after 30 seconds. Longer speech without a pause starts again at the
 first row, with an empty past.
 
-Sessions that settle the same number of positions at the same time share one run. The network scales
-and rounds each row of a product separately, so a session's scores are the same to the last bit in
-any batch and any chunking. Keys and values are rings, because attention does not depend on their
-order. They take 1.5 MB per speaking session, in 16 bits.
+Sessions that settle the same number of encoder frames at the same time share one run. The network
+scales and rounds each row of a product separately, so a session's scores are the same to the last
+bit in any batch and any chunking. Keys and values are rings, because attention does not depend on
+their order. They take 1.5 MB per speaking session, in 16 bits.
 """
 
 from __future__ import annotations
@@ -74,11 +74,11 @@ Float16 = NDArray[np.float16]
 
 _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # before the caches
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
-# Constants of the file that become inputs: the number of kept positions, and the last of them.
+# Constants of the file that become inputs: the number of kept encoder frames, and the last of them.
 _NUM_KEPT, _LAST_KEPT = "block", "last_of_block"
 EXTENSION_PREFIX = "universal_"  # before the names of a second readout's input and outputs
 _PADDING = 2  # frames of zeros before a segment's first
-_SEEN_AFTER = 2  # frames that a position sees after its first frame
+_SEEN_AFTER = 2  # feature frames after an encoder frame's first one on which it depends
 _MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
 _MAX_SIZE = 4096
 _MAX_CACHE_BYTES = 3_000_000  # per session
@@ -146,17 +146,17 @@ class NetworkState:
 
     state: Floats  # state of the recurrent layer, (width,)
     rings: Float16  # keys and values, (2 layers, heads, PAST, size), finite
-    num_cached: int = 0  # positions in the rings
+    num_cached: int = 0  # encoder frames in the rings
 
 
 class Block(Record, frozen=True):
     """The next block of one session, with its right context."""
 
-    frames: Floats  # (2 positions + 3, 80), from two before the first position's
-    row: int  # row of the first position in the table
+    frames: Floats  # (2 encoder frames + 3, 80), from two before the first encoder frame's
+    row: int  # row of the first encoder frame in the table of positions
     num_positions: int
-    num_settled: int  # number of leading positions whose scores are settled
-    num_kept: int  # number of leading positions whose keys and values are kept; 0 at the end
+    num_settled: int  # number of leading encoder frames whose scores are settled
+    num_kept: int  # number of leading encoder frames whose keys and values are kept; 0 at the end
     past: NetworkState
 
 
@@ -181,11 +181,11 @@ class BlockRunner:
         self._positions = np.concatenate([position_table(self.sizes.width), unused])
 
     def run(self, blocks: Sequence[Block]) -> tuple[Floats, Floats, Float16]:
-        """Run the network on the next blocks of ``n`` sessions, which keep equally many positions.
+        """Run the network on the next blocks of ``n`` sessions, which keep equally many frames.
 
-        Returns log posteriors, (n, 2 (B + R), states), undefined for positions that a block lacks;
-        the recurrent layer's state after the kept positions, (n, width); the keys of all layers and
-        then the values of the kept positions, (n, 2 layers, heads, kept, size). If no position is
+        Returns log posteriors, (n, 2 (B + R), states), undefined for frames that a block lacks; the
+        recurrent layer's state after the kept encoder frames, (n, width); the keys of all layers
+        and then the values of the kept ones, (n, 2 layers, heads, kept, size). If no frame is
         kept, the state is undefined.
         """
         length, num_kept = self.sizes.length, max(1, blocks[0].num_kept)
@@ -273,7 +273,7 @@ class BlockStream(AcousticStream):
 
     @property
     def _num_positions(self) -> int:
-        """Number of complete positions, from the next block's first on."""
+        """Number of complete encoder frames, from the next block's first on."""
         return self._num_positions_after(0)
 
     def _num_positions_after(self, num_frames: int) -> int:
@@ -378,7 +378,7 @@ def cache_names(num_layers: int) -> list[str]:
 
 
 def parse_block_model(archive: Archive) -> BlockModel:
-    """Build the model after checking every size; ``ValueError`` if something does not fit."""
+    """Build the model after checking every size; raises ``ValueError`` if a size is wrong."""
     return model_of(archive, archive.array("network", None).astype(np.uint8))
 
 

@@ -157,7 +157,7 @@ class GmmStream(AcousticStream):
 
 
 def parse_gmm_model(archive: Archive) -> GmmModel:
-    """Build the model after checking every size; ``ValueError`` if an array does not fit."""
+    """Build the model after checking every size; raises ``ValueError`` if an array does not fit."""
     topology = parse_topology(archive)
     num_mixtures = archive.array("weights", None).shape[-1]
     if not 1 <= num_mixtures <= _MAX_MIXTURES:

@@ -138,7 +138,7 @@ def build_light_model(topology: Topology, log_prior: Floats) -> LightModel | Non
 
 
 def parse_light_model(archive: Archive) -> LightModel:
-    """Build the model from the file of a block model; ``ValueError`` if something does not fit."""
+    """Build the model from a block model's file; raises ``ValueError`` if a size is wrong."""
     topology = parse_topology(archive)
     model = build_light_model(topology, archive.floats("log_prior", topology.num_states))
     if model is None:

@@ -54,7 +54,7 @@ class Archive:
 
 
 def read_archive(path: Path) -> Archive:
-    """Read a model file; ``UserError`` if it is missing or not a model file."""
+    """Read a model file; raises ``UserError`` if it is missing or not a model file."""
     if not path.exists():
         raise UserError(
             f"there is no acoustic model at {path}; use blocks, light, gmm, universal, or a model"

@@ -16,7 +16,7 @@ FORMAT = "universal 1"
 
 
 def parse_universal_model(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
-    """Build the model on the block network; ``ValueError`` if something does not fit."""
+    """Build the model on the block network; raises ``ValueError`` if something does not fit."""
     if str(archive.array("block_network", ())) != hash_of(network):
         raise ValueError("it belongs to another version of the block model")
     extension = archive.array("extension", None).astype(np.uint8)

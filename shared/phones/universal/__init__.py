@@ -22,7 +22,7 @@ __all__ = ["pronounce", "read_ipa", "spell", "transcribe", "write"]
 
 
 def pronounce(text: str) -> list[tuple[str, ...]]:
-    """Return the phones of each word or character; ``UserError`` if a part cannot be read."""
+    """Return the phones of each word or character; raises ``UserError`` if one cannot be read."""
     transcript = transcribe(text)
     if transcript.dropped:
         raise UserError(f"cannot read {transcript.dropped[0]!r}; choose its language")

@@ -1,8 +1,8 @@
-"""Joins lip frames to a continuous mouth trajectory.
+"""Joins lip positions to a continuous mouth trajectory.
 
-Lip frames are joined by cubic Hermite splines. The velocity at a frame is the slope of the line
-from the previous frame, so position and velocity are continuous without waiting for the next frame.
-If frames are missing, the mouth moves to rest and back.
+Cubic Hermite splines join the lip positions. The velocity at one of them is the slope of the line
+from the previous one, so the mouth and its velocity are continuous without waiting for the next.
+If lip positions are missing, the mouth moves to rest and back.
 """
 
 from bisect import bisect_right
@@ -15,9 +15,9 @@ from kouxing.services.synthesizer.lips.trajectory import FapState, stationary_st
 
 Array = NDArray[np.float64]
 
-HOLD_S = 0.04  # tolerated lateness of a frame
-CLOSE_S = 0.1  # time from the last frame to rest
-_OPEN_S = 0.06  # time from rest to the first frame
+HOLD_S = 0.04  # tolerated lateness of lip positions
+CLOSE_S = 0.1  # time from the last lip positions to rest
+_OPEN_S = 0.06  # time from rest to the first lip positions
 MAX_GAP_S = CLOSE_S + _OPEN_S  # maximum distance of two frames that are joined
 
 

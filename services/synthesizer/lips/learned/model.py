@@ -1,18 +1,18 @@
-"""Live learned lips: turns predicted lip frames and phones into mouth FAPs.
+"""Live learned lips: turns predicted lip positions and phones into mouth FAPs.
 
-    lip frames -> stabilize -> closures -> lip track -> transition -> rest
+    lip positions -> stabilize -> closures -> lip track -> transition -> rest
     phones -> dynamic visemes -> tongue
 
 The recognizer predicts ``LipPositions`` from the audio, 50 per second during speech. Small changes
-are reduced, because they are jitter. Closures depend on lip frames and on recognized phones
-(`closure_rule`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which cameras
-do not track, come from the dynamic visemes. The lip frames already contain the effect of loudness,
-so the amplitude modifier is off.
+are reduced, because they are jitter. Closures depend on lip positions and on recognized phones
+(`closure_rule`). Each closure lasts at least 40 ms. Tongue and jaw thrust, which cameras do not
+track, come from the dynamic visemes. The lip positions already contain the effect of loudness, so
+the amplitude modifier is off.
 
-A lip frame is processed once, when its FAP frame is due, without waiting for the next lip frame. If
-lip frames are late, a *transition* keeps the mouth continuous in position and velocity. After the
-last lip frame the track closes within 150 ms. In pauses, the lips stay ajar (`resting_lips`).
-Until the first lip frame arrives, the dynamic visemes move the whole mouth.
+Lip positions are processed once, when their FAP frame is due, without waiting for the next. If they
+are late, a *transition* keeps the mouth and its velocity continuous. After the last lip positions,
+the track closes within 150 ms. In pauses, the lips stay ajar (`resting_lips`). Until the first lip
+positions arrive, the dynamic visemes move the whole mouth.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _UNTRACKED_FAPS = (14, 44, 45, 46, 47)  # jaw thrust and tongue
 _TRANSITION_S = 0.04  # duration of the change to a new track
 _SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 _REST_S = 0.15  # duration of the return to rest without sound
-_FLUSHED_S = 0.3  # lip frames of this much audio may arrive after an interruption
+_FLUSHED_S = 0.3  # lip positions of this much audio may arrive after an interruption
 _MEMORY_S = 0.5
 _TEETH_LOG_ODDS = 1.0  # threshold for a phone f
 _CLOSED_FRACTION = 0.5  # lips count as closed from this closure amount
@@ -71,7 +71,7 @@ _JITTER_SQUARED = np.array(
 
 @dataclass(frozen=True, slots=True)
 class LearnedLips:
-    """The lip model that uses predicted lip frames, with the tongue of the dynamic visemes."""
+    """The lip model that uses predicted lip positions, with the tongue of the dynamic visemes."""
 
     amplitude_applies: ClassVar[bool] = False
 
@@ -105,26 +105,26 @@ class LearnedStream:
             ClosingPhones(visemes.inventory, viseme, rule) for viseme in ("b", "f")
         )
         self._queue: deque[LipPositions] = deque()  # not due yet
-        self._newest_s = -np.inf  # time of the newest lip frame
-        self._stable = self._neutral  # the last lip frame, stabilized
-        self._closing = (0.0, 0.0)  # closure fractions of the last two lip frames
+        self._newest_s = -np.inf  # time of the newest lip positions
+        self._stable = self._neutral  # the last lip positions, stabilized
+        self._closing = (0.0, 0.0)  # closure fractions of the last two lip positions
         self._has_lip_frames = False
         self._is_speaking = False
-        self._flushed_until_s = -np.inf  # lip frames of earlier audio are ignored
-        self._known_s = start_s  # end of the audio on which the newest lip frame depends
+        self._flushed_until_s = -np.inf  # lip positions of earlier audio are ignored
+        self._known_s = start_s  # end of the audio on which the newest lip positions depend
         self._track = LipTrack(self._neutral)
         self._on_track = stationary_state(self._neutral)  # the track at the last frame
         self._transition = NO_TRANSITION
         self._rest: RestTransition | None = None  # set while media time does not advance
         self._resting = RestingLips()
         self._ajar = 0.0  # fraction of the ajar mouth at the last frame
-        self._late_s = 0.0  # lateness of the newest lip frame
+        self._late_s = 0.0  # lateness of the newest lip positions
         self._time_s = start_s  # time of the last frame
         self._mouth = stationary_state(self._neutral)
         self._tongue = self._neutral
 
     def add_event(self, event: SoundEvent) -> None:
-        """Add a lip frame, a phone, a revision, a level, or a change of voice activity."""
+        """Add lip positions, a phone, a revision, a level, or a change of voice activity."""
         self._visemes.add_event(event)
         self._resting.add_event(event)
         match event:
@@ -203,19 +203,19 @@ class LearnedStream:
         self._rest = None
 
     def _extend_track(self, time_s: float) -> None:
-        """Extend the track to a time, if enough lip frames have arrived."""
+        """Extend the track to a time, if enough lip positions have arrived."""
         self._track.forget_before(self._time_s)
         for phones in (self._bilabials, self._labiodentals):
             phones.forget_before(time_s - _MEMORY_S)
         while self._queue and self._track.end_s < time_s:
             frame = self._queue.popleft()
             self._track.append(frame.time_s, self._stabilize(frame))
-            # lip frames with a longer delay than the face are late
+            # lip positions with a longer delay than the face are late
             self._late_s = max(0.0, frame.delay_s - self._delay_s)
         self._track.hold_s = HOLD_S + self._late_s if self._is_speaking else 0.0
 
     def _stabilize(self, frame: LipPositions) -> Array:
-        """Return the FAPs of the next lip frame, stabilized and with closures."""
+        """Return the FAPs of the next lip positions, stabilized and with closures."""
         faps = frame.faps.astype(np.float64)
         if frame.time_s - self._track.end_s <= MAX_GAP_S:
             change = faps - self._stable
