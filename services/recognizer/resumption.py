@@ -9,22 +9,22 @@ from collections.abc import Iterable
 from typing import TypeAlias
 
 import numpy as np
+from kouxing_client.messages import Message
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (
-    EndOfSound,
     LipPositions,
     Phone,
     Progress,
-    SoundEvent,
     SpeechChange,
     Waveform,
 )
-from kouxing.shared.phones.final_time import FinalTimeTracker
 from kouxing.shared.phones.inventory import SILENCE
+from kouxing.shared.wire import speech
+from kouxing.shared.wire.final_time import FinalTimeTracker
 
 WARM_UP_S = 2.8  # duration of the reprocessed audio; docs/recognition.md explains the choice
 # Audio starts at a multiple of this time. Network blocks and positions divide it, so they are
@@ -40,7 +40,7 @@ class ReplayWindow:
 
     def __init__(self) -> None:
         self.last_droppable_sequence = 0  # last message that a replacement can do without
-        self._final = FinalTimeTracker()  # final time of the events that the synthesizer has
+        self._final = FinalTimeTracker()  # of the messages that the synthesizer has
         # (sequence, end) of each message
         self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED_MESSAGES)
 
@@ -48,13 +48,13 @@ class ReplayWindow:
         """Add an audio message that ends at a media time in samples."""
         self._messages.append((sequence, end))
 
-    def update(self, event: SoundEvent, newest_sequence: int) -> None:
-        """Drop the messages that are no longer needed, because the synthesizer has an event."""
-        if isinstance(event, EndOfSound):
+    def update(self, result: Message, newest_sequence: int) -> None:
+        """Drop the messages that are no longer needed, because the synthesizer has a result."""
+        if isinstance(result, speech.Progress) and result.state == speech.AudioState.ENDED:
             self.last_droppable_sequence = newest_sequence
             return
-        self._final.update(event)
-        needed_from = to_samples(max(0.0, self._final.time_s - WARM_UP_S))
+        self._final.update(result)
+        needed_from = max(0, self._final.media_time - to_samples(WARM_UP_S))
         while self._messages and self._messages[0][1] <= needed_from:
             self.last_droppable_sequence, _ = self._messages.popleft()
 

@@ -31,19 +31,17 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import trim_heap
-from kouxing.shared.phones.events import Progress, Waveform
+from kouxing.shared.phones.events import Waveform
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
-from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode
-from kouxing.shared.wire.speech import Acknowledge
+from kouxing.shared.wire.speech import Acknowledge, Progress
 
 MAX_QUEUED_S = 60.0  # limit for live audio; later audio waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for more late audio: once, and in total
@@ -384,23 +382,21 @@ class RecognizerService(SessionService):
         results = session.new_results(self._recognizer)
         acoustic = session.acoustic_message(results)
         published = [*session.published_messages(results)]
-        messages = [
-            event_to_message(result) for result in results if not isinstance(result, Waveform)
-        ]
         if acoustic is not None:
             session.replay.send(acoustic, now_s)
         for message in published:
             session.replay.send(message, now_s)
-        for message in messages:
-            session.link.send(message, now_s)
+        for result in results:
+            if not isinstance(result, Waveform):
+                session.link.send(result, now_s)
         for message in published:
             if isinstance(message, Speech):
                 self.send_to_control(message)
         for result in results:
-            if isinstance(result, Progress) and result.is_laughter != session.is_laughing:
-                session.is_laughing = result.is_laughter
-                name = EventName.LAUGHTER_START if result.is_laughter else EventName.LAUGHTER_STOP
-                self.publish_event(name, session.start, media_time=to_samples(result.time_s))
+            if isinstance(result, Progress) and result.laughter != session.is_laughing:
+                session.is_laughing = result.laughter
+                name = EventName.LAUGHTER_START if result.laughter else EventName.LAUGHTER_STOP
+                self.publish_event(name, session.start, media_time=result.media_time)
 
     def _on_subscribe(self, session: str) -> None:
         if (joined := self._sessions.get(session)) is not None:

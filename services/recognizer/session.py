@@ -5,11 +5,10 @@ import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
-from kouxing_client.messages import Message
+from kouxing_client.messages import Message, Phone, Speech
 
 from kouxing.services.recognizer.audio_queue import AudioQueue
 from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, ResumeFilter
 from kouxing.services.recognizer.sound_packets import SoundPackets
@@ -21,11 +20,11 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER
 from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
 from kouxing.shared.pcm import decode_pcm
-from kouxing.shared.phones.events import LipPositions, Phone, SpeechChange
+from kouxing.shared.phones.events import Waveform
 from kouxing.shared.replaying_publisher import ReplayingPublisher
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.events import SpeechMessage, event_to_message, message_to_event
+from kouxing.shared.wire.events import SpeechMessage, event_to_message
 from kouxing.shared.wire.face import CurrentFace
 from kouxing.shared.wire.session import AudioChunk, ErrorCode
 from kouxing.shared.wire.speech import (
@@ -33,9 +32,9 @@ from kouxing.shared.wire.speech import (
     Acoustic,
     AcousticModelName,
     AudioState,
+    LipPositions,
     Progress,
 )
-from kouxing.shared.wire.speech import LipPositions as LipMessage
 
 MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # limit for the lead of a paced client over the clock, and for catching up
@@ -260,23 +259,28 @@ class RecognizerSession:
         )
         self.socket.send(acknowledgement, to=self.client)
 
-    def new_results(self, recognizer: Recognizer) -> list[StreamOutput]:
+    def new_results(self, recognizer: Recognizer) -> list[SpeechMessage | Waveform]:
         """Return the stream's new results, without those that a lost recognizer has emitted."""
         results = recognizer.get_result(self.stream)
-        return results if self.resume_filter is None else self.resume_filter.new_results(results)
+        if self.resume_filter is not None:
+            results = self.resume_filter.new_results(results)
+        return [
+            result if isinstance(result, Waveform) else event_to_message(result)
+            for result in results
+        ]
 
-    def published_messages(self, results: Iterable[StreamOutput]) -> Iterator[Message]:
-        """Yield the messages of results for subscribers."""
+    def published_messages(self, results: Iterable[SpeechMessage | Waveform]) -> Iterator[Message]:
+        """Yield the messages for subscribers."""
         for result in results:
-            if isinstance(result, Phone | LipPositions | SpeechChange):
-                yield self._number(event_to_message(result))
+            if isinstance(result, Phone | LipPositions | Speech):
+                yield self._number(result)
             else:
                 yield from map(self._number, self._sound_packets.add(result))
 
-    def acoustic_message(self, results: Sequence[StreamOutput]) -> Acoustic | None:
+    def acoustic_message(self, results: Sequence[SpeechMessage | Waveform]) -> Acoustic | None:
         """Return a message about the acoustic model if it has changed or speech starts."""
         model = AcousticModelName.LIGHT if self.stream.uses_light_model else AcousticModelName.FULL
-        starts = any(isinstance(result, SpeechChange) and result.active for result in results)
+        starts = any(isinstance(result, Speech) and result.active for result in results)
         if model == self._published_acoustic and not starts:
             return None
         self._published_acoustic = model
@@ -291,8 +295,7 @@ class RecognizerSession:
     def on_acknowledge(self, ack: Acknowledge, now_s: float) -> None:
         """Process the synthesizer's acknowledgement."""
         for message in self.link.acknowledge(ack, now_s):
-            if isinstance(message, SpeechMessage) and not isinstance(message, LipMessage):
-                self.replay_window.update(message_to_event(message), self.last_sequence)
+            self.replay_window.update(message, self.last_sequence)
 
 
 class _LeadLimiter:

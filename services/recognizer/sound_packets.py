@@ -7,7 +7,8 @@ from kouxing_client.messages import Sound
 
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.pcm import as_integers
-from kouxing.shared.phones.events import EndOfSound, SoundEvent, Waveform
+from kouxing.shared.phones.events import Waveform
+from kouxing.shared.wire.speech import AudioState, Progress
 
 PACKET_S = 0.04  # duration of a message; less if the face has a shorter delay
 
@@ -20,18 +21,18 @@ class SoundPackets:
         self._start = 0  # media time, samples
         self._samples = np.empty(0, np.float32)
 
-    def add(self, event: SoundEvent | Waveform) -> Iterator[Sound]:
-        """Add sound, or another event; yield the messages that are complete."""
-        if isinstance(event, EndOfSound):
-            yield from self._take()
-        elif isinstance(event, Waveform):
-            start = to_samples(event.time_s)
+    def add(self, result: Waveform | Progress) -> Iterator[Sound]:
+        """Add sound, or the state of the audio; yield the messages that are complete."""
+        if isinstance(result, Waveform):
+            start = to_samples(result.time_s)
             if start != self._start + len(self._samples):  # after a gap
                 yield from self._take()
                 self._start = start
-            self._samples = np.concatenate([self._samples, event.samples])
+            self._samples = np.concatenate([self._samples, result.samples])
             if len(self._samples) >= self._num_joined:
                 yield from self._take()
+        elif result.state == AudioState.ENDED:
+            yield from self._take()
 
     def _take(self) -> Iterator[Sound]:
         if len(self._samples):

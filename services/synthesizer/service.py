@@ -106,7 +106,7 @@ class SynthesizerService(SessionService):
             session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
-        self.session_started(start, to_samples(session.final_time.time_s))
+        self.session_started(start, session.final_time.media_time)
         return False
 
     def stop_session(self, session: str) -> None:
@@ -163,7 +163,7 @@ class SynthesizerService(SessionService):
         """Return each session's progress: end of its final phones, lateness and skipped time."""
         return {
             name: SessionProgress(
-                final_until=to_samples(session.final_time.time_s),
+                final_until=session.final_time.media_time,
                 lateness=session.lateness.newest,
                 skipped_s=session.skip_policy.skipped_s,
             )
@@ -264,7 +264,7 @@ class SynthesizerService(SessionService):
             text = f"{event.symbol!r} is not a phone of {language}"
             self.warn("unknown-phone", text, message.session)
             return
-        session.final_time.update(event)
+        session.final_time.update(message)
         if not session.events and isinstance(event, Phone | LipPositions | SpeechChange):
             session.face.process(event)  # makes no frames
             return

@@ -15,11 +15,11 @@ from kouxing.shared.clock import to_seconds
 from kouxing.shared.overload import SkipPolicy
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, SoundEvent
-from kouxing.shared.phones.final_time import FinalTimeTracker
 from kouxing.shared.reliable import ReliableReceiver
 from kouxing.shared.replaying_publisher import ReplayingPublisher
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.final_time import FinalTimeTracker
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame
 
 RECOGNIZER_TIMEOUT_S = 20.0  # longer than the reports for silent clients take

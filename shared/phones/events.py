@@ -1,6 +1,11 @@
-"""The live results of a recognizer: phones, lip positions, voice activity and level.
+"""The results of a recognizer: phones, lip positions, voice activity and level.
 
-Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
+Times are media time: seconds from the session's first sample. ``shared/wire/events.py`` converts
+these events to messages and back, without loss, because live results have whole samples at 16 kHz.
+
+Two types are needed. Phones of a known text, and phones that a lip model moves, have times between
+samples, and a lip model does not depend on the protocol. A message has whole samples, packed values
+and checked ranges, and a session, an epoch and a sequence.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Converts a recognizer's events to messages and back."""
+"""Converts a recognizer's events to messages and back.
+
+The recognizer service converts its results once, and the synthesizer service converts them back.
+``shared/phones/events.py`` explains why there are two types.
+"""
 
 from collections.abc import Sequence
 from operator import attrgetter

@@ -20,11 +20,16 @@ from kouxing.services.recognizer.session import (
 )
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
-from kouxing.shared.phones.events import LipPositions
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import AudioChunk, ErrorCode
-from kouxing.shared.wire.speech import Acknowledge, AcousticModelName, AudioState, Progress
+from kouxing.shared.wire.speech import (
+    Acknowledge,
+    AcousticModelName,
+    AudioState,
+    LipPositions,
+    Progress,
+)
 from tests.live_streams import START
 from tests.samples import with_opening
 from tests.system import VOWELS_FILE, samples_of_file
@@ -204,7 +209,7 @@ def test_a_session_gets_the_lip_frames_of_its_mouth_profile() -> None:
     results = session.new_results(recognizer())
     frames = [result for result in results if isinstance(result, LipPositions)]
     assert len(frames) > 5
-    assert {frame.faps[0] for frame in frames} == {77.0}
+    assert {np.frombuffer(frame.values, "<f4")[0] for frame in frames} == {77.0}
     messages = list(session.published_messages(results))
     assert [message.sequence for message in messages] == [*range(1, len(messages) + 1)]
 

@@ -5,22 +5,22 @@ from itertools import chain
 
 import numpy as np
 import pytest
+from kouxing_client.messages import Message, Speech
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.resumption import GRID_S, WARM_UP_S, ReplayWindow, ResumeFilter
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.shared.clock import to_samples
+from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.phones.events import (
-    EndOfSound,
     Phone,
-    Progress,
-    SoundEvent,
     SpeechChange,
     Waveform,
 )
-from kouxing.shared.phones.final_time import QUIET_S, FinalTimeTracker
+from kouxing.shared.wire.events import event_to_message
+from kouxing.shared.wire.final_time import QUIET, FinalTimeTracker
+from kouxing.shared.wire.speech import AudioState, Progress
 from tests import lips
 from tests.live_streams import LiveStream
 from tests.system import DEMO, samples_of_file
@@ -66,9 +66,9 @@ def state_at_loss(
     final = FinalTimeTracker()
     for output in before:
         if not isinstance(output, Waveform):
-            final.update(output)
-    begin = max(0, round((final.time_s - WARM_UP_S) * 16_000) // CHUNK * CHUNK)
-    return before, final.time_s, begin
+            final.update(event_to_message(output))
+    begin = max(0, (final.media_time - to_samples(WARM_UP_S)) // CHUNK * CHUNK)
+    return before, to_seconds(final.media_time), begin
 
 
 def final_phones(outputs: Sequence[StreamOutput]) -> list[Phone]:
@@ -137,14 +137,15 @@ def test_aligns_the_first_audio_with_the_grid() -> None:
     assert resumption.align((7, samples), 44_100) == (7, samples)
 
 
-EVENTS_AND_FINAL_TIMES_S: list[tuple[SoundEvent, float]] = [
-    (Progress(time_s=0.2, level_db=0.0), 0.0),
-    (Progress(time_s=2.0, level_db=0.0), 2.0 - QUIET_S),
-    (SpeechChange(active=True, time_s=1.9), 1.9),
-    (Progress(time_s=3.0, level_db=0.0), 1.9),
-    (phone(0, 2.0, 0.25), 2.25),
-    (phone(1, 2.25, 0.25, final=False), 2.25),
-    (SpeechChange(active=False, time_s=4.0), 4.0),
+RESULTS_AND_FINAL_TIMES: list[tuple[Message, int]] = [
+    (Progress(media_time=3200), 0),
+    (Progress(media_time=32_000), 32_000 - QUIET),
+    (Progress(media_time=40_000, state=AudioState.SKIPPED), 32_000 - QUIET),
+    (Speech(active=True, media_time=30_400), 30_400),
+    (Progress(media_time=48_000), 30_400),
+    (event_to_message(phone(0, 2.0, 0.25)), 36_000),
+    (event_to_message(phone(1, 2.25, 0.25, final=False)), 36_000),
+    (Speech(active=False, media_time=64_000), 64_000),
 ]
 
 
@@ -152,10 +153,10 @@ def test_audio_is_droppable_once_no_recognizer_would_replay_it() -> None:
     window, final = ReplayWindow(), FinalTimeTracker()
     for sequence in range(1, 5):
         window.add(sequence, to_samples(sequence))
-    for event, final_s in EVENTS_AND_FINAL_TIMES_S:
-        window.update(event, newest_sequence=4)
-        final.update(event)
-        assert final.time_s == final_s
+    for result, final_until in RESULTS_AND_FINAL_TIMES:
+        window.update(result, newest_sequence=4)
+        final.update(result)
+        assert final.media_time == final_until
     assert window.last_droppable_sequence == int(4.0 - WARM_UP_S)
-    window.update(EndOfSound(time_s=5.0), newest_sequence=4)
+    window.update(Progress(media_time=80_000, state=AudioState.ENDED), newest_sequence=4)
     assert window.last_droppable_sequence == 4

@@ -5,7 +5,8 @@ from kouxing_client.messages import Sound
 
 from kouxing.services.recognizer.sound_packets import SoundPackets
 from kouxing.shared.clock import to_seconds
-from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, Waveform
+from kouxing.shared.phones.events import Waveform
+from kouxing.shared.wire.speech import AudioState, Progress
 
 
 def messages(*starts: int, num_samples: int = 320, face_delay_s: float = 0.06) -> list[Sound]:
@@ -15,9 +16,8 @@ def messages(*starts: int, num_samples: int = 320, face_delay_s: float = 0.06) -
         Waveform(time_s=to_seconds(start), samples=np.full(num_samples, start / 2**15, np.float32))
         for start in starts
     ]
-    events: list[SoundEvent | Waveform] = [*pieces]
-    events += [Progress(time_s=1.0, level_db=0.0), EndOfSound(time_s=1.0)]
-    return [message for event in events for message in packets.add(event)]
+    results: list[Waveform | Progress] = [*pieces, Progress(), Progress(state=AudioState.ENDED)]
+    return [message for result in results for message in packets.add(result)]
 
 
 def spans(sounds: list[Sound]) -> list[tuple[int, int]]:
