@@ -2,7 +2,10 @@
 
 from collections.abc import Collection
 
+from kouxing_client.messages import Speech
+
 from kouxing.services.control.service_registry import ServiceRegistry
+from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.control import Heartbeat, StartSession
 
 RECOVERY_S = 5.0
@@ -20,14 +23,24 @@ class RestartRecovery:
 
     def add(self, start: StartSession, instance: str) -> bool:
         """Add a session that a service reports; return False if the service may not report it."""
-        audio = self._registry[instance].heartbeat.endpoints.get("audio")
-        if not self.is_active or audio is None or start.endpoints.get("audio") != audio:
+        if not self.is_active or not self._is_recognizer(start, instance):
             return False
         known = self._reported.get(start.session)
         if known is not None and known.epoch > start.epoch:
             return False  # the session has moved away from this recognizer, which was stalled
         self._reported[start.session] = start
         return True
+
+    def record_speech(self, speech: Speech, instance: str) -> None:
+        """Record that speech starts or stops in a session that is not restored yet."""
+        start = self._reported.get(speech.session)
+        if start is not None and self._is_recognizer(start, instance):
+            speech_time = speech.media_time if speech.active else None
+            self._reported[speech.session] = replace(start, speech_time=speech_time)
+
+    def _is_recognizer(self, start: StartSession, instance: str) -> bool:
+        audio = self._registry[instance].heartbeat.endpoints.get("audio")
+        return audio is not None and start.endpoints.get("audio") == audio
 
     def record_observer(self, heartbeat: Heartbeat) -> None:
         """Record the sessions that an observer already takes part in."""

@@ -192,10 +192,7 @@ class ControlService(Service):
                 self._commands.send(replace(message, request=None), to=peer)
         else:
             record = self._sessions.find(message.session)
-            record.face.change(message.face, time.monotonic())
-            self._lifecycle.send_to_participants(
-                record, replace(message, epoch=record.epoch, request=None)
-            )
+            self._lifecycle.change_face(record, self._sessions.with_listening(message.face))
         return _done(message)
 
     def _report_status(self, message: StatusRequest, sender: Peer) -> Message:
@@ -338,22 +335,18 @@ class ControlService(Service):
 
     def _on_speech(self, speech: Speech, instance: str) -> None:
         record = self._sessions.get(speech.session)
-        if record is None or not record.announced:  # of an earlier session with this name
+        if record is None:
+            self._recovery.record_speech(speech, instance)
+            return
+        if not record.announced:  # of an earlier session with this name
             return
         if (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
             return
         if not record.speaking:  # a new recognizer repeats the start of speech
             record.speech_time = speech.media_time
-        record.speaking = speech.active
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
         self._lifecycle.publish(name, record, media_time=speech.media_time)
-        for listener in self._sessions.listeners_of(record.name):
-            listening = SetFace(
-                session=listener.name,
-                epoch=listener.epoch,
-                face=FaceSettings(listening=speech.active),
-            )
-            self._lifecycle.send_to_participants(listener, listening)
+        self._lifecycle.set_speaking(record, speaking=speech.active)
 
     def _on_service_event(self, event: Event, instance: str) -> None:
         if event.name in SERVICE_EVENTS:
@@ -384,6 +377,7 @@ class ControlService(Service):
                 continue
             record = self._sessions.restore(start, time.monotonic())
             LOG.info("session restored", extra={"session": record.name})
+            self._lifecycle.set_speaking(record, speaking=record.speaking)
             missed_start = self._recovery.observers_that_missed_start(record.name)
             self._lifecycle.send_start(record, record.waiting_for | missed_start)
             if record.lost:

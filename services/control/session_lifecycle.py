@@ -17,6 +17,7 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import EventName
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionMoved
 
 START_TIMEOUT_S = 5.0
@@ -75,6 +76,19 @@ class SessionLifecycle:
         for instance in self._sessions.participants(record):
             self._commands.send(message, to=self._registry[instance].peer)
 
+    def change_face(self, record: SessionRecord, change: FaceSettings) -> None:
+        """Change a session's face, and notify its services."""
+        self._sessions.change_face(record, change, time.monotonic())
+        self.send_to_participants(
+            record, SetFace(session=record.name, epoch=record.epoch, face=change)
+        )
+
+    def set_speaking(self, record: SessionRecord, *, speaking: bool) -> None:
+        """Record whether a session has speech, and notify the faces of its listeners."""
+        record.speaking = speaking
+        for listener in self._sessions.listeners_of(record.name):
+            self.change_face(listener, FaceSettings(listening=speaking))
+
     def announce_if_started(self, record: SessionRecord) -> None:
         """Notify the client that its session is open or has moved, once all services are ready.
 
@@ -112,6 +126,8 @@ class SessionLifecycle:
 
     def end(self, record: SessionRecord, reason: str) -> None:
         """End a session; ``reason`` is for the log and the event."""
+        if record.speaking:
+            self.set_speaking(record, speaking=False)
         close = CloseSession(session=record.name, epoch=record.epoch)
         self.send_to_participants(record, close)
         self._sessions.remove(record, time.monotonic())

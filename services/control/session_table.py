@@ -33,6 +33,7 @@ class SessionTable:
         self._by_worker: dict[str, dict[str, SessionRecord]] = {}
         self._num_per_key: Counter[str] = Counter()
         self._by_request: dict[tuple[Peer, str], SessionRecord] = {}
+        self._listeners: dict[str, set[str]] = {}  # by the session to which their faces listen
 
     def __iter__(self) -> Iterator[SessionRecord]:
         return iter(list(self._records.values()))
@@ -56,9 +57,14 @@ class SessionTable:
 
     def listeners_of(self, name: str) -> list[SessionRecord]:
         """Return the sessions whose faces listen to a session."""
-        return [
-            record for record in self._records.values() if record.face.settings.listen_to == name
-        ]
+        return [self._records[listener] for listener in self._listeners.get(name, ())]
+
+    def with_listening(self, face: FaceSettings) -> FaceSettings:
+        """Add ``listening`` to settings that choose the session to which a face listens."""
+        if face.listen_to is None or face.listening is not None:
+            return face
+        speaker = self._records.get(face.listen_to)
+        return replace(face, listening=speaker is not None and speaker.speaking)
 
     def find_authorized(self, name: str, token: str) -> SessionRecord:
         """Return a session after checking its token.
@@ -148,7 +154,10 @@ class SessionTable:
             endpoints=self._registry.endpoints(workers),
             facts=facts,
             face=CurrentFace(
-                FaceSettings(lip_model=facts.lip_model).merged_with(opening.face), now_s
+                FaceSettings(lip_model=facts.lip_model).merged_with(
+                    self.with_listening(opening.face)
+                ),
+                now_s,
             ),
             waiting_for={*workers.values()} | self._registry.observers(),
         )
@@ -182,6 +191,8 @@ class SessionTable:
             announced=True,
             restored_epoch=start.epoch,
             final_until=start.final_until,
+            speaking=start.speech_time is not None,
+            speech_time=start.speech_time or 0,
         )
         self._add(record, now_s)
         return record
@@ -192,7 +203,14 @@ class SessionTable:
         self._pending.pop(record.name, None)
         self._num_per_key[record.client.key] -= 1
         self._by_request.pop((record.client, record.opening.request), None)
+        self._remove_listener(record)
         self._set_workers(record, {}, now_s)
+
+    def change_face(self, record: SessionRecord, change: FaceSettings, now_s: float) -> None:
+        """Change the settings of a session's face."""
+        self._remove_listener(record)
+        record.face.change(change, now_s)
+        self._add_listener(record)
 
     # --- reports of services -------------------------------------------------------------------
 
@@ -286,7 +304,18 @@ class SessionTable:
         self._pending[record.name] = record
         self._num_per_key[record.client.key] += 1
         self._by_request[record.client, record.opening.request] = record
+        self._add_listener(record)
         self._set_workers(record, workers, now_s)
+
+    def _add_listener(self, record: SessionRecord) -> None:
+        if speaker := record.face.settings.listen_to:
+            self._listeners.setdefault(speaker, set()).add(record.name)
+
+    def _remove_listener(self, record: SessionRecord) -> None:
+        if speaker := record.face.settings.listen_to:
+            self._listeners[speaker].remove(record.name)
+            if not self._listeners[speaker]:
+                del self._listeners[speaker]
 
     def _set_workers(self, record: SessionRecord, workers: dict[str, str], now_s: float) -> None:
         before, after = {*record.workers.values()}, {*workers.values()}

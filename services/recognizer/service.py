@@ -31,6 +31,7 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
 from kouxing.services.service_kinds import KINDS
+from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
@@ -139,7 +140,8 @@ class RecognizerService(SessionService):
         """Return the current state of the sessions, for a restarted control."""
         now_s = time.monotonic()
         for session in self._sessions.values():
-            yield session.start.with_face(session.face.at(now_s))
+            start = session.start.with_face(session.face.at(now_s))
+            yield replace(start, speech_time=session.speech_time)
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
         self._pending.set_face(message.session, message.face)

@@ -106,6 +106,7 @@ class RecognizerSession:
         self.silent_s = -MOVE_GRACE_S if start.epoch > 1 else 0.0
         self.acknowledge_due_s: float | None = None
         self.acknowledged_s = 0.0
+        self.speech_time = start.speech_time  # start of the current speech; None: silence
         self.is_laughing = False  # whether the speaker laughs
         self._published_acoustic = AcousticModelName.FULL
         self._sound_packets = SoundPackets(face_delay_s)
@@ -264,10 +265,16 @@ class RecognizerSession:
         results = recognizer.get_result(self.stream)
         if self.resume_filter is not None:
             results = self.resume_filter.new_results(results)
-        return [
+        messages = [
             result if isinstance(result, Waveform) else event_to_message(result)
             for result in results
         ]
+        for message in messages:
+            if isinstance(message, Speech) and not message.active:
+                self.speech_time = None
+            elif isinstance(message, Speech) and self.speech_time is None:
+                self.speech_time = message.media_time
+        return messages
 
     def published_messages(self, results: Iterable[SpeechMessage | Waveform]) -> Iterator[Message]:
         """Yield the messages for subscribers."""

@@ -92,6 +92,13 @@ def chunk(number: int, num_bytes: int, session: str = "s") -> AudioChunk:
     )
 
 
+def test_reports_speech_in_progress_to_a_restarted_control(service: Recognizer) -> None:
+    service.start_session(UNPACED)
+    assert [start.speech_time for start in service.served_sessions()] == [None]
+    service._sessions["s"].speech_time = 2840
+    assert [start.speech_time for start in service.served_sessions()] == [2840]
+
+
 @pytest.mark.parametrize("paced", [False, True])
 def test_decodes_a_long_chunk_in_parts_with_heartbeats_between(
     service: Recognizer, paced: bool

@@ -3,21 +3,24 @@
 import contextlib
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import zmq
-from kouxing_client.messages import Speech
+from kouxing_client.messages import Message, Speech
 
 from kouxing.shared.bus import Bus
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import add_key, load_user_key, read_key, revoke_key
+from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionProgress
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.session import Error, OpenSession, SessionOpened
+from kouxing.shared.wire.session import CloseSession, Error, OpenSession, SessionOpened
 from tests.control_harness import ControlHarness
+from tests.system import wait_until
 
 
 @pytest.fixture(params=[True, False])
@@ -163,21 +166,76 @@ def test_a_connection_with_a_stolen_routing_id_gets_no_old_answer(harness: Contr
     assert getattr(stolen, "code", "") == "session-exists"
 
 
-@pytest.mark.parametrize("harness", [True], indirect=True)
-def test_a_face_learns_when_the_session_that_it_listens_to_speaks(harness: ControlHarness) -> None:
+def request(harness: ControlHarness, client: zmq.Socket[bytes], message: Message) -> None:
+    """Send a request and wait for its answer."""
+    client.send_multipart(encode(message))
+    wait_until(lambda: client.poll(0), step=lambda: harness.control.step(0.01))
+    client.recv_multipart()
+
+
+def send_speech(harness: ControlHarness, *, active: bool) -> None:
+    """Send control the start or the end of speech in the session ``speaker``."""
+    record = harness.control._sessions.find("speaker")
+    harness.services[0].send(Speech(session="speaker", epoch=1, sequence=1, active=active))
+    wait_until(lambda: record.speaking == active, step=lambda: harness.control.step(0.01))
+
+
+def receive_listening(harness: ControlHarness, synthesizer: Socket, num: int) -> list[bool]:
+    """Return the next values of ``listening`` for the session ``listener``."""
+    listening: list[bool] = []
+    while len(listening) < num:
+        for message in harness.receive(synthesizer):
+            if isinstance(message, SetFace) and message.face.listening is not None:
+                assert message.session == "listener"
+                listening.append(message.face.listening)
+    return listening
+
+
+@pytest.fixture
+def listening_to(harness: ControlHarness) -> zmq.Socket[bytes]:
+    """Open the sessions ``speaker`` and ``listener``; return their client."""
     client = harness.connect_client(harness.control.key and load_user_key())
     harness.open(client, "speaker")
     harness.open(client, "listener", "2")
-    client.send_multipart(
-        encode(SetFace(session="listener", face=FaceSettings(listen_to="speaker"), request="3"))
-    )
-    harness.step_until(lambda: client.poll(0))
-    recognizer, synthesizer = harness.services
-    for active in (True, False):
-        recognizer.send(Speech(session="speaker", epoch=1, sequence=1, active=active))
-    listening: list[bool] = []
-    while len(listening) < 2:
-        messages = harness.receive(synthesizer)
-        faces = [message.face for message in messages if isinstance(message, SetFace)]
-        listening += [face.listening for face in faces if face.listening is not None]
-    assert listening == [True, False]
+    return client
+
+
+LISTEN = SetFace(session="listener", face=FaceSettings(listen_to="speaker"), request="3")
+
+
+@pytest.mark.parametrize("harness", [True], indirect=True)
+def test_a_face_learns_when_the_session_that_it_listens_to_speaks(
+    harness: ControlHarness, listening_to: zmq.Socket[bytes]
+) -> None:
+    request(harness, listening_to, LISTEN)
+    harness.services[0].send(Speech(session="speaker", epoch=1, sequence=1, active=True))
+    harness.services[0].send(Speech(session="speaker", epoch=1, sequence=2, active=False))
+    assert receive_listening(harness, harness.services[1], 3) == [False, True, False]
+
+
+@pytest.mark.parametrize("harness", [True], indirect=True)
+@pytest.mark.parametrize("end", ["its session closes", "the face no longer listens"])
+def test_a_face_stops_listening_during_speech(
+    harness: ControlHarness, listening_to: zmq.Socket[bytes], end: str
+) -> None:
+    request(harness, listening_to, LISTEN)
+    send_speech(harness, active=True)
+    assert receive_listening(harness, harness.services[1], 2) == [False, True]
+    if end == "its session closes":
+        token = harness.control._sessions.find("speaker").token
+        request(harness, listening_to, CloseSession(session="speaker", token=token, request="4"))
+    else:
+        face = FaceSettings(listen_to="")
+        request(harness, listening_to, SetFace(session="listener", face=face, request="4"))
+    assert receive_listening(harness, harness.services[1], 1) == [False]
+
+
+@pytest.mark.parametrize("harness", [True], indirect=True)
+def test_a_face_learns_about_speech_that_started_before(
+    harness: ControlHarness, listening_to: zmq.Socket[bytes]
+) -> None:
+    send_speech(harness, active=True)
+    request(harness, listening_to, LISTEN)
+    assert receive_listening(harness, harness.services[1], 1) == [True]
+    start = harness.control._sessions.find("listener").start_message(time.monotonic())
+    assert start.opening.face.listening  # for another synthesizer

@@ -1,6 +1,7 @@
 """A session of the recognizer: the audio that it accepts, the order of messages, its sound."""
 
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -20,6 +21,7 @@ from kouxing.services.recognizer.session import (
 )
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
+from kouxing.shared.phones.events import SpeechChange
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import AudioChunk, ErrorCode
@@ -152,6 +154,22 @@ def test_reports_the_acoustic_model_in_use() -> None:
     reported = [(number, model) for number, model in enumerate(models) if model]
     assert [model for _, model in reported][:2] == ["full", "light"]
     assert reported[1][0] == 8
+
+
+def test_keeps_the_start_of_the_current_speech() -> None:
+    session = make_session()
+
+    def speech_time_after(*changes: SpeechChange) -> int | None:
+        fake = SimpleNamespace(get_result=lambda _stream: list(changes))
+        session.new_results(cast(Recognizer, fake))
+        return session.speech_time
+
+    start, stop = (SpeechChange(active=active, time_s=2.0) for active in (True, False))
+    assert speech_time_after() is None
+    assert speech_time_after(start) == 32_000
+    assert speech_time_after(replace(start, time_s=3.0)) == 32_000  # a repetition
+    assert speech_time_after(stop) is None
+    assert speech_time_after(stop, replace(start, time_s=4.0)) == 64_000
 
 
 def test_limits_how_far_a_paced_client_is_ahead_of_the_clock() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from kouxing_client.messages import SessionFacts
+from kouxing_client.messages import SessionFacts, Speech
 
 from kouxing.services.control.restart_recovery import RestartRecovery
 from kouxing.shared.errors import Rejected
@@ -61,6 +61,23 @@ def test_a_session_of_a_chosen_language_moves_only_to_a_worker_that_has_it(
     cluster.add(replace(worker("recognizer", "recognizer-3"), languages=languages))
     assert cluster.sessions.move(record, 1.0)
     assert record.facts.language == "universal"
+
+
+def test_a_face_listens_to_a_session_that_already_speaks(cluster: Cluster) -> None:
+    speaker = cluster.open("speaker")
+    speaker.speaking = True
+    face = FaceSettings(listen_to="speaker")
+    listener = cluster.open("listener", face=face)
+    assert listener.face.settings.listening
+    assert cluster.open("other", face=FaceSettings(listen_to="")).face.settings.listening is False
+    explicit = replace(face, listening=False)  # the client's own value
+    assert cluster.sessions.with_listening(explicit) == explicit
+    assert cluster.sessions.listeners_of("speaker") == [listener]
+    cluster.sessions.change_face(listener, FaceSettings(listen_to="other"), 1.0)
+    assert cluster.sessions.listeners_of("speaker") == []
+    assert cluster.sessions.listeners_of("other") == [listener]
+    cluster.sessions.remove(listener, 1.0)
+    assert cluster.sessions.listeners_of("other") == []
 
 
 def test_a_new_session_waits_for_its_workers_and_all_observers(cluster: Cluster) -> None:
@@ -303,3 +320,18 @@ def test_restores_a_session_from_its_newest_recognizer(cluster: Cluster) -> None
     recovery.add(stalled, "recognizer-1")
     (start,) = recovery.pop_complete()
     assert start.epoch == 2
+
+
+@pytest.mark.parametrize("has_stopped", [False, True])
+def test_a_restored_session_still_speaks(cluster: Cluster, has_stopped: bool) -> None:
+    record = cluster.open("demo")
+    record.speaking, record.speech_time = True, 2840
+    recovery = RestartRecovery(cluster.registry, 2.0)
+    assert recovery.add(record.start_message(2.0), "recognizer-1")
+    stop = Speech(session="demo", epoch=1, media_time=5000, active=False)
+    recovery.record_speech(stop, "recognizer-1" if has_stopped else "synthesizer-1")
+    (start,) = recovery.pop_complete()
+    cluster.sessions.remove(record, 2.0)
+    restored = cluster.sessions.restore(start, 2.0)
+    assert restored.start_message(3.0).speech_time == (None if has_stopped else 2840)
+    assert cluster.sessions.num_speaking("recognizer-1") == (0 if has_stopped else 1)
