@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from kouxing_client import (
+    aio,
     AsyncClient,
     AsyncResults,
     Client,
@@ -314,7 +315,12 @@ def test_a_session_disconnects_though_control_does_not_answer(
     assert frames.has_ended
 
 
-def test_a_session_closes_if_its_opening_is_cancelled(control: FakeControl) -> None:
+@pytest.mark.parametrize("stays_open", [True, False])
+def test_a_session_closes_if_its_opening_is_cancelled(
+    control: FakeControl, monkeypatch: pytest.MonkeyPatch, stays_open: bool
+) -> None:
+    monkeypatch.setattr(aio, "LAST_ANSWER_S", LIMIT_S)
+
     async def run() -> None:
         async with AsyncClient(control.address, insecure=True, timeout_s=LIMIT_S) as client:
             control.is_silent = True
@@ -324,6 +330,8 @@ def test_a_session_closes_if_its_opening_is_cancelled(control: FakeControl) -> N
             with pytest.raises(asyncio.CancelledError):
                 await opening
             control.is_silent = False  # it answers the repeated request
-            await asyncio.to_thread(wait_until, lambda: control.sessions_of(CloseSession) == ["s"])
+            if stays_open:
+                await asyncio.to_thread(wait_until, lambda: control.sessions_of(CloseSession))
 
     asyncio.run(run())
+    assert control.sessions_of(CloseSession) == ["s"]

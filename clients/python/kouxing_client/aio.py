@@ -32,8 +32,13 @@ class AsyncClient(BaseClient):
         await self.close()
 
     async def close(self) -> None:
-        """Close all connections, as ``Client.close``."""
-        await asyncio.to_thread(self._thread.close)
+        """Close all connections, as ``Client.close``, and sessions whose opening was cancelled."""
+        closings = [asyncio.wrap_future(closed) for closed in tuple(self._unused)]
+        try:
+            if closings:
+                await asyncio.wait(closings, timeout=LAST_ANSWER_S)
+        finally:
+            await asyncio.to_thread(self._thread.close)
 
     async def open_session(self, name: str = "", **options: Unpack[SessionOptions]) -> AsyncSession:
         """Open a session, as ``Client.open_session``."""
@@ -42,7 +47,7 @@ class AsyncClient(BaseClient):
         try:
             return AsyncSession(self._thread, await asyncio.wrap_future(opened), fields)
         except asyncio.CancelledError:
-            opened.add_done_callback(self._close_unused)
+            self._close_unused(opened)
             raise
 
     async def follow(self, name: str = "", *, paced: bool = True) -> AsyncSession:

@@ -10,7 +10,7 @@ from typing import Any
 from kouxing_client.audio import SAMPLE_BYTES, check_channels, split, to_pcm
 from kouxing_client.core import ClientCore
 from kouxing_client.errors import KouxingError, Refused
-from kouxing_client.inbox import Inbox
+from kouxing_client.inbox import Inbox, new_future
 from kouxing_client.keys import Key, find_key, read_key
 from kouxing_client.messages import Fields, Result
 from kouxing_client.options import check_name, check_results
@@ -63,6 +63,7 @@ class BaseClient:
             key = read_key(key)
         key = None if insecure else key or find_key()
         self._thread = ClientThread(control, key, timeout_s, start_s)
+        self._unused: set[Future[None]] = set()  # of cancelled openings whose session may open
 
     @property
     def is_closed(self) -> bool:
@@ -74,11 +75,21 @@ class BaseClient:
         return self._thread.submit(lambda core: core.request(kind, session, **fields))
 
     def _close_unused(self, opened: Future[SessionCore]) -> None:
-        """Close a session that has opened although its opening was cancelled."""
-        if opened.exception() is None:
+        """Close a session as soon as it opens, because its opening was cancelled."""
+        closed = new_future()
+        self._unused.add(closed)
+        closed.add_done_callback(self._unused.discard)
+
+        def close(opened: Future[SessionCore]) -> None:
+            if opened.exception() is not None:
+                closed.set_result(None)
+                return
             core = opened.result()
-            BaseSession(self._thread, core, None)._close()
+            answer = BaseSession(self._thread, core, None)._close()
+            answer.add_done_callback(lambda _: closed.set_result(None))
             self._thread.forget(core)
+
+        opened.add_done_callback(close)
 
 
 class BaseSession:
