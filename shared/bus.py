@@ -7,13 +7,14 @@ key. The endpoint of a bound socket with a key includes the public key: ``tcp://
 
 import errno
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
 from typing import Self
 
 import zmq
 from kouxing_client.field_types import MAX_AUDIO_BYTES
 from kouxing_client.keys import Key
+from kouxing_client.messages import Message
 from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
 from zmq.utils.monitor import recv_monitor_message
 
@@ -84,11 +85,15 @@ class Bus:
         return self._bind(zmq.ROUTER, endpoint, key, limits)
 
     def bind_publisher(
-        self, endpoint: str, key: str, on_subscribe: Callable[[str], None] = lambda session: None
+        self,
+        endpoint: str,
+        key: str,
+        on_subscribe: Callable[[str], Sequence[Message]] = lambda session: (),
     ) -> Socket:
         """Bind a socket that many peers subscribe to.
 
         ``on_subscribe`` is called with the session when the subscriptions of a peer are in effect.
+        It returns the messages to publish again.
         """
         return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS, on_subscribe)
 
@@ -164,7 +169,7 @@ class Bus:
         endpoint: str,
         key: str,
         limits: SocketLimits,
-        on_subscribe: Callable[[str], None] = lambda session: None,
+        on_subscribe: Callable[[str], Sequence[Message]] = lambda session: (),
     ) -> Socket:
         split_endpoint(endpoint, key)
         raw = self._open(kind, limits.num_answers)
@@ -196,6 +201,7 @@ class Bus:
             routes=kind == zmq.ROUTER,
             publishes=kind == zmq.XPUB,
             on_subscribe=on_subscribe,
+            endpoint_name=key.rpartition(".")[2],
         )
         self._sockets.append(socket)
         return socket

@@ -5,6 +5,7 @@ are published in the meantime are repeated for each of them. Subscribers ignore 
 """
 
 from collections import deque
+from collections.abc import Sequence
 
 from kouxing_client.messages import Message
 
@@ -30,8 +31,6 @@ class ReplayingPublisher:
         else:
             self._messages.clear()
 
-    def repeat(self, now_s: float) -> None:
-        """Publish the first messages again for a new subscriber."""
-        if now_s < self._end_s:
-            for message in self._messages:
-                self._publisher.send(message)
+    def repeated(self, now_s: float) -> Sequence[Message]:
+        """Return the messages to publish again for a new subscriber."""
+        return self._messages if now_s < self._end_s else ()

@@ -5,7 +5,7 @@ Undecodable messages are returned as ``BadMessage``.
 
 import math
 import secrets
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import zmq
@@ -60,7 +60,8 @@ class Socket:
         *,
         routes: bool = False,
         publishes: bool = False,
-        on_subscribe: Callable[[str], None] = lambda session: None,
+        on_subscribe: Callable[[str], Sequence[Message]] = lambda session: (),
+        endpoint_name: str | None = None,
     ) -> None:
         self.raw = raw
         self._key = key
@@ -69,6 +70,7 @@ class Socket:
         self._routes = routes
         self._publishes = publishes
         self._on_subscribe = on_subscribe
+        self._endpoint_name = endpoint_name  # of a publisher
         self._connection: PeerConnection | None = None  # connection of the last message
         self._sender = NO_PEER  # sender of the last message
         self._has_unread_parts = False  # unread parts of the last message remain
@@ -270,8 +272,17 @@ class Socket:
         prefix = f"{Joined.kind}/".encode()
         session = subscription.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
         if subscription.startswith(prefix) and is_name(session):
-            self.send(Joined(session=session, publisher=self._name))
-            self._on_subscribe(session)
+            repeated = self._on_subscribe(session)
+            self.send(
+                Joined(
+                    session=session,
+                    publisher=self._name,
+                    endpoint=self._endpoint_name,
+                    repeats=bool(repeated),
+                )
+            )
+            for message in repeated:
+                self.send(message)
 
 
 def _property(frame: zmq.Frame, name: int | str, default: T) -> T:

@@ -400,9 +400,9 @@ class RecognizerService(SessionService):
                 name = EventName.LAUGHTER_START if result.laughter else EventName.LAUGHTER_STOP
                 self.publish_event(name, session.start, media_time=result.media_time)
 
-    def _on_subscribe(self, session: str) -> None:
-        if (joined := self._sessions.get(session)) is not None:
-            joined.replay.repeat(time.monotonic())
+    def _on_subscribe(self, session: str) -> Sequence[Message]:
+        subscribed = self._sessions.get(session)
+        return () if subscribed is None else subscribed.replay.repeated(time.monotonic())
 
     def _on_acknowledge(self, ack: Acknowledge, _sender: Peer) -> None:
         if (session := self._sessions.get(ack.session)) is not None:

@@ -335,7 +335,6 @@ class SynthesizerService(SessionService):
             )
             session.replay.send(session.newest_frame, time.monotonic())
 
-    def _on_subscribe(self, session: str) -> None:
+    def _on_subscribe(self, session: str) -> Sequence[Message]:
         subscribed = self._sessions.get(session)
-        if subscribed is not None:
-            subscribed.replay.repeat(time.monotonic())
+        return () if subscribed is None else subscribed.replay.repeated(time.monotonic())

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from kouxing_client import (
-    aio,
     AsyncClient,
     AsyncResults,
     Client,
@@ -24,6 +23,7 @@ from kouxing_client import (
     Phone,
     Refused,
     Shapes,
+    aio,
     find_key,
 )
 from kouxing_client.base import MAX_LIVE
@@ -211,6 +211,14 @@ def test_results_may_be_read_in_several_event_loops(control: FakeControl) -> Non
         control.publish(control.faps, frame(1), frame(2))
         assert {reader.result() for reader in readers} == {1.0, 2.0}
     asyncio.run(client.close())
+
+
+def test_a_new_subscriber_receives_what_the_publisher_repeats(
+    control: FakeControl, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control.faps, "_on_subscribe", lambda _: [frame(1), frame(2)])
+    frames = client.open_session("s").frames()
+    assert [next(frames).sequence for _ in range(2)] == [1, 2]
 
 
 def test_a_session_that_control_closes_ends(control: FakeControl, client: Client) -> None:

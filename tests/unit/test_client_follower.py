@@ -74,6 +74,25 @@ def test_subscribes_again_until_every_publisher_confirms() -> None:
     assert len(harness.sockets.connections) == 2
 
 
+def test_misses_no_repeated_message_if_a_newer_one_arrives_before_the_confirmation() -> None:
+    harness = FollowerHarness()
+    harness.publish(frame(3), sound(8))
+    assert harness.received == []
+    harness.publish(Joined(publisher="a", endpoint="faps", repeats=True))
+    harness.publish(*map(frame, (1, 2, 3, 4)))
+    assert harness.received == [frame(number) for number in (1, 2, 3, 4)]
+    harness.publish(Joined(publisher="b", endpoint="phones"))  # it repeats nothing
+    assert harness.received[4:] == [sound(8)]
+
+
+def test_accepts_messages_of_a_publisher_that_does_not_confirm() -> None:
+    harness = FollowerHarness()
+    harness.publish(frame(3), sound(8))
+    harness.sockets.now_s += RETRY_S
+    harness.follower.tick()
+    assert harness.received == [sound(8), frame(3)]
+
+
 def test_follows_a_move_to_another_publisher() -> None:
     harness = FollowerHarness().complete()
     old = harness.connection

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Protocol
 
 from kouxing_client.errors import KouxingError
@@ -53,7 +53,8 @@ class Follower:
     After a move, the old connection stays open until the new subscriptions are in effect, and
     ``OVERLAP_S`` longer if one of the publishers stays the same. If a publisher does not confirm,
     the follower subscribes again: libzmq never reconnects a socket to an address where another
-    program answered before.
+    program answered before. Messages that arrive before their publisher confirms wait until then,
+    because the publisher may repeat them in order, after older ones.
 
     Parameters
     ----------
@@ -101,6 +102,8 @@ class Follower:
         self._live_addresses: set[str] = set()
         self._keeps_publisher = False  # an address was also used before the move
         self._confirmed: set[str] = set()  # publishers
+        # Messages that arrived before the confirmation, by endpoints that have not confirmed
+        self._early: dict[str, list[Message]] = {}
         self._first_epoch = 0
         self._epochs: dict[str, int] = {}  # endpoint: epoch of its newest message
         self._newest: dict[str, _Number] = {}  # numbers of the newest message, by kind
@@ -120,6 +123,7 @@ class Follower:
         KouxingError
             If an endpoint is missing or malformed.
         """
+        self._stop_waiting()
         names = {cls.published_at for cls in self._classes}
         if missing := sorted(names - endpoints.keys()):
             raise KouxingError(f"session {self.session} has no endpoint {missing[0]!r}")
@@ -151,6 +155,7 @@ class Follower:
         if now_s >= self._close_old_due_s:
             self._close_old_connection()
         if self._connection is not None and now_s >= self._retry_s:
+            self._stop_waiting()
             self._transport.close_connection(self._connection)
             self._subscribe()
         return min(self._close_old_due_s, self._retry_s)
@@ -160,6 +165,7 @@ class Follower:
         self._close_old_connection()
         if self._connection is not None:
             self._transport.drain(self._connection)
+        self._stop_waiting()
         self._deliver_held()
 
     def await_confirmation(self) -> Any:
@@ -182,6 +188,7 @@ class Follower:
 
     def _subscribe(self) -> None:
         confirmed = self._confirmed = set()
+        early = self._early = {cls.published_at: [] for cls in self._classes}
         self.is_complete = False
         self._retry_s = self._transport.now_s + RETRY_S
         self._connection = self._transport.subscribe(
@@ -189,7 +196,7 @@ class Follower:
             (*self._classes, Joined),  # subscribed last, so its confirmation covers the others
             self._addresses - self._live_addresses,
             self._live_addresses,
-            lambda message: self._on_arrival(message, confirmed),
+            lambda message: self._on_arrival(message, confirmed, early),
         )
 
     def _close_old_connection(self) -> None:
@@ -202,11 +209,33 @@ class Follower:
             self._transport.close_connection(connection)
             self._old_connection = None
 
-    def _on_arrival(self, message: Message, confirmed: set[str]) -> None:
+    def _on_arrival(
+        self, message: Message, confirmed: set[str], early: dict[str, list[Message]]
+    ) -> None:
         self.received_at_s = self._transport.now_s
         if isinstance(message, Joined):
+            endpoints = [*early] if message.endpoint is None else [message.endpoint]
+            for endpoint in endpoints:
+                messages = early.pop(endpoint, [])
+                self._accept_early(() if message.repeats else messages)
             self._on_joined(message.publisher, confirmed)
-        elif self._live and isinstance(message, FapFrame) and self._is_catching_up():
+        elif message.published_at in early:
+            early[message.published_at].append(message)
+        else:
+            self._receive(message)
+
+    def _stop_waiting(self) -> None:
+        """Accept the messages of publishers that have not confirmed the newest connection."""
+        while self._early:
+            self._accept_early(self._early.popitem()[1])
+
+    def _accept_early(self, messages: Iterable[Message]) -> None:
+        for message in messages:
+            if self._connection is not None:  # no handler has closed it
+                self._receive(message)
+
+    def _receive(self, message: Message) -> None:
+        if self._live and isinstance(message, FapFrame) and self._is_catching_up():
             self._held_frames.append(message)
         else:
             self._deliver_held()

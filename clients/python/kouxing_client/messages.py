@@ -189,6 +189,10 @@ class Joined(Message, frozen=True, kw_only=True):
 
     publisher: Name
     """differs between publishers; wait for as many as you connected to"""
+    endpoint: Name | None = None
+    """name of the publisher's endpoint: ``phones`` or ``faps``; None: unknown"""
+    repeats: bool = False
+    """whether the publisher next repeats its messages, also those that arrived before this one"""
 
 
 class Event(Message, frozen=True, kw_only=True):
