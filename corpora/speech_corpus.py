@@ -17,7 +17,7 @@ Natural recordings are held out from all training, to measure recognizers on the
 podcasts, a talk, a web seminar and a prompt, with eight voices. The publishers of ``MOSS-TTSD`` and
 ``Step-Audio-EditX`` provide the texts. Other texts are the output of one large recognizer
 (``RapidASR``) or the majority of several (``vad_example``), so they contain errors. Long recordings
-are cut into pieces that overlap by 0.48 s, and so are their texts.
+are cut into segments that overlap by 0.48 s, and so are their texts.
 
 ``languages.tsv`` lists recordings in several languages, by speakers that no model was trained on,
 and their phones. No setting of the universal model was chosen on these recordings, except for those

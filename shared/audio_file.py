@@ -388,7 +388,7 @@ def _check_samples(
 def _resample(
     pieces: Iterator[tuple[int, Samples]], rate_hz: int, num_channels: int
 ) -> Iterator[Samples]:
-    """Resample pieces with another rate. The rate may change between pieces."""
+    """Resample chunks with another rate. The rate may change between chunks."""
     resampler: Any = None
     piece_rate_hz = rate_hz
     end = np.zeros((0, num_channels), np.float32)

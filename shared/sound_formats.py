@@ -66,10 +66,10 @@ _OTHER = {
     b"\x1f\x8b": "a gzip archive; unpack it first",
     b"7z\xbc\xaf": "a 7z archive; unpack it first",
     b"Rar!": "a rar archive; unpack it first",
-    b"%PDF": "a PDF document, not audio",
-    b"\x89PNG": "a picture, not audio",
-    b"\xff\xd8\xff": "a picture, not audio",
-    b"GIF8": "a picture, not audio",
+    b"%PDF": "a PDF document; use an audio file",
+    b"\x89PNG": "a picture; use an audio file",
+    b"\xff\xd8\xff": "a picture; use an audio file",
+    b"GIF8": "a picture; use an audio file",
     b"glTF": "an avatar, not audio; show it with --head of kouxing run or render",
     **dict.fromkeys((b"#!SILK", b"\2#!SILK"), "a SILK voice message; convert it to wav first"),
     b"MThd": "a MIDI file, which contains notes, not audio; render it to wav with a synthesizer",
@@ -131,7 +131,7 @@ def non_audio_kind(begin: bytes) -> str:
         if begin.startswith(mark):
             return kind
     text = _text_of(begin)
-    return f"text, not audio: {text.splitlines()[0][:60]!r}" if text else ""
+    return f"text, not audio: {text.splitlines()[0][:60]!r}; use an audio file" if text else ""
 
 
 def why_unreadable(begin: bytes, reason: str) -> str:

@@ -25,8 +25,8 @@ Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write
 PhoneLm = Annotated[
     Path | None,
     typer.Option(
-        help="Phone language model, phone_lm.npz or an acoustic model. Default: counted on the"
-        " corpora."
+        help="Phone language model, phone_lm.npz or an acoustic model. Default: a model that is"
+        " counted from the corpora."
     ),
 ]
 Whisper = Annotated[

@@ -6,7 +6,7 @@ warping (Keogh and Pazzani 2001, with first differences) pairs frames. A pair co
 are maxima or minima, and the predicted one is between the real curve's neighboring extrema. The
 misalignment is the mean absolute offset of the pairs of a clip.
 
-Long clips are cut into pieces of 8 s, because the paper's sequences are sentences.
+Long clips are cut into segments of 8 s, because the paper's sequences are sentences.
 """
 
 import numpy as np

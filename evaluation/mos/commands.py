@@ -50,7 +50,7 @@ def heads(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SOUND", help="Speech and laughter, padded with pauses to one minute."
+            metavar="AUDIO", help="Speech and laughter, padded with pauses to one minute."
         ),
     ],
     language: Language = None,

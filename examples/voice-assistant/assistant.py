@@ -34,7 +34,7 @@ def answer(text):
 
 
 async def synthesize(text):
-    """Yield 16-bit PCM in pieces of any length; here a hum with one vowel per letter."""
+    """Yield 16-bit PCM in chunks of any length; here a hum with one vowel per letter."""
     for letter in text:
         states = [[0.0, 0.0], [0.0, 0.0]]
         samples = array.array("h")
@@ -56,7 +56,7 @@ async def speak(face, text):
     sent_s = 0.0
     try:
         async for pcm in synthesize(text):
-            for begin in range(0, len(pcm), MESSAGE_BYTES):  # a whole sentence can be a large piece
+            for begin in range(0, len(pcm), MESSAGE_BYTES):  # a whole sentence can be a large chunk
                 await face.send_bytes(pcm[begin : begin + MESSAGE_BYTES])
             sent_s += len(pcm) / 2 / RATE_HZ
     except (OSError, aiohttp.ClientError) as error:

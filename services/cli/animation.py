@@ -37,7 +37,7 @@ from kouxing.shared.phones.transcript import TimedSyllable
 from kouxing.shared.terminal import print_message
 
 T = TypeVar("T", Phone, TimedSyllable)
-_IMAGE_RATE_HZ = 25.0  # for a video made from sound
+_IMAGE_RATE_HZ = 25.0  # rate of a video that is made from audio
 _MAX_IMAGE_RATE_HZ = 240.0
 
 
@@ -52,7 +52,7 @@ class FaceMotion:
     phones: list[Phone] | None = None  # spoken phones in order; None if the source has no sound
     syllables: Sequence[TimedSyllable] = ()  # as written, in order
     source: Path | None = None
-    language: str = DEFAULT_LANGUAGE  # of the phones
+    language: str = DEFAULT_LANGUAGE  # language of the phones
     has_wrong_text: bool = False  # the mouth follows a text that does not fit the audio
 
 

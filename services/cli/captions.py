@@ -44,7 +44,10 @@ def check_characters(transcript: Transcript, inventory: PhoneInventory) -> None:
     """
     written = [_write(syllable, inventory) for syllable in transcript.syllables]
     if all(text == spelling for text, spelling in written):
-        raise UserError("--captions characters needs a text in characters; this one is pinyin")
+        raise UserError(
+            "--captions characters needs a text in characters, and this one is pinyin; use"
+            " --captions pinyin"
+        )
     if not can_draw("".join(text for text, _ in written)):
         raise UserError(f"--captions characters: {NO_CHINESE_FONT}, or use --captions pinyin")
 

@@ -151,7 +151,10 @@ def devices() -> None:
 
     devices = list_sound_devices()
     if not devices:
-        print_message("no microphone and no sound server was found")
+        print_message(
+            "no microphone and no sound server were found; connect a microphone, or start"
+            " PulseAudio or PipeWire"
+        )
     for device in devices:
         source = "mic" if device.kind == "mic" else "monitor"
         typer.echo(f"{device.kind}: {device.name}")

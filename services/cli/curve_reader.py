@@ -169,7 +169,7 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
     folded = [name.lower() for name in names]
     for name in known:
         if folded.count(name.lower()) > 1:
-            raise UserError(f"{path}: two columns have the name {name}")
+            raise UserError(f"{path}: two columns have the name {name}; rename or delete one")
     for angle, fap in _HEAD_FAPS.items():
         if angle.lower() in folded:
             known[angle] = fap_rows[FAP_NUMBER[fap] - 1] / RADIANS_PER_ANGLE_UNIT

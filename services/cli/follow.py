@@ -45,10 +45,10 @@ def follow(
 ) -> None:
     """Follow a session until it ends. Without a name, follow the newest one or wait for the next.
 
-    The frames go to ``output``. Without it, they are printed, or syllables, or phones in an
-    ``alphabet``. ``control`` finds control's address, once the file's format was checked. Raises
-    ``UserError`` if control does not answer, the file cannot be written, or its format does not fit
-    ``form``.
+    Writes the frames to ``output``. Without it, prints the frames, or the syllables or phones that
+    ``form`` names. Phones are in ``alphabet``. ``control`` is entered only after the format of the
+    file has been checked, so that a wrong name fails at once. Raises ``UserError`` if control does
+    not answer, the file cannot be written, or its format does not fit ``form``.
     """
     is_speech = form in SPEECH_FORMATS
     curve_form = None if form is None or is_speech else CurveFormat(form)

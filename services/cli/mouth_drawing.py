@@ -63,7 +63,7 @@ FRAME_RATE_HZ = 25.0
 CSV_COLUMNS = ("time_s", "opening", "line", "point", "x", "y", "phone")
 _VIDEO_SIZE_PX = (640, 480)
 _MOUTHS_PER_ROW, _MOUTH_PX = 8, 150.0
-_MAX_MOUTHS = 400  # in one picture
+_MAX_MOUTHS = 400  # maximum number of mouths in one picture
 _STRETCH = slice(5, 7)  # FAP 6 and 7, of the corners
 _BLOCK_FRAMES = 250  # number of contours to compute at once
 

@@ -70,7 +70,7 @@ def render(
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SOUND|CURVES [OUTPUT]",
+            metavar="AUDIO|CURVES [OUTPUT]",
             help="Audio or video files, or curves (.fap, .csv, .jsonl); '-' is standard input."
             " Then, for a single file, the output. Default: a video (.mp4) next to the file.",
         ),
@@ -121,7 +121,11 @@ def render(
         ),
     ] = _DEFAULTS.background,
     camera: Annotated[
-        Framing, typer.Option(help="Part that fills the picture, or the head from the side.")
+        Framing,
+        typer.Option(
+            help="What fills the picture: the face, the head or the mouth. side shows the head at"
+            " 60 degrees."
+        ),
     ] = _DEFAULTS.camera,
     rate: Annotated[
         float | None,
@@ -335,7 +339,8 @@ def lips(
         WidthSource,
         typer.Option(
             metavar="MODEL",
-            help=f"Lip model for the width of the mouth: {', '.join(WidthSource)} (constant).",
+            help=f"Lip model for the width of the mouth: {', '.join([*WidthSource][:-1])}, or"
+            f" {[*WidthSource][-1]}, which keeps it constant.",
         ),
     ] = WidthSource.VISEMES,
     language: Language = None,

@@ -65,8 +65,10 @@ def _parser() -> argparse.ArgumentParser:
     add("-o", "--output", type=Path, help="file to write; an existing file is overwritten")
     add("-d", "--dialogFile", type=Path, help="file with the spoken text")
     add("--language", default=AUTO, help="language of the speech, such as en or zh; not in Rhubarb")
-    add("--extendedShapes", default="GHX", help="mouths of G, H and X that are drawn")
-    add("--datFrameRate", type=float, default=24.0, help="10 to 100 images per second")
+    add("--extendedShapes", default="GHX", help="which of the mouths G, H and X you have drawn")
+    add(
+        "--datFrameRate", type=float, default=24.0, help="images per second of dat files, 10 to 100"
+    )
     add(
         "--datUsePrestonBlair",
         action="store_true",

@@ -1,10 +1,10 @@
-"""Logs lost services. Short faults are only logged; longer faults are reported."""
+"""Logs lost services: as information at first, as a warning if they do not return in time."""
 
 from dataclasses import dataclass
 
 from kouxing.shared.logs import LOG
 
-SHORT_S = 1.0  # faults of services that return within this time are not reported
+SHORT_S = 1.0  # time without a service after which its loss is a warning
 MAX_FAULTS = 1000
 
 
@@ -30,7 +30,7 @@ class FaultLog:
             del self._faults[next(iter(self._faults))]
 
     def report(self, now_s: float) -> None:
-        """Report faults that last longer than ``SHORT_S``."""
+        """Warn about each fault that has lasted longer than ``SHORT_S``."""
         for fault in self._faults.values():
             if not fault.is_reported and now_s - fault.begin_s > SHORT_S:
                 fault.is_reported = True
@@ -39,7 +39,7 @@ class FaultLog:
     def end(self, instance: str, now_s: float) -> float:
         """Record that a service has registered; return how long it was lost, seconds.
 
-        The return is reported if the loss was reported.
+        The return is logged as a warning if the loss was.
         """
         fault = self._faults.pop(instance, None)
         if fault is None:

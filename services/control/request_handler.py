@@ -24,7 +24,7 @@ from kouxing.shared.wire.session import (
     StatusRequest,
 )
 
-MAX_ANSWERS = 1000  # kept for repeated requests
+MAX_ANSWERS = 1000  # number of answers that are kept for repeated requests
 MAX_DEFERRED = 1000
 TEMPORARY_ERRORS = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)  # may be temporary
 Request: TypeAlias = OpenSession | CloseSession | FlushSession | SetFace | StatusRequest

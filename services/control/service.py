@@ -46,7 +46,7 @@ from kouxing.shared.wire.session import (
 
 STOPPED = "stopped"  # reason for a service that shut down
 CHECK_S = 0.5  # interval of checking waiting sessions and the list of keys
-MAX_PAUSE_S = 0.1  # delay of a tick; any longer delay was caused by control itself
+MAX_PAUSE_S = 0.1  # if a tick is later than this, control itself was stalled
 # events that a service may publish
 SERVICE_EVENTS = (
     EventName.AUDIO_SKIPPED,

@@ -22,7 +22,7 @@ from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionM
 
 START_TIMEOUT_S = 5.0
 MOVE_TIMEOUT_S = 20.0  # time without a worker after which a session is closed
-REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)  # because a client's connection may have broken
+REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)  # delays of repeated messages: a connection may have broken
 
 
 class SessionLifecycle:

@@ -71,7 +71,8 @@ class DriverConfig(HeadConfig):
     ] = "studio"
     """Background of windows and videos."""
     camera: Framing = Framing.FACE
-    """The part of the head that fills the picture, or the head from the side."""
+    """What fills the picture: the face, the head or the mouth. side shows the head at 60
+    degrees."""
     virtual_camera: Switch = False
     """Whether to offer the picture to other programs as a camera."""
     size: Annotated[
@@ -79,7 +80,7 @@ class DriverConfig(HeadConfig):
     ] = "1280x720"
     """Size of the window and of videos, in pixels."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 25.0
-    """Images per second."""
+    """Images per second in the window and in videos."""
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -15,8 +15,8 @@ from kouxing.shared.encoding_check import EncodingCheck
 
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
-CHUNK_S = 0.04  # duration of the pieces in which queued audio is forwarded
-KEEP_ALIVE_S = 20.0  # interval of the silent pieces that keep a session without audio open
+CHUNK_S = 0.04  # duration of the chunks in which queued audio is forwarded
+KEEP_ALIVE_S = 20.0  # interval between the silent chunks that keep a session without audio open
 _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR}
 
 

@@ -14,7 +14,7 @@ from kouxing_client.keys import Key
 from kouxing.services.gateway import browser_messages
 from kouxing.shared.errors import UserError
 
-LAST_FRAME_TIMEOUT_S = 1.5  # after the end of the audio
+LAST_FRAME_TIMEOUT_S = 1.5  # maximum wait for the last frame after the end of the audio
 LAST_PHONES_S = 0.2  # wait for the last phones, which arrive separately from the last frame
 CONTROL_TIMEOUT_S = 3.0
 

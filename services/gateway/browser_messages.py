@@ -42,10 +42,10 @@ MAX_SHOWN = 40  # characters of a client's text in an error
 # The face settings that a browser can change; the query of its address selects shapes.
 FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
 _FORMAT_FIELDS = PcmFormat.__struct_fields__
-COMMANDS = ("skip", "flush", "last", *FACE_SETTINGS)  # of a microphone
-CHANNEL_COMMANDS = ("flush", *FACE_SETTINGS)  # of a WebRTC client
+COMMANDS = ("skip", "flush", "last", *FACE_SETTINGS)  # that a microphone client may send
+CHANNEL_COMMANDS = ("flush", *FACE_SETTINGS)  # that a WebRTC client may send
 VIEWER_COMMANDS = ("follow", "play", "avatar", "format", *FACE_SETTINGS)
-FORMATS = ("binary", "json", "msgpack")  # of blendshapes
+FORMATS = ("binary", "json", "msgpack")  # formats of blendshapes
 # names in version 0.1.0, which are still accepted
 _OLD_NAMES = {"lips": "lip_model", "express": "expressions", "eof": "last"}
 

@@ -25,7 +25,7 @@ class ShapeEncoder:
     shape_set: str
     message_format: str  # one of FORMATS
     targets: tuple[tuple[int, int], ...] = ()  # an avatar's meshes and the shapes within them
-    indices: tuple[int, ...] = ()  # of their weights in the set
+    indices: tuple[int, ...] = ()  # indices of the shapes' weights in the set
 
     def header_message(self) -> str:
         """Return the message with the names or the targets, in the order of the weights."""

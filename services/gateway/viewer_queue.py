@@ -1,4 +1,7 @@
-"""Bounded queue of one viewer's messages, which prefers new frames to complete delivery."""
+"""Bounded queue of one viewer's messages.
+
+If the viewer is too slow, old messages are dropped, so that new frames are not late.
+"""
 
 import asyncio
 from collections import deque

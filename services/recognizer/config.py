@@ -30,13 +30,14 @@ class RecognizerConfig(LiveConfig):
     acoustic: Annotated[
         str, KnownNames(lambda: MODEL_NAMES, r".*\.\w+", ", or a file such as model.npz")
     ] = "blocks"
-    """Acoustic model: blocks has the fewest errors, light suits weak machines, and universal knows
+    """Acoustic model: blocks has the fewest errors, light suits weak machines, and universal has
     the phones of all languages."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
         default_factory=lambda values: _rule_of_model(values).num_stable_frames
     )
-    """Consecutive frames that must agree before a phone is emitted (N = 3 in Li 2011). The
-    default is 1 if acoustic is light or gmm."""
+    """Number of consecutive frames that must agree before a phone is emitted (N in Li 2011, where
+    it is 3). More frames give fewer wrong phones, but later ones. The default is 1 if acoustic is
+    light or gmm."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         default_factory=lambda values: _rule_of_model(values).min_confidence
     )

@@ -64,8 +64,8 @@ def _check_combination(target: Target) -> None:
         raise UserError("only=mouth lets another program control the head; leave out head=on")
     if target.camera is not None and is_loopback(target.host) and target.camera[1] == target.port:
         raise UserError(
-            f"camera must differ from the program's port {target.port}; set the tracker to send to"
-            " the port of camera"
+            f"camera={target.port} is the port of the avatar program itself; choose another port,"
+            " and set the tracker to send to it"
         )
 
 

@@ -43,9 +43,9 @@ class SynthesizerConfig(FaceConfig, LiveConfig):
         AfterValidator(_check_milliseconds),
         ValueHint("0, or a number of milliseconds from 1 to 300"),
     ] = Field(default_factory=_delay_ms)
-    """Delay between a frame's audio and the frame, in steps of 20 ms. The default is 160 if
-    lips is dynamic-visemes or ferguson."""
+    """How much later than its audio a frame is made, in steps of 20 ms. A longer delay gives
+    better lips. The default is 160 if lips is dynamic-visemes or ferguson."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """Size of the mouth movements. 1 leaves the lip model unchanged. Closures stay closed."""
     feeling: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Strength of the voice's emotion on the face. 0 turns it off."""
+    """How strongly the face shows the emotion in the voice. 0 turns this off."""

@@ -102,7 +102,7 @@ def _pack(numbers: memoryview[Any], encoding: str) -> bytes:
 
 
 def split(pcm: bytes, num_bytes: int) -> Iterator[bytes]:
-    """Split PCM into pieces of at most ``num_bytes``."""
+    """Split PCM into chunks of at most ``num_bytes`` bytes."""
     for begin in range(0, len(pcm), num_bytes):
         yield pcm[begin : begin + num_bytes]
 

@@ -1,6 +1,6 @@
 """Builds a head from a mesh and its feature points.
 
-The connected surface that contains point 8.1 is the skin; it gets the fields of ``import_fields``.
+The connected surface that contains point 8.1 is the skin; it gets the fields of ``skin_fields``.
 The role of other connected surfaces follows from their position. Eyeballs rotate. Objects in the
 mouth below the lips (lower teeth, tongue) follow the jaw. Objects on the skin (lashes, brows,
 beard) follow the skin. The rest only follows the head.

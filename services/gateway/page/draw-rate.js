@@ -5,11 +5,11 @@ import { SlidingWindow } from "./sliding-window.js";
 
 const STEP = 0.85; // factor of the pixel ratio; the number of pixels changes by its square
 const MIN_RATIO = 0.35;
-const MIN_IMAGES = 10; // before their mean time is used
-const FEW_IMAGES = 3; // if all of them are very slow
+const MIN_IMAGES = 10; // number of images after which their mean time is used
+const FEW_IMAGES = 3; // the same if all of them are very slow
 const SMOOTHING = 0.2;
 const MAX_SHOWN_MS = 200; // an image that is shown for longer belongs to a face that does not move
-const WINDOW_MS = 2000; // over which delays are measured
+const WINDOW_MS = 2000; // window in which delays are measured
 const TOLERANCE_MS = 8; // half a tick of the display; an image starts later than its tick
 const PERIOD_MS = 50; // 20 images per second
 const TICK_MS = 1000 / 60;

@@ -4,13 +4,13 @@ const CHINESE = {
   // Files: the same texts as the commands print
   "the file is empty": "文件是空的",
   "cannot read audio: this is {kind}": "无法读取声音：这是{kind}",
-  "text, not audio: {text}": "文本，不是声音：{text}",
+  "text, not audio: {text}; use an audio file": "文本，不是声音：{text}；请用声音文件",
   "a zip archive; unpack it first": "zip 压缩包，请先解压",
   "a gzip archive; unpack it first": "gzip 压缩包，请先解压",
   "a 7z archive; unpack it first": "7z 压缩包，请先解压",
   "a rar archive; unpack it first": "rar 压缩包，请先解压",
-  "a PDF document, not audio": "PDF 文档，不是声音",
-  "a picture, not audio": "图片，不是声音",
+  "a PDF document; use an audio file": "PDF 文档，请用声音文件",
+  "a picture; use an audio file": "图片，请用声音文件",
   "an avatar, not audio; show it with --head of kouxing run or render": "虚拟形象，不是声音；请用 kouxing run 或 render 的 --head 显示它",
   "a SILK voice message; convert it to wav first": "SILK 语音消息，请先转成 wav",
   "a MIDI file, which contains notes, not audio; render it to wav with a synthesizer": "MIDI 文件，只有音符没有声音；请先用合成器转成 wav",
@@ -102,8 +102,8 @@ const CHINESE = {
   "cannot receive from a tracker on {host}:{port}: {reason}": "无法在 {host}:{port} 接收面部追踪数据：{reason}",
   "camera must be a port such as 39541, or ADDRESS:PORT, not {text}":
     "camera 应为端口（例如 39541）或 地址:端口，而不是 {text}",
-  "camera must differ from the program's port {port}; set the tracker to send to the port of camera":
-    "camera 的端口不能与目标程序的端口 {port} 相同；请让面部追踪程序发送到 camera 的端口",
+  "camera={port} is the port of the avatar program itself; choose another port, and set the tracker to send to it":
+    "camera={port} 是虚拟形象程序自己的端口；请换一个端口，并让面部追踪程序发送到它",
   "only=mouth lets another program control the head; leave out head=on":
     "only=mouth 表示头部由其他程序控制，请去掉 head=on",
   "cannot reach {address}: {reason}": "无法连接 {address}：{reason}",

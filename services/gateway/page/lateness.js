@@ -4,11 +4,11 @@ import { SlidingWindow } from "./sliding-window.js";
 import { SAMPLES_PER_MS } from "./playout.js";
 
 const WINDOW_MS = 10000; // as in services/synthesizer/lateness.py
-const LATE_MS = 300;
+const LATE_MS = 300; // a face that is later than this is late
 const MIN_SKIP_MS = 100;
 const MAX_SKIP_MS = 10000; // a longer gap is a pause of the client
-const SHOWN_AFTER_MS = 1000; // time with late frames
-const OVER_AFTER_MS = 2000; // time without late frames
+const SHOWN_AFTER_MS = 1000; // time with late frames until the notice appears
+const OVER_AFTER_MS = 2000; // time without late frames until it disappears
 const RECENT_MS = 1000; // window of the displayed lateness
 const IMAGES_MS = 3000; // window of the delays of images
 

@@ -5,7 +5,7 @@ import { SlidingWindow } from "./sliding-window.js";
 
 export const SAMPLES_PER_MS = 16;
 const FRAME_MS = 20; // between two FAP frames; interpolation needs both
-const FIRST_DELAY_MS = 120; // before anything has been measured
+const FIRST_DELAY_MS = 120; // delay until arrivals have been measured
 // percentile: of the arrivals to wait for. marginMs: added for interpolation. jumpMs: smaller errors
 // are corrected by gliding. With sound, playback must not run dry or jump audibly. Without sound,
 // a face that is one frame too old is not visible as late.
@@ -14,11 +14,11 @@ const WITHOUT_SOUND = { percentile: 0.8, marginMs: 0, jumpMs: 5 };
 const ADJUST_EVERY_MS = 500;
 const MAX_GLIDE = 0.005; // change of speed; a twelfth of a semitone, which is inaudible
 const WINDOW_MS = 10000; // window of the percentiles; long enough to ignore a single hiccup
-const MIN_FRAMES = 20; // before the percentile is used
-const JUMP_MS = 300; // restart if the stream is late or early by more than this
-const LATE_MS = 100; // and late for this long; less than the delay, so that no sound is lost
-const EARLY_MS = 300; // or if the stream is early for this long
-const START_MS = 300; // in which the earliest arrival sets the offset
+const MIN_FRAMES = 20; // number of frames after which the percentile is used
+const JUMP_MS = 300; // a stream that is late or early by more than this is restarted …
+const LATE_MS = 100; // … after it was late for this long; less than the delay, so that no sound is lost
+const EARLY_MS = 300; // … or early for this long
+const START_MS = 300; // time at the start in which the earliest arrival sets the offset
 const MAX_BEHIND_MS = 3000; // restart immediately if media time jumps ahead by more than this
 const MAX_FRAMES = 1000;
 

@@ -1,7 +1,7 @@
 // Whether the stream is live, and the fade between its face and the face at rest. Time is injected.
 
-const STALL_MS = 500; // without frames, until the face fades to rest
-const SILENT_MS = 1000; // without sound messages, until the stream is not live; idle faces also move
+const STALL_MS = 500; // time without frames until the face fades to rest
+const SILENT_MS = 1000; // time without sound messages until the stream is not live; idle faces also move
 const FADE_MS = 80; // time constant of the fade
 
 export class StreamActivity {

@@ -97,7 +97,10 @@ export const TEXTS = {
     en: "The microphone was unplugged. Plug it in and press Microphone again.",
     zh: "麦克风断开了。请接上后再按“麦克风”。",
   },
-  microphoneFailed: { en: "Cannot use the microphone: {reason}", zh: "无法使用麦克风：{reason}" },
+  microphoneFailed: {
+    en: "Cannot use the microphone: {reason}. Close other programs that use it, or choose another microphone in the browser.",
+    zh: "无法使用麦克风：{reason}。请关闭占用麦克风的其他程序，或在浏览器中选择另一个麦克风。",
+  },
   microphoneStopped: {
     en: "The gateway closed the connection. Press Microphone to try again.",
     zh: "网关关闭了连接。请再按“麦克风”重试。",
@@ -240,7 +243,10 @@ export const TEXTS = {
     zh: "摄像头或麦克风被其他程序占用。请关闭后重试。",
   },
   cameraUnplugged: { en: "The camera or the microphone was unplugged. Plug it in and try again.", zh: "摄像头或麦克风断开了。请接上后重试。" },
-  trackerFailed: { en: "Face tracking does not work in this browser: {reason}", zh: "此浏览器无法跟踪面部：{reason}" },
+  trackerFailed: {
+    en: "Face tracking does not work in this browser: {reason}. Use a current version of Chrome, Edge or Firefox.",
+    zh: "此浏览器无法跟踪面部：{reason}。请用最新版的 Chrome、Edge 或 Firefox。",
+  },
   gatewaySilent: {
     en: "The gateway does not answer. Start it with “kouxing run” and try again.",
     zh: "网关没有应答。请运行 kouxing run 后重试。",

@@ -51,13 +51,13 @@ class SliceMeter:
     def __init__(self, start: int = 0) -> None:
         self.media_time = start  # end of the audio so far
         self._start = start
-        self._pieces: list[NDArray[np.float32]] = []  # pieces of the incomplete slice
+        self._pieces: list[NDArray[np.float32]] = []  # audio of the incomplete slice
         self._pitch = PitchTracker(start // SLICE)
 
     def accept_waveform(
         self, samples: NDArray[np.float32]
     ) -> Iterator[tuple[NDArray[np.float32], Progress | None]]:
-        """Accept samples, (n,); yield pieces, each with the slice that ends there."""
+        """Accept samples, (n,); yield chunks, each with the slice that ends there."""
         for piece in split_slices(samples, self.media_time - self._start):
             self.media_time += len(piece)
             self._pieces.append(piece)

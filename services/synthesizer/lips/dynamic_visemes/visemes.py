@@ -3,7 +3,7 @@
 The language's inventory lists the visemes of each phone. The visemes follow Li et al. 2011,
 table 1, each named after a phone. The rounded variants of consonants before rounded vowels, and the
 static targets in ``targets.tsv``, are from Crystal.TTVS (Tsinghua University, Apache-2.0). Sounds
-of other languages have visemes that are derived from these (``derived``).
+of other languages have visemes that are derived from these (``derived_visemes``).
 """
 
 import numpy as np

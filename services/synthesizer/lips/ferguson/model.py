@@ -4,8 +4,9 @@
                                         +-> key frames -> R(t) -> transition -> FAPs
     recognized phones ------------------+
 
-Source: Zhang et al. 2021, sections 4 and 5. The paper knows the text; here, phones are recognized.
-A recognized syllable starts with its segment, and the influence factor places its final.
+Source: Zhang et al. 2021, sections 4 and 5. In the paper, the text is known; here, phones are
+recognized. A recognized syllable starts with its segment, and the influence factor places its
+final.
 
 A segment is known before its phones. Until its phones are known, the mouth moves toward an average
 syllable. Likewise, an average phone follows the last known phone. When segments or phones change,
