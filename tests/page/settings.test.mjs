@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import test from "node:test";
-import { languageFor, translate, translateError, setLanguage } from "../../services/gateway/page/language.js";
+import { languageFor, setLanguage, translate, translateError, translateResponse } from "../../services/gateway/page/language.js";
 import { MouthProfileStore, Preferences } from "../../services/gateway/page/storage.js";
 import { TEXTS } from "../../services/gateway/page/texts.js";
 
@@ -41,6 +41,16 @@ test("the page uses the first language of the browser that it supports", () => {
   assert.equal(translateError({ code: "busy", text: "no" }), "no");
   assert.match(translateError({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
   assert.equal(translate("head.new-head"), "new-head", "a name without a text is shown as it is");
+});
+
+test("an error of the gateway is JSON or text", async () => {
+  const page = { documentElement: {}, querySelectorAll: () => [] };
+  const asJson = () => Response.json({ error: "the gateway is stopping" }, { status: 422 });
+  assert.equal(await translateResponse(asJson()), "the gateway is stopping");
+  assert.equal(await translateResponse(new Response("no token\n", { status: 403 })), "no token");
+  setLanguage("zh", page);
+  assert.equal(await translateResponse(asJson()), "网关正在停止");
+  setLanguage("en", page);
 });
 
 test("every text that the page uses exists in both languages, and every text is used", () => {

@@ -1,7 +1,7 @@
 // Captures the audio of a microphone or a file in chunks, with an audio worklet.
 
 import { pathWithToken } from "./address.js";
-import { UserError, translate, translateReceived } from "./language.js";
+import { UserError, translate, translateResponse } from "./language.js";
 
 const MAX_RATE_HZ = 48000;
 const MAX_FILE_BYTES = 200 << 20;
@@ -50,11 +50,7 @@ export async function openFileSpeech(context, file) {
   } catch {
     throw new UserError(translate("gatewaySilent"));
   }
-  if (!response.ok) {
-    const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
-    const reason = isJson ? (await response.json()).error : await response.text();
-    throw new UserError(translateReceived(reason));
-  }
+  if (!response.ok) throw new UserError(await translateResponse(response));
   const buffer = await context.decodeAudioData(await response.arrayBuffer());
   if (buffer.getChannelData(0).every((sample) => Math.abs(sample) < QUIET_PEAK)) {
     throw new UserError(translate("noSpeechSilent", { file: file.name }));

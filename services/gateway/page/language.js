@@ -27,6 +27,13 @@ export function translateReceived(text) {
   return language === "zh" ? toChinese(text) : text;
 }
 
+/** Return the error of an HTTP response, which is JSON or text, in the page's language. */
+export async function translateResponse(response) {
+  const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
+  const text = isJson ? (await response.json()).error : await response.text();
+  return translateReceived(text.trim());
+}
+
 /** Return the text of an error message in the page's language. */
 export function translateError({ code, text }) {
   if (code === "bad-mouth-profile") return translate("oldMouthProfile");

@@ -6,7 +6,7 @@ import { capture, openCaptureContext } from "./capture.js";
 import { element } from "./elements.js";
 import { FaceRecording } from "./face-recording.js";
 import { FaceTracker } from "./face-tracker.js";
-import { UserError, translate, translateReceived } from "./language.js";
+import { UserError, translate, translateResponse } from "./language.js";
 import { curvePath, extent, correlationRows, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
@@ -248,17 +248,18 @@ export class LearnMouthDialog {
     const { signal } = this.#abort;
     element("learn-progress").textContent = translate("learnProgress");
     this.#show("learning");
-    let answer;
+    let answer = null;
+    let problem = "";
     try {
       const response = await fetch(pathWithToken("learn-mouth"), { method: "POST", body: this.#recording, signal });
-      const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
-      answer = isJson ? await response.json() : { error: await response.text() };
+      if (response.ok) answer = await response.json();
+      else problem = await translateResponse(response);
     } catch {
-      answer = { error: translate("gatewaySilent") };
+      problem = translate("gatewaySilent");
     }
     if (signal.aborted) return;
-    if (answer.error !== undefined) {
-      this.#fail(translateReceived(answer.error));
+    if (answer === null) {
+      this.#fail(problem);
       return;
     }
     const { mouth_profile: profile, before, after } = answer;

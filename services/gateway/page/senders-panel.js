@@ -3,7 +3,7 @@
 
 import { pathWithToken } from "./address.js";
 import { element, setText } from "./elements.js";
-import { translate, translateReceived } from "./language.js";
+import { translate, translateReceived, translateResponse } from "./language.js";
 import { roundToTens } from "./status.js";
 
 const PERIOD_MS = 1000; // while the panel is open
@@ -78,9 +78,8 @@ export class SendersPanel {
     const options = { method: "POST", body: JSON.stringify(command) };
     const response = await fetch(pathWithToken("senders"), options).catch(() => null);
     if (response === null) return false; // the notice reports that the gateway has stopped
-    const answer = await response.json();
-    setText(element("send-problem"), translateReceived(answer.error ?? ""));
-    if (response.ok) this.#show(answer);
+    setText(element("send-problem"), response.ok ? "" : await translateResponse(response));
+    if (response.ok) this.#show(await response.json());
     return response.ok;
   }
 }
