@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from kouxing_client.messages import VERSION, Message
+from kouxing_client.field_types import MAX_TEXT
+from kouxing_client.messages import Message
 
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
@@ -87,14 +88,15 @@ class MessageLoop:
         message, sender = received.message, received.sender
         if isinstance(message, BadMessage):
             self.warn(message.reason, f"dropped a message: {message}")
-            # The answer has the sender's version, so that the sender can read it.
-            self._answer_bad_message(socket, sender, str(message), message.version)
+            _answer_bad_message(socket, sender, message)
             return
         handler = handlers.get(type(message))
         if handler is None:
             text = f"dropped a {message.kind} message: not expected here"
             self.warn("unexpected", text, message.session)
-            self._answer_bad_message(socket, sender, f"this socket does not accept {message.kind}")
+            error = BadMessage("unexpected", f"this socket does not accept {message.kind}")
+            error.request = getattr(message, "request", None)
+            _answer_bad_message(socket, sender, error)
             return
         self.metrics.count(f"in_{message.kind.replace('-', '_')}")
         self.current_session = message.session
@@ -106,9 +108,14 @@ class MessageLoop:
             self.warn("files", f"{message.kind}: {error.strerror}", message.session)
         self.current_session = ""
 
-    def _answer_bad_message(
-        self, socket: Socket, sender: Peer, text: str, version: int = VERSION
-    ) -> None:
-        if sender.address:
-            answer = Error(version=version, code=ErrorCode.BAD_MESSAGE, text=text[:2000])
-            socket.send(answer, to=sender)
+
+def _answer_bad_message(socket: Socket, sender: Peer, error: BadMessage) -> None:
+    """Answer in the sender's version, so that the sender can read the answer."""
+    if sender.address:
+        answer = Error(
+            version=error.version,
+            code=ErrorCode.BAD_MESSAGE,
+            text=str(error)[:MAX_TEXT],
+            request=error.request,
+        )
+        socket.send(answer, to=sender)

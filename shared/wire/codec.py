@@ -8,7 +8,7 @@ less than separate parts.
 from collections.abc import Sequence
 
 import msgspec
-from kouxing_client.field_types import Version
+from kouxing_client.field_types import Name, Version
 from kouxing_client.messages import VERSION, Message, topic
 
 from kouxing.shared.field_errors import describe_field_error
@@ -21,22 +21,30 @@ MAX_TOPIC_BYTES = 96
 class BadMessage(Exception):
     """The parts are not a message.
 
-    ``reason`` is a short word for counters, ``version`` the sender's protocol version.
+    ``reason`` is a short word for counters, ``version`` the sender's protocol version, and
+    ``request`` the name of the request, if it can be read.
     """
 
     def __init__(self, reason: str, text: str, version: int = VERSION) -> None:
         super().__init__(text)
         self.reason = reason
         self.version = version
+        self.request: str | None = None
 
 
 class _VersionOnly(msgspec.Struct):
     version: Version = VERSION
 
 
+class _RequestOnly(msgspec.Struct):
+    request: Name | None = None
+
+
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODERS = {kind: msgspec.msgpack.Decoder(cls) for kind, cls in MESSAGES.items()}
 _VERSION_DECODER = msgspec.msgpack.Decoder(_VersionOnly)
+_REQUEST_DECODER = msgspec.msgpack.Decoder(_RequestOnly)
+_UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 
 
 def encode(message: Message) -> list[bytes]:
@@ -57,7 +65,14 @@ def decode(parts: Sequence[bytes]) -> Message:
     """
     if len(parts) != 2:
         raise BadMessage("parts", f"expected 2 parts (topic, body), got {len(parts)}")
-    label, body = parts
+    try:
+        return _decode(*parts)
+    except BadMessage as error:
+        error.request = _read_request(parts[1])
+        raise
+
+
+def _decode(label: bytes, body: bytes) -> Message:
     try:
         kind, session, rest = label[:MAX_TOPIC_BYTES].decode("ascii").split("/")
     except ValueError:
@@ -71,7 +86,7 @@ def decode(parts: Sequence[bytes]) -> Message:
         )
     try:
         message: Message = decoder.decode(body)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except _UNREADABLE as error:
         _check_version(kind, _read_version(body))
         raise BadMessage("body", f"{kind}: {describe_field_error(error)}") from None
     _check_version(kind, message.version)
@@ -93,5 +108,12 @@ def _check_version(kind: str, version: int) -> None:
 def _read_version(body: bytes) -> int:
     try:
         return _VERSION_DECODER.decode(body).version
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+    except _UNREADABLE:
         return VERSION
+
+
+def _read_request(body: bytes) -> str | None:
+    try:
+        return _REQUEST_DECODER.decode(body).request
+    except _UNREADABLE:
+        return None

@@ -148,6 +148,7 @@ def test_a_client_of_another_version_is_answered_in_its_version(system: System) 
     control.send_multipart([b"open//", msgpack.packb({"version": 1, "request": "r"})])
     kind, answer = receive(control)
     assert (kind, answer["version"], answer["code"]) == ("error", 1, "bad-message")
+    assert answer["request"] == "r"
     assert "upgrade" in answer["text"]
     program.close()
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from kouxing_client.keys import Key, read_key
-from kouxing_client.messages import Speech
 
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
@@ -30,6 +29,7 @@ from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.control import Heartbeat, SessionProgress, SessionStarted
+from kouxing.shared.wire.session import Error, FlushSession
 from kouxing.shared.wire.speech import Progress
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
@@ -155,12 +155,13 @@ def test_sleeps_until_a_tick_or_heartbeat_is_due_or_a_message_arrives(
 def test_answers_counts_and_drops_unexpected_messages(slow: SlowService) -> None:
     with Bus() as bus:
         sender = bus.connect_dealer(slow.input.endpoint)
-        sender.send(Speech(session="s", active=True))
+        sender.send(FlushSession(session="s", request="r", token="t"))
         sender.send(Progress(level_db=0.0))
         handle(slow, 1)
         assert sender.wait(LIMIT_S)
         (answer,) = [received.message for received in sender.receive()]
-    assert getattr(answer, "code", "") == "bad-message"
+    assert isinstance(answer, Error)
+    assert (answer.code, answer.request) == ("bad-message", "r")
     assert slow.metrics.snapshot(0.0)["dropped_unexpected"] == 1
 
 

@@ -112,6 +112,19 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     assert harness.sockets.num_explained == 3  # an idle client does not connect again and again
 
 
+def test_a_bad_request_does_not_affect_other_requests() -> None:
+    harness = CoreHarness()
+    first, bad, last = (harness.core.request("flush-session", "s") for _ in range(3))
+    _, fields = harness.commands.sent[-2]
+    harness.commands.answer("error", code="bad-message", text="x", request=fields["request"])
+    assert "x" in str(bad.exception(0))
+    assert not first.done()
+    harness.answer("done")
+    assert last.done()
+    harness.commands.answer("error", code="bad-message", text="upgrade")  # control is older
+    assert "upgrade" in str(first.exception(0))
+
+
 @pytest.mark.parametrize("reason", [NO_LISTENER, "the connection times out"])
 def test_reports_early_that_nothing_listens_at_an_address(reason: str) -> None:
     sockets = FakeSockets()

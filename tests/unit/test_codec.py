@@ -55,6 +55,26 @@ def test_rejects_bad_messages_with_a_reason(parts: list[bytes], reason: str) -> 
     assert caught.value.reason == reason
 
 
+@pytest.mark.parametrize(
+    ("parts", "request_name"),
+    [
+        (parts_of("done", request="r", media_time=-1), "r"),
+        (parts_of("dance", request="r"), "r"),
+        (parts_of("done", request="r", version=1), "r"),
+        (parts_of("done", request=5), None),
+        (parts_of("phone", **PHONE, confidence=2.0), None),
+        ([b"done/s/", b"\xc1garbage"], None),
+        ([b"done/s/"], None),
+    ],
+)
+def test_a_bad_message_has_the_name_of_its_request(
+    parts: list[bytes], request_name: str | None
+) -> None:
+    with pytest.raises(BadMessage) as caught:
+        decode(parts)
+    assert caught.value.request == request_name
+
+
 def test_fields_with_defaults_are_optional_and_unknown_fields_are_ignored() -> None:
     message = decode(parts_of("open-session", request="r", color="red"))
     assert message == OpenSession(session="s", request="r")

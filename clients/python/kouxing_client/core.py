@@ -274,7 +274,8 @@ class ClientCore:
         kind, fields = message
         if kind == "session-moved":
             self._on_moved(fields)
-        elif kind == "error" and fields.get("code") == "bad-message":  # names no request
+        elif fields.get("code") == "bad-message" and fields.get("request") is None:
+            # control cannot read the request's name, or is older
             for request in self._requests.values():
                 request.answer.set_exception(refused(fields))
             self._requests.clear()

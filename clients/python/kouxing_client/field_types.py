@@ -7,6 +7,7 @@ from msgspec import Meta
 NUM_FAPS = 68
 MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the first byte
 MAX_SHAPES = 256  # per set
+MAX_TEXT = 2000  # characters
 MAX_AUDIO_BYTES = 64 * 1024  # in one message
 SESSION_NAME = "[A-Za-z0-9_-]{0,64}"  # empty: no session
 NO_LINE_BREAK = r"(?!\n)"  # "$" alone also matches before a final line break
@@ -20,7 +21,7 @@ def whole_text(pattern: str) -> Meta:
 Version = Annotated[int, Meta(ge=1, le=65535)]
 SessionName = Annotated[str, whole_text(SESSION_NAME)]
 Name = Annotated[str, Meta(min_length=1, max_length=128)]
-Text = Annotated[str, Meta(max_length=2000)]
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Samples = Annotated[int, Meta(ge=0, le=2**53)]  # at 16 kHz
 Seconds = Annotated[float, Meta(ge=0)]
