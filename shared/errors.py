@@ -3,6 +3,8 @@
 import importlib.util
 import sys
 
+from kouxing_client.field_types import MAX_TEXT
+
 USER_ERROR = 2  # exit status of a program after a ``UserError``
 
 
@@ -22,12 +24,15 @@ class StartFailure(UserError):
 
 
 class Rejected(Exception):
-    """A message that a service rejects. The sender receives these fields in ``error``."""
+    """A message that a service rejects. The sender receives these fields in ``error``.
+
+    A text that is too long for a message is cut off: it can contain the text of any exception.
+    """
 
     def __init__(self, code: str, text: str, retry_after_s: float | None = None) -> None:
         super().__init__(text)
         self.code = code
-        self.text = text
+        self.text = text[:MAX_TEXT]
         self.retry_after_s = retry_after_s
 
 

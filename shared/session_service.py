@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterable
 
+from kouxing_client.field_types import MAX_TEXT
 from kouxing_client.messages import Event, Message
 
 from kouxing.shared.errors import Rejected, StartFailure, UserError
@@ -66,7 +67,7 @@ class SessionService(Service):
             session=start.session,
             session_id=start.session_id,
             name=name,
-            detail=detail[:2000],
+            detail=detail[:MAX_TEXT],
             media_time=media_time,
         )
         self.send_to_control(event)

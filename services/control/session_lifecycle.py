@@ -6,6 +6,7 @@ Each step is sent to the services and the client of the session, and is publishe
 import math
 import time
 
+from kouxing_client.field_types import MAX_TEXT
 from kouxing_client.messages import Event, Message
 
 from kouxing.services.control.request_handler import RequestHandler
@@ -157,7 +158,7 @@ class SessionLifecycle:
                 session_id=None if record is None else record.session_id,
                 media_time=media_time,
                 name=name,
-                detail=detail[:2000],
+                detail=detail[:MAX_TEXT],
             )
         )
 

@@ -7,13 +7,15 @@ import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kouxing_client.field_types import MAX_TEXT
 from kouxing_client.messages import VERSION, Decoders, Message
 from kouxing_client.messages import decode as decode_fields
 
+from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply
-from kouxing.shared.wire.session import Done, OpenSession
+from kouxing.shared.wire.session import Done, Error, OpenSession
 from tests.samples import SAMPLES
 
 PHONE: dict[str, Any] = {"index": 0, "symbol": "a", "duration": 1, "final": True}
@@ -73,6 +75,13 @@ def test_a_bad_message_has_the_name_of_its_request(
     with pytest.raises(BadMessage) as caught:
         decode(parts)
     assert caught.value.request == request_name
+
+
+def test_a_rejection_with_a_long_text_can_be_read() -> None:
+    rejection = Rejected("no-service", 5000 * "文")
+    error = decode(encode(Error(code=rejection.code, text=rejection.text)))
+    assert isinstance(error, Error)
+    assert error.text == MAX_TEXT * "文"
 
 
 def test_fields_with_defaults_are_optional_and_unknown_fields_are_ignored() -> None:
