@@ -2,14 +2,59 @@
 
 import contextlib
 import errno
+import fcntl
 import os
+import re
 import secrets
 import shutil
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from kouxing.shared.errors import UserError
+
+MAX_NAME = 40  # characters of the output's name in the name of its unfinished file
+
+
+class UnfinishedFile:
+    """A new file next to an output, locked by this process until it is deleted or renamed.
+
+    If this process is killed, the file stays until ``remove_unfinished``. Raises ``OSError`` if the
+    file cannot be created.
+    """
+
+    def __init__(self, output: Path) -> None:
+        while True:
+            # another process may be writing the same output
+            name = f".{output.name[:MAX_NAME]}.{secrets.token_hex(4)}.part"
+            self.path = output.with_name(name)
+            locks: list[BinaryIO] = []
+            # first, because Ctrl-C may interrupt any of the following lines
+            self.delete = weakref.finalize(self, _delete, self.path, locks)
+            locks.append(self.path.open("xb"))
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(locks[0], fcntl.LOCK_EX)
+            if os.fstat(locks[0].fileno()).st_nlink:
+                return
+            self.delete()  # another process deleted it before it was locked
+
+
+def remove_unfinished(folder: Path, output_name: str = "") -> None:
+    """Delete the unfinished files of killed processes, of one output or of all in a folder."""
+    for path in folder.glob(".*.part"):
+        match = re.fullmatch(r"\.(.+)\.[0-9a-f]{8}\.part", path.name)
+        if match is None or output_name[:MAX_NAME] not in ("", match[1]):
+            continue
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while a process writes it
+            path.unlink()
+
+
+def _delete(path: Path, locks: list[BinaryIO]) -> None:
+    path.unlink(missing_ok=True)
+    for lock in locks:
+        lock.close()
 
 
 @contextlib.contextmanager
@@ -27,13 +72,14 @@ def open_output(path: Path, *, keep_on_error: bool = False) -> Iterator[BinaryIO
             with path.open("wb") as file:
                 yield file
             return
-        part = path.with_name(f".{path.name[:40]}.{secrets.token_hex(4)}.part")
+        remove_unfinished(path.parent, path.name)
+        unfinished = UnfinishedFile(path)
         try:
-            with part.open("wb") as file:
+            with unfinished.path.open("wb") as file:
                 yield file
-            _replace(path, part)
+            _replace(path, unfinished.path)
         finally:
-            part.unlink(missing_ok=True)
+            unfinished.delete()
     except OSError as error:
         raise write_error(path, error) from error
 

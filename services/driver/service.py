@@ -18,7 +18,6 @@ from kouxing_client.messages import EndOfFaps, FapFrame, Message, Sound
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.pose_store import PoseStore
 from kouxing.services.driver.recorder_client import RecorderClient
-from kouxing.services.driver.video.video_writer import remove_unfinished
 from kouxing.services.driver.view import View
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.clock import to_seconds
@@ -27,6 +26,7 @@ from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
+from kouxing.shared.output_file import remove_unfinished
 from kouxing.shared.session_follower import SessionFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession

@@ -228,6 +228,20 @@ def test_a_file_is_deleted_if_the_disk_is_full(tmp_path: Path) -> None:
     assert not path.exists()
 
 
+def test_removes_the_unfinished_file_of_a_killed_process_only(tmp_path: Path) -> None:
+    path = tmp_path / "head.glb"
+    stale, foreign = (tmp_path / f".{name}.0123abcd.part" for name in ("head.glb", "other.glb"))
+    for unfinished in (stale, foreign):
+        unfinished.touch()
+    with open_output(path) as outer:
+        assert not stale.exists()
+        with open_output(path) as inner:  # such as that of another process
+            inner.write(b"inner")
+        outer.write(b"outer")
+    assert path.read_bytes() == b"outer"
+    assert {*tmp_path.iterdir()} == {path, foreign}
+
+
 def interrupted_frames() -> Iterator[TimedFaps]:
     yield 0.0, np.zeros(68, np.float32)
     raise KeyboardInterrupt

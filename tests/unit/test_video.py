@@ -15,9 +15,10 @@ from PIL import Image, ImageSequence
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.video_renderer import VideoRenderer
-from kouxing.services.driver.video.video_writer import VideoWriter, open_writer, remove_unfinished
+from kouxing.services.driver.video.video_writer import VideoWriter, open_writer
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.output_file import remove_unfinished
 
 
 def test_pictures_and_sound_are_in_sync(tmp_path: Path) -> None:

@@ -18,16 +18,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
-import os
 import re
-import secrets
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import av
 import numpy as np
@@ -36,7 +32,12 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import open_output, write_error
+from kouxing.shared.output_file import (
+    UnfinishedFile,
+    open_output,
+    remove_unfinished,
+    write_error,
+)
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -183,10 +184,10 @@ class VideoWriter:
             if self._path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
             remove_unfinished(self._path.parent)
-            self._create_unfinished()
+            self._unfinished = UnfinishedFile(self._path)
             container = self._path.suffix.removeprefix(".") or "mp4"
             self._container = av.open(
-                str(self._unfinished), "w", format=container, options=form.options
+                str(self._unfinished.path), "w", format=container, options=form.options
             )
         except OSError as error:
             raise write_error(self._path, error) from error
@@ -216,21 +217,6 @@ class VideoWriter:
             self.close()
         else:
             self.discard()
-
-    def _create_unfinished(self) -> None:
-        """Create the unfinished file, locked while this process writes the video."""
-        while True:
-            # another process may be writing a video of the same name
-            name = f".{self._path.name}.{secrets.token_hex(4)}.part"
-            self._unfinished = self._path.with_name(name)
-            locks: list[BinaryIO] = []
-            # first, because Ctrl-C may interrupt any of the following lines
-            self._delete_unfinished = weakref.finalize(self, _delete, self._unfinished, locks)
-            locks.append(self._unfinished.open("xb"))
-            fcntl.flock(locks[0], fcntl.LOCK_EX)
-            if os.fstat(locks[0].fileno()).st_nlink:
-                return
-            self._delete_unfinished()  # another process deleted it before it was locked
 
     def write_image(self, image: UInt8) -> None:
         """Append a picture (H, W, 3), or (H, W, 4) if the video is transparent; sRGB."""
@@ -280,15 +266,15 @@ class VideoWriter:
         with self._discards_on_error():
             self._container.close()
             path = self._path if self._overwrite else _create_unique(self._path)
-            self._unfinished.replace(path)
-        self._delete_unfinished()
+            self._unfinished.path.replace(path)
+        self._unfinished.delete()
         return path
 
     def discard(self) -> None:
         """Delete the unfinished file."""
         with contextlib.suppress(OSError, av.FFmpegError):
             self._container.close()
-        self._delete_unfinished()
+        self._unfinished.delete()
 
 
 class PictureSequence:
@@ -338,24 +324,6 @@ def write_picture(path: Path, image: UInt8) -> None:
     """
     with open_output(path) as file:
         file.write(picture.encode(image))
-
-
-def remove_unfinished(folder: Path) -> None:
-    """Delete the unfinished videos of processes that were killed."""
-    for path in filter(_is_unfinished, folder.glob(".*.part")):
-        with contextlib.suppress(OSError), path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while a process writes it
-            path.unlink()
-
-
-def _is_unfinished(path: Path) -> bool:
-    return re.fullmatch(r"\..+\.[0-9a-f]{8}\.part", path.name) is not None
-
-
-def _delete(path: Path, locks: list[BinaryIO]) -> None:
-    path.unlink(missing_ok=True)
-    for lock in locks:
-        lock.close()
 
 
 def _create_unique(path: Path) -> Path:
