@@ -297,7 +297,7 @@ class Service(MessageLoop):
         if self.control is None:
             return
         end_s = time.monotonic() + REPLY_TIMEOUT_S
-        while self._replied_ns < self._sent_ns and (left_s := end_s - time.monotonic()) > 0:
+        while self._replied_ns != self._sent_ns and (left_s := end_s - time.monotonic()) > 0:
             self.control.wait(left_s)
             self.handle_messages(self.control)
 

@@ -11,6 +11,7 @@ from kouxing_client.keys import Key, read_key
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
+from kouxing.shared.clock import now_ns
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import format_key, key_folder, revoke_key
@@ -224,10 +225,17 @@ def run_until(worker: Worker, condition: Callable[[], object]) -> None:
     wait_until(condition, step=lambda: worker.step(0.01))
 
 
+@pytest.mark.parametrize("step_ns", [0, -(10**10)])
 def test_resyncs_with_control_after_a_stall(
-    control: FakeControl, worker: Worker, clock: Clock
+    control: FakeControl,
+    worker: Worker,
+    clock: Clock,
+    monkeypatch: pytest.MonkeyPatch,
+    step_ns: int,
 ) -> None:
-    run_until(worker, lambda: control.heartbeats)
+    run_until(worker, lambda: worker._control_instance)
+    # While a machine is suspended, its wall clock may be set back.
+    monkeypatch.setattr("kouxing.shared.service.now_ns", lambda: now_ns() + step_ns)
     with Bus() as bus:
         bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
         assert worker.input.wait(LIMIT_S)
