@@ -87,7 +87,9 @@ class MessageLoop:
     ) -> None:
         message, sender = received.message, received.sender
         if isinstance(message, BadMessage):
-            self.warn(message.reason, f"dropped a message: {message}")
+            grant = self.bus.zap.grants.get(sender.key) if self.bus.zap is not None else None
+            origin = f" with the key {grant.name}" if grant is not None else ""
+            self.warn(message.reason, f"dropped a message{origin}: {message}")
             _answer_bad_message(socket, sender, message)
             return
         handler = handlers.get(type(message))

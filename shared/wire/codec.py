@@ -48,8 +48,16 @@ _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 
 
 def encode(message: Message) -> list[bytes]:
-    """Return the two parts of a message."""
-    return [topic(message.kind, message.session), _ENCODER.encode(message)]
+    """Return the two parts of a message.
+
+    In an answer to a program of another version, empty fields are omitted. They would be null,
+    which version 2 does not accept.
+    """
+    body: object = message
+    if message.version != VERSION:
+        fields = msgspec.structs.asdict(message)
+        body = {name: value for name, value in fields.items() if value is not None}
+    return [topic(message.kind, message.session), _ENCODER.encode(body)]
 
 
 def encoded_size(structure: object) -> int:
@@ -99,8 +107,9 @@ def _check_version(kind: str, version: int) -> None:
     if version != VERSION:
         raise BadMessage(
             "version",
-            f"{kind[:32]!r} is a message of protocol version {version}, but this program uses "
-            f"version {VERSION}: upgrade the sender ({DOCUMENT} describes version {VERSION})",
+            f"{kind[:32]!r} is a message of protocol version {version}, but its receiver uses "
+            f"version {VERSION}: upgrade the {'sender' if version < VERSION else 'receiver'} "
+            f"({DOCUMENT} describes version {VERSION})",
             version,
         )
 

@@ -156,5 +156,5 @@ class Error(RegisteredMessage, frozen=True, kw_only=True):
 
     code: Name  # an ErrorCode, or one of a later build
     text: Text
-    request: Name | None = None
+    request: Annotated[str, Meta(max_length=128)] | None = None  # version 2 sends ""
     retry_after_s: Annotated[Seconds, Meta(le=3600)] | None = None

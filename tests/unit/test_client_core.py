@@ -112,7 +112,8 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     assert harness.sockets.num_explained == 3  # an idle client does not connect again and again
 
 
-def test_a_bad_request_does_not_affect_other_requests() -> None:
+@pytest.mark.parametrize("unnamed", [{}, {"request": ""}])  # control of version 3, of version 2
+def test_a_bad_request_does_not_affect_other_requests(unnamed: dict[str, str]) -> None:
     harness = CoreHarness()
     first, bad, last = (harness.core.request("flush-session", "s") for _ in range(3))
     _, fields = harness.commands.sent[-2]
@@ -121,7 +122,7 @@ def test_a_bad_request_does_not_affect_other_requests() -> None:
     assert not first.done()
     harness.answer("done")
     assert last.done()
-    harness.commands.answer("error", code="bad-message", text="upgrade")  # control is older
+    harness.commands.answer("error", code="bad-message", text="upgrade", **unnamed)
     assert "upgrade" in str(first.exception(0))
 
 

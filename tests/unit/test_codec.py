@@ -99,6 +99,29 @@ def test_clients_accept_messages_without_a_version() -> None:
     assert decode_fields(other) is None
 
 
+@pytest.mark.parametrize(("version", "older"), [(VERSION - 1, "sender"), (VERSION + 1, "receiver")])
+def test_the_rejection_of_another_version_names_both_and_the_program_to_upgrade(
+    version: int, older: str
+) -> None:
+    with pytest.raises(BadMessage) as caught:
+        decode(parts_of("status-request", version=version))
+    text = str(caught.value)
+    assert f"version {version}," in text
+    assert f"version {VERSION}:" in text
+    assert f"upgrade the {older} " in text
+
+
+def test_programs_of_version_2_can_read_an_error_and_its_errors_can_be_read() -> None:
+    rejection: dict[str, Any] = {"code": "bad-message", "text": "upgrade the sender"}
+    _, body = encode(Error(version=2, **rejection))
+    fields = msgpack.unpackb(body)
+    assert fields.items() >= {"version": 2, **rejection}.items()
+    assert None not in fields.values()
+    received = decode(parts_of("error", **rejection, request="", retry_after_s=0.0))
+    assert isinstance(received, Error)
+    assert received.text == rejection["text"]
+
+
 @pytest.mark.parametrize("clock_ns", [-(2**63), -1, 2**63, 2**64 - 1])
 def test_heartbeats_of_a_wrong_clock_count(clock_ns: int) -> None:
     heartbeat = SAMPLES["heartbeat"]

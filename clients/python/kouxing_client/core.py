@@ -274,7 +274,7 @@ class ClientCore:
         kind, fields = message
         if kind == "session-moved":
             self._on_moved(fields)
-        elif fields.get("code") == "bad-message" and fields.get("request") is None:
+        elif fields.get("code") == "bad-message" and not fields.get("request"):
             # control cannot read the request's name, or is older
             for request in self._requests.values():
                 request.answer.set_exception(refused(fields))
