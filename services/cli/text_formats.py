@@ -14,19 +14,15 @@ from typing import NamedTuple
 
 from kouxing.services.cli.text_columns import remove_columns
 from kouxing.shared.errors import UserError
+from kouxing.shared.sound_formats import audio_file_kind
 from kouxing.shared.user_file import parse_json
 
-_BINARY_SIGNATURES = {  # by their first bytes
+_BINARY_SIGNATURES = {  # by their first bytes; see also `audio_file_kind`
     b"%PDF": "a PDF document",
     b"{\\rtf": "an RTF document",
     b"PK\x03\x04": "a Word, OpenDocument, EPUB or zip file",
     b"\xd0\xcf\x11\xe0": "a Word or Office document",
     b"\x1f\x8b": "a gzip file",
-    b"RIFF": "an audio or video file",
-    b"ID3": "an audio file",
-    b"fLaC": "an audio file",
-    b"OggS": "an audio file",
-    b"\x1aE\xdf\xa3": "a video file",
     b"\x89PNG": "a picture",
     b"\xff\xd8\xff": "a picture",
 }
@@ -114,9 +110,12 @@ def decode_text(content: bytes) -> SpokenText:
 
     Raises ``UserError`` if the file is not a text; the message names its format.
     """
-    for beginning, name in _BINARY_SIGNATURES.items():
-        if content.startswith(beginning):
-            raise UserError(f"this is {name}; save the spoken text as a plain text file")
+    signatures = _BINARY_SIGNATURES.items()
+    name = next((name for begin, name in signatures if content.startswith(begin)), "")
+    if b"\0" in content:  # a text may start with FORM, as AIFF files do
+        name = name or audio_file_kind(content)
+    if name:
+        raise UserError(f"this is {name}; save the spoken text as a plain text file")
     encoding = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), "")
     if not encoding and b"\0" in content:
         encoding = "utf-16-be" if content[::2].count(0) > content[1::2].count(0) else "utf-16-le"

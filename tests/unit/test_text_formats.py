@@ -244,7 +244,8 @@ def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
         (b"%PDF-1.7", "PDF"),
         (b"{\\rtf1 ", "RTF"),
         (b"PK\3\4word/document.xml", "Word"),
-        (b"RIFF1234WAVE", "an audio or video file"),
+        (b"RIFF$\0\0\0WAVE", "a WAV file"),
+        (b"FORM\0\0\0$AIFF", "an AIFF file"),
         (b"\x01\x02\xff\xfe\xfd", "not a text file"),
     ],
 )
@@ -252,6 +253,10 @@ def test_rejects_a_file_that_is_not_text(content: bytes, name: str, tmp_path: Pa
     (tmp_path / "said.txt").write_bytes(content)
     with pytest.raises(UserError, match=rf"said\.txt: this is .*{name}"):
         read_spoken_text(str(tmp_path / "said.txt"))
+
+
+def test_a_text_may_start_like_an_audio_file() -> None:
+    assert decode_text(b"FORM and caffeine") == ("FORM and caffeine", "")
 
 
 def test_reads_a_subtitle_file_and_names_its_format(
