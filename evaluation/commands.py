@@ -168,7 +168,7 @@ def face(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure the motion of a face apart from its lips: feeling, nods, brows, blinks, stillness."""
+    """Measure the motion of a face apart from its lips: emotion, nods, brows, blinks, stillness."""
     from kouxing.corpora.emotions import read_emotions
     from kouxing.evaluation.face_motion import measure_face
     from kouxing.services.recognizer.acoustic.load import load_model

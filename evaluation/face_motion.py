@@ -1,11 +1,11 @@
-"""Measures the motion of a live face apart from its lips: feeling, nods, brows, blinks, stillness.
+"""Measures the motion of a live face apart from its lips: emotion, nods, brows, blinks, stillness.
 
 The recordings of each speaker are one session, with pauses between them. The manifest names
 their emotions (:mod:`kouxing.corpora.emotions`), and may give the times of stressed vowels. A
 second face is at rest for a minute.
 
-- Rank correlations (Spearman) with the feeling of the named emotion, mean over speakers. They cover
-  the estimated arousal and valence, the size of the mouth's motion, and the height of the brows.
+- Rank correlations (Spearman) with arousal or valence of the named emotion, mean over speakers:
+  of the estimated arousal and valence, the size of the mouth's motion, and the height of the brows.
 - Nods and brow raises: peaks of the head's pitch and of the brows. Those during a recording match a
   stressed vowel if the last one started 0.1 to 0.3 s before the peak. The chance is the fraction of
   all times that match. Movements within 0.6 s after a recording mark the end of the phrase.

@@ -5,9 +5,9 @@
 3. Live: what the services send.
 4. Live, but a phone counts only once the next one starts.
 
-Schemes 1 and 2 use the offline pipeline (``services.recording_pipeline``). Schemes 3 and 4 use
-its live chain with the default delay of each lip model. Scheme 1 always uses the default acoustic
-model. In the paper, too, the alignment does not depend on the recognizer.
+Schemes 1 and 2 use the offline pipeline (``services.recording_pipeline``). Schemes 3 and 4 use the
+live pipeline (``services.live_pipeline``) with the default delay of each lip model. Scheme 1 always
+uses the default acoustic model. In the paper, too, the alignment does not depend on the recognizer.
 
 The paper's output rule (section 2.2) emits a phone once N = 3 frames agree on it, and never
 corrects it (eq. 4, figure 3). A wrong phone stays, and its duration stays the mean. In scheme 4 a

@@ -68,7 +68,7 @@ def live_events(
 def live_frames(
     lips: LipModel, events: Sequence[SoundEvent], delay_s: float
 ) -> NDArray[np.float64]:
-    """Return frames (num_frames, 68) of the live chain, without idle motion."""
+    """Return frames (num_frames, 68) of the live pipeline, without idle motion."""
     face = FaceAnimator(lips, frame_rate_hz=FRAME_RATE_HZ, delay_s=delay_s)
     return np.array([faps for _, faps in animate_live(face, events)], dtype=float)
 

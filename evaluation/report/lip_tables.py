@@ -1,4 +1,4 @@
-"""The tables of lips: agreement with tracked lips, closures, look-ahead and motion."""
+"""The tables of lips: agreement with tracked lips, closures, delay and motion."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -58,7 +58,7 @@ _CONSOLE_COLUMNS = {  # measures by title
     "r": ("r_opening", "r_width", "r_jaw"),
     "F1/P/R": ("closure_f1", "closure_precision", "closure_recall"),
     "P by class": ("precision_bpm", "precision_aei", "precision_uo", "precision_pause"),
-    "shut": ("labials_shut", "share_shut"),
+    "closed": ("labials_shut", "share_shut"),
     "rest": ("rest_opening", "closing_time_ms"),
     "effort": ("effort_correlation", "slcc"),
     "spread": ("phone_spread", "turns_per_s", "mtm_ms"),
@@ -66,9 +66,9 @@ _CONSOLE_COLUMNS = {  # measures by title
 _LEGEND = """\
 First row of a group: real lips. new: speakers not in training. +b, +m: babble,
 music. In %: r of opening/width/jaw in speech; F1/precision/recall of closures;
-their precision at b p m/a e i/u o/pauses; lips shut at b p m/in speech; effort:
-r of range and level/SLCC, over clips. rest: opening, FAP units/ms to close in
-pauses. spread: within phone classes, FAP units/turns per s/MTM, ms."""
+their precision at b p m/a e i/u o/pauses; lips closed at b p m/in speech;
+effort: r of range and level/SLCC, over clips. rest: opening, FAP units/ms to
+close in pauses. spread: within phone classes, FAP units/turns per s/MTM, ms."""
 _MARKS = {CLEAN: "", BABBLE: "+b", MUSIC: "+m"}
 _WHOLE_MEASURES = ("lag_ms", "mtm_ms", "rest_opening", "closing_time_ms", "phone_spread")
 _FORMATS = {  # of measures; not of correlations
@@ -234,7 +234,7 @@ def disturbed_lips(faces: Figures) -> list[str]:
 
 
 def lookahead_table(faces: Figures) -> Table:
-    """Return the correlation of the opening and the F1 of closures by look-ahead."""
+    """Return the correlation of the opening and the F1 of closures by delay."""
     curves = lookahead_curves(faces)
     delays = sorted({delay for points in curves.values() for delay in points})
     rows = []
@@ -247,7 +247,7 @@ def lookahead_table(faces: Figures) -> Table:
 
 
 def display_floor_ms(look_ahead_ms: int) -> int:
-    """Return the minimum time from a sound to its image: look-ahead, frame and display tick."""
+    """Return the minimum time from a sound to its image: delay, frame and display tick."""
     return look_ahead_ms + _FRAME_MS + _TICK_MS
 
 

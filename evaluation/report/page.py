@@ -15,7 +15,7 @@ from kouxing.evaluation.report import lip_tables, paper_tables, recognition_tabl
 from kouxing.evaluation.report.steps import STEPS
 from kouxing.evaluation.tables import Figures, Table
 
-PICTURE = "lookahead.png"
+PICTURE = "delay.png"
 _TEMPLATE = Path(__file__).with_name("template.md")
 
 
@@ -112,7 +112,7 @@ def _lookahead_figure(faces: Figures) -> Any:
             delays = sorted(points)
             axis.plot(delays, [points[delay][measure] for delay in delays], "o-", label=lips)
             axis.set_title(title, fontsize=9)
-            axis.set_xlabel("look-ahead, ms")
+            axis.set_xlabel("delay, ms")
             axis.set_ylim(0.0, 1.0)
     axes[-1].legend(fontsize=8)
     return figure

@@ -56,7 +56,7 @@ def _chain_rows(chain: Figures, sizes: Figures) -> Iterator[list[str]]:
         "sound to its frame, p50 / p95, ms",
         _format_percentiles(chain["sound_to_frame_ms"]),
         str(_LOOK_AHEAD_MS),
-        "look-ahead of the lips",
+        "delay of the face",
     )
     yield _row(
         "processor time of all services, s per s of audio",
@@ -65,14 +65,14 @@ def _chain_rows(chain: Figures, sizes: Figures) -> Iterator[list[str]]:
         "operations of the networks / rate of the matrix product",
     )
     for name, drawing in chain["page"]["drawings"].items():
-        title = f"page in headless Chromium, {name}, pictures per s"
+        title = f"page in headless Chromium, {name}, images per s"
         yield _row(title, f"{drawing['pictures_per_s']:.0f}", "60", "display")
         if drawing["voice_to_picture_ms"]:
             yield _row(
                 "sound to its image on the page, ms",
                 f"{drawing['voice_to_picture_ms']:.0f}",
                 str(display_floor_ms(_LOOK_AHEAD_MS)),
-                "look-ahead + frame + display tick",
+                "delay + frame + display tick",
             )
 
 
@@ -109,7 +109,7 @@ def _browser_rows(browser: Figures, sizes: Figures) -> Iterator[list[str]]:
         "lips in the browser: sound to weights, p50 / p95, ms",
         _format_percentiles(browser["delay_ms"]),
         f"{_LOOK_AHEAD_MS + _FRAME_MS / 2:.0f}",
-        "look-ahead + half a frame",
+        "delay + half a frame",
     )
     models = sizes.get("model_bytes", {})
     weights_mb = sum(models.get(name, 0) for name in _WEB_MODELS) / 1e6

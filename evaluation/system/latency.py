@@ -1,4 +1,4 @@
-"""Latency and CPU cost of the chain, with real processes and real sockets.
+"""Latency and CPU cost of the services, with real processes and real sockets.
 
 The services run as under ``kouxing run``, on free ports. A sentence is streamed in real time in 20
 ms chunks. Two latencies are measured for each FAP frame:

@@ -72,7 +72,7 @@ def open_fields(name: str, options: SessionOptions) -> Fields:
     TypeError
         If a keyword is unknown.
     KouxingError
-        If the name is not valid, or the form of the audio is not supported.
+        If the name is not valid, or the audio format is not supported.
     """
     _check_keywords("open_session", options, SessionOptions.__annotations__)
     check_name(name)
