@@ -10,6 +10,8 @@ export interface SessionMessage {
   chosen: string;
   epoch: number;
   lip_model: string;
+  /** code of the language of the phones, such as "zh"; "": unknown */
+  language: string;
   acoustic: string;
   sample: boolean;
 }

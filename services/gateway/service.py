@@ -201,7 +201,7 @@ class GatewayService(SessionService):
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)
         session.follower.session_start = start
-        self._viewers.add_session(start.session, start.epoch, start.opening.face.lip_model or "")
+        self._announce(session, start.epoch)
         is_needed = start.session in self._needed_sessions() or self._audio_client.num_opening
         if session.follower.is_following or is_needed:
             session.follower.follow()
@@ -314,10 +314,14 @@ class GatewayService(SessionService):
     def _restart(self, session: _FollowedSession) -> None:
         """Restart a session for its viewers. It continues in a new epoch."""
         session.syllables.reset()
+        self._announce(session, session.follower.epoch)
+
+    def _announce(self, session: _FollowedSession, epoch: int) -> None:
+        """Announce a session to its viewers, or its new epoch."""
         start = session.follower.session_start
-        self._viewers.add_session(
-            start.session, session.follower.epoch, start.opening.face.lip_model or ""
-        )
+        lip_model = start.opening.face.lip_model or ""
+        language = session.syllables.inventory.code
+        self._viewers.add_session(start.session, epoch, lip_model, language)
 
     def _on_frame(self, frame: FapFrame) -> None:
         now_s, values = time.monotonic(), frame.packed_values

@@ -37,6 +37,7 @@ PAUSE_S = 0.2  # after this time without a frame, a viewer receives the face at 
 class _ShownSession:
     epoch: int
     lip_model: str  # its name; empty: unknown
+    language: str  # its code; empty: unknown
     acoustic: str = AcousticModelName.FULL
 
 
@@ -82,9 +83,9 @@ class ViewerHandler:
 
     # --- sessions ------------------------------------------------------------------------------
 
-    def add_session(self, session: str, epoch: int, lip_model: str) -> None:
+    def add_session(self, session: str, epoch: int, lip_model: str, language: str) -> None:
         """Announce a session to its viewers, or its new epoch."""
-        self._sessions[session] = _ShownSession(epoch, lip_model)
+        self._sessions[session] = _ShownSession(epoch, lip_model, language)
         self._notify_viewers()
 
     def set_lip_model(self, session: str, lip_model: str) -> None:
@@ -268,6 +269,7 @@ class ViewerHandler:
                 chosen=viewer.chosen_session,
                 epoch=session.epoch if session else 0,
                 lip_model=session.lip_model if session else "",
+                language=session.language if session else "",
                 acoustic=session.acoustic if session else "",
                 sample=session is not None
                 and name == viewer.chosen_session == self._sample.session,

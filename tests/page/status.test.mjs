@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { LevelMeter, SILENT_DB } from "../../services/gateway/page/level.js";
-import { PhoneTrack } from "../../services/gateway/page/caption.js";
+import { Caption, PhoneTrack } from "../../services/gateway/page/caption.js";
 import { StreamActivity } from "../../services/gateway/page/stream-activity.js";
 import { errorToChinese, toChinese } from "../../services/gateway/page/gateway-texts.js";
 import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
@@ -39,6 +39,18 @@ test("the last phone stays during a pause and then fades", () => {
   assert.deepEqual(phones.at(17000), { current: "a", past: [], opacity: 1 });
   assert.deepEqual(phones.at(25600), { current: "a", past: [], opacity: 0.5 });
   assert.deepEqual(phones.at(34000), { current: "", past: ["a", "·"], opacity: 0 });
+});
+
+test("a caption has the language of its session", () => {
+  const elements = {};
+  const makeElement = () => ({ setAttribute() {} });
+  globalThis.document = { getElementById: (id) => (elements[id] ??= makeElement()) };
+  const caption = new Caption({ get: () => null });
+  for (const language of ["de", ""]) {
+    caption.reset(language);
+    assert.deepEqual([elements.spoken.lang, elements.past.lang], [language, language]);
+  }
+  delete globalThis.document;
 });
 
 test("the level is that of the sound that is audible", () => {

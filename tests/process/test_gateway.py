@@ -90,9 +90,8 @@ async def test_viewers_receive_their_session(control: FakeControl, gateway: Gate
         await receive_json(newest, "status", missing=[])
         control.start("one")
         publish_all(control, "one")
-        await receive_json(
-            newest, "session", session="one", lip_model="dynamic-visemes", sample=False
-        )
+        shown = {"session": "one", "lip_model": "dynamic-visemes", "language": "zh"}
+        await receive_json(newest, "session", **shown, sample=False)
         messages = [await receive_session_message(newest) for _ in range(5)]
         binary = {m.data[0]: m.data for m in messages if m.type is aiohttp.WSMsgType.BINARY}
         texts = [json.loads(m.data) for m in messages if m.type is aiohttp.WSMsgType.TEXT]

@@ -83,7 +83,7 @@ def test_the_session_can_end_before_the_connection(
     handler: WhipHandler, viewers: ViewerHandler
 ) -> None:
     async def stream() -> None:
-        viewers.add_session("s", 1, "")
+        viewers.add_session("s", 1, "", "zh")
         session = cast("Any", FakeSession(Refused("unknown-session", "it has ended")))
         client = _Client(None, session=session)
         with viewers.connect_viewer("s", None) as viewer:

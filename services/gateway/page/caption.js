@@ -83,9 +83,11 @@ export class Caption {
     return this.#phones.hasSpeech;
   }
 
-  reset() {
+  /** Start with a session of a language, given by its code; "": unknown. */
+  reset(language) {
     this.#syllables.reset();
     this.#phones.reset();
+    for (const name of ["spoken", "past"]) element(name).lang = language;
   }
 
   /** Add a "syllable" or "phone" message. */

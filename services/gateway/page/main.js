@@ -120,7 +120,7 @@ function showSession(message) {
   if (gateway.session !== null) {
     // A session that has ended stays visible and audible to its end.
     player.reset(isOther);
-    caption.reset();
+    caption.reset(message.language);
     meter.reset();
   }
   if (isOwnSession()) sendFaceSettings();
