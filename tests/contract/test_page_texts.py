@@ -9,10 +9,12 @@ from tests.system import ROOT
 
 PAGE = ROOT / "services" / "gateway" / "page"
 PAGE_TEXTS = PAGE / "gateway-texts.js"
+# The texts of other modules are about messages and samples that the page does not send.
 SOURCES = (
     *("shared/audio_file.py", "shared/media_file.py", "shared/sound_formats.py"),
     *("shared/phase_cancellation.py", "shared/wav_parts.py", "services/gateway/sound_upload.py"),
     *("services/gateway/upload_handler.py", "services/gateway/mouth_learner.py"),
+    "services/gateway/viewer_handler.py",
     *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),
     *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),
     *("services/senders/connection.py", "services/senders/protocols.py"),
@@ -30,6 +32,7 @@ OTHERS = re.compile(
     r"--rate|^this is \{\}$|--raw$|--raw if|a terminal|audio arrived|images and audio"
     r"|a folder|no such file|there is no track|expected 'start'|has disconnected"
     r"|it is larger|landmark file|header|landmarks a frame|sample rate is|times do|not pixels"
+    r"|a viewer can set|cannot be combined|contains no command"
     r"|a worker must name|may provide|host and port to connect to|registered with another key"
 )
 
@@ -64,7 +67,7 @@ def control_texts(source: str) -> Iterator[str]:
             yield template(node.value)
 
 
-def test_the_page_translates_all_texts_of_the_gateway() -> None:
+def test_the_page_translates_all_texts_that_it_may_get() -> None:
     texts, _ = PAGE_TEXTS.read_text("utf-8").split("const REASONS")
     keys = re.findall(r'^  "(.+?)":(?: "|$)', texts, re.MULTILINE)
     translated = {re.sub(r"\{\w+\}", "{}", key) for key in keys}

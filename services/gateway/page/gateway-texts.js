@@ -58,6 +58,7 @@ const CHINESE = {
   "control at {address} does not accept this key. If it belongs to another user, start your own with 'kouxing run'. If it is yours, restart it. If it runs on another machine, run 'kouxing keys add NAME --role client' there and copy the file here": "控制服务（{address}）不接受此密钥。如果它属于另一个用户，请用 kouxing run 启动自己的控制服务；如果是你自己的，请重启它；如果它在另一台机器上运行，请在那里运行 kouxing keys add NAME --role client，并把文件复制到这里",
   "control has closed the session: {reason}": "控制服务关闭了会话（{reason}）",
   "the session is closed": "会话已关闭",
+  "no session is shown; start a microphone or the sample first": "没有显示会话，请先打开麦克风或播放示例",
   "another program opened this session; only that program can send audio": "此会话由另一个程序打开，只有该程序可以发送声音",
 
   "session {name} is open; choose another name": "会话 {name} 已存在，请换一个名称",
