@@ -86,6 +86,7 @@ class Service(MessageLoop):
         self.endpoints: dict[str, str] = {}  # endpoints that it provides, by name
         self.facts = SessionFacts()  # facts about the sessions of this service
         self.languages: list[str] = []  # additional languages that its sessions may choose
+        self.lip_models: list[str] = []  # lip models that its sessions may choose
         self.tick_callbacks: set[Callable[[], float]] = set()  # as `on_tick`
         self._exit_requested = False
         self._hand_over_end_s = 0.0
@@ -329,6 +330,7 @@ class Service(MessageLoop):
                 needs=list(self.kind.needs),
                 facts=self.facts,
                 languages=self.languages,
+                lip_models=self.lip_models,
                 state="draining" if self._exit_requested else "ready",
                 sent_ns=self._sent_ns,
                 endpoints=self.endpoints,

@@ -1,4 +1,6 @@
-"""Checks the names in the settings of a face; the synthesizer checks its lip models."""
+"""Checks the names in the settings of a face."""
+
+from collections.abc import Collection
 
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.face.expressions import check_expressions
@@ -8,9 +10,13 @@ from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import AcousticModelName
 
 
-def check_face(settings: FaceSettings) -> None:
-    """Raise ``Rejected`` if a setting has an unknown name; the text lists the names."""
-    known: list[tuple[str, str | None, list[str]]] = [
+def check_face(settings: FaceSettings, lip_models: Collection[str]) -> None:
+    """Raise ``Rejected`` if a setting has an unknown name; the text lists the names.
+
+    If no ``lip_models`` are given, all names of lip models are allowed.
+    """
+    known: list[tuple[str, str | None, Collection[str]]] = [
+        ("lip model", settings.lip_model if lip_models else None, lip_models),
         ("acoustic model", settings.acoustic, [*AcousticModelName]),
         *(("set of shapes", name, [*ShapeSetName]) for name in settings.shapes or ()),
     ]

@@ -218,6 +218,11 @@ class ServiceRegistry:
         """Return the workers that provide an endpoint, by instance."""
         return self._providers.get(endpoint, {})
 
+    def lip_models(self) -> list[str]:
+        """Return the lip models of the running synthesizers, sorted; empty if unknown."""
+        synthesizers = self.providers("faps").values()
+        return sorted({name for record in synthesizers for name in record.heartbeat.lip_models})
+
     def observers(self) -> set[str]:
         """Return the services that take part in every session."""
         return set(self._observers)

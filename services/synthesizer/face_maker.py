@@ -2,29 +2,24 @@
 
 from collections.abc import Callable
 
-from kouxing.services.lip_models import lip_model_names
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.services.synthesizer.modifiers.speech_motion import IdleMotionSettings
 from kouxing.services.synthesizer.session import SynthesizerSession
-from kouxing.shared.errors import Rejected, StartFailure, UserError
-from kouxing.shared.face.expressions import ExpressionName
-from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.fast_record import replace
+from kouxing.shared.errors import StartFailure, UserError
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ErrorCode
 
-EXPRESSION_NAMES = frozenset(ExpressionName)
-
 
 class FaceMaker:
     """Creates and changes faces.
 
-    ``report`` is called with a session and a text if a setting is ignored.
+    Control has checked the names in the settings. ``report`` is called with a session and a text if
+    a lip model cannot be loaded.
     """
 
     def __init__(
@@ -34,20 +29,9 @@ class FaceMaker:
         self._report = report
         load_lip_model(name=config.lips)  # so that the first session does not wait
 
-    def initial_settings(self, start: StartSession) -> FaceSettings:
-        """Return the settings of a session without unknown names.
-
-        Raises ``Rejected`` if a new session's lip model is unknown.
-        """
-        lip_model = start.opening.face.lip_model
-        if start.epoch == 1 and lip_model not in (None, *lip_model_names()):
-            text = f"unknown lip model {lip_model!r}; use {', '.join(lip_model_names())}"
-            raise Rejected(ErrorCode.BAD_FACE, text)
-        return self._known_settings(start, start.opening.face)
-
-    def make(self, start: StartSession, settings: FaceSettings) -> FaceAnimator:
+    def make(self, start: StartSession) -> FaceAnimator:
         """Return a face at rest. Raises ``StartFailure`` if its lip model cannot be loaded."""
-        config = self._config
+        config, settings = self._config, start.opening.face
         face = FaceAnimator(
             self._load_lip_model(start, settings.lip_model or config.lips),
             frame_rate_hz=config.frame_rate_hz,
@@ -61,9 +45,8 @@ class FaceMaker:
         face.set_idle_motion(_idle_motion_settings(settings))
         return face
 
-    def change(self, session: SynthesizerSession, changes: FaceSettings) -> None:
+    def change(self, session: SynthesizerSession, settings: FaceSettings) -> None:
         """Change the settings of a face, with continuous transitions."""
-        settings = self._known_settings(session.start, changes)
         if settings.lip_model is not None:
             language = session.start.facts.language or DEFAULT_LANGUAGE
             try:
@@ -77,7 +60,7 @@ class FaceMaker:
         session.face.set_idle_motion(_idle_motion_settings(settings))
         if settings.expressions is not None:
             session.face.set_expressions(settings.expressions, settings.hold_s)
-        session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))
+        session.add_shapes(settings.shapes or ())
 
     def _load_lip_model(self, start: StartSession, name: str) -> LipModel:
         """Load the lip model of a session.
@@ -95,25 +78,6 @@ class FaceMaker:
                 raise StartFailure(code, str(error)) from error
             self._report(start, str(error))
             return self._load_lip_model(start, self._config.lips)
-
-    def _known_settings(self, start: StartSession, settings: FaceSettings) -> FaceSettings:
-        """Return the settings without unknown names; report unknown names."""
-        unknown = {settings.lip_model} - {None, *lip_model_names()}
-        unknown |= (settings.expressions or {}).keys() - EXPRESSION_NAMES
-        unknown |= {*(settings.shapes or ())} - SHAPE_SETS.keys()
-        if not unknown:
-            return settings
-        self._report(
-            start, f"ignored unknown face settings: {', '.join(sorted(map(str, unknown)))}"
-        )
-        strengths = (settings.expressions or {}).items()
-        return replace(
-            settings,
-            lip_model=None if settings.lip_model in unknown else settings.lip_model,
-            expressions=settings.expressions
-            and {name: strength for name, strength in strengths if name not in unknown},
-            shapes=settings.shapes and [name for name in settings.shapes if name not in unknown],
-        )
 
 
 def _idle_motion_settings(settings: FaceSettings) -> IdleMotionSettings:

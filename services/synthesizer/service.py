@@ -20,6 +20,7 @@ import numpy as np
 from kouxing_client.field_types import MASK_BYTES
 from kouxing_client.messages import EndOfFaps, FapFrame, Message, SessionFacts
 
+from kouxing.services.lip_models import lip_model_names
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, Frame
@@ -75,6 +76,7 @@ class SynthesizerService(SessionService):
         self.facts = SessionFacts(
             frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lip_model=config.lips
         )
+        self.lip_models = lip_model_names()
         self._face_maker = FaceMaker(config, self._report_bad_face)
         self._sessions: dict[str, SynthesizerSession] = {}
         self._turn = 0  # round robin of sessions with queued events
@@ -98,12 +100,13 @@ class SynthesizerService(SessionService):
         """Create a face at rest. A session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
-            settings = self._face_maker.initial_settings(start)
-            face = self._face_maker.make(start, settings)
             session = SynthesizerSession(
-                start, face, self._input, self._faps, self._config.max_lag_s
+                start,
+                self._face_maker.make(start),
+                self._input,
+                self._faps,
+                self._config.max_lag_s,
             )
-            session.shapes = settings.shapes or []
             self._sessions[start.session] = session
         session.start = start
         self.session_started(start, session.final_time.media_time)

@@ -3,7 +3,7 @@
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from kouxing_client.messages import FapFrame
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import to_seconds
+from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.overload import SkipPolicy
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, SoundEvent
@@ -53,6 +54,12 @@ class SynthesizerSession:
         self.is_finished = False
         self.lateness = LatenessMeter()
         self.shapes: list[str] = []  # shape sets to publish
+        self.add_shapes(start.opening.face.shapes or ())
+
+    def add_shapes(self, names: Iterable[str]) -> None:
+        """Publish more shape sets."""
+        known = [name for name in names if name in SHAPE_SETS]
+        self.shapes = list(dict.fromkeys([*self.shapes, *known]))
 
     def skip_if_behind(self, now_s: float) -> None:
         """Skip all frames except the newest frame if the session is too far behind."""

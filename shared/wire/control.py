@@ -70,6 +70,8 @@ class Heartbeat(RegisteredMessage, frozen=True, kw_only=True):
     facts: SessionFacts = field(default_factory=SessionFacts)
     # additional languages that its sessions may choose
     languages: Annotated[list[Name], Meta(max_length=64)] = field(default_factory=list)
+    # lip models that its sessions may choose; empty: unknown
+    lip_models: Annotated[list[Name], Meta(max_length=64)] = field(default_factory=list)
     build: Text = ""  # version of kouxing
     load: Probability = 0.0  # fraction of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)

@@ -62,7 +62,8 @@ def test_lips_are_switched_while_a_session_runs(system: System) -> None:
     ):
         with pytest.raises(Refused, match="unknown lip model 'muscles'; use "):
             client.open_session(face={"lip_model": "muscles"})
-        session.set_face(lip_model="muscles")  # is reported and ignored
+        with pytest.raises(Refused, match="unknown lip model 'muscles'; use "):
+            session.set_face(lip_model="muscles")
         session.set_face(lip_model="learned")
         streamed = StreamedSession(session)
         streamed.send(SAMPLES)

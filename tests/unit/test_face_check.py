@@ -8,19 +8,22 @@ from kouxing.services.control.face_check import check_face
 from kouxing.shared.errors import Rejected
 from kouxing.shared.wire.face import FaceSettings
 
+LIP_MODELS = ["learned", "my-lips"]
+
 
 def test_known_names_are_accepted() -> None:
-    check_face(FaceSettings())
-    check_face(
-        FaceSettings(
-            lip_model="my-lips", acoustic="light", expressions={"joy": 0.5}, shapes=["vrm"]
-        )
+    settings = FaceSettings(
+        lip_model="my-lips", acoustic="light", expressions={"joy": 0.5}, shapes=["vrm"]
     )
+    check_face(FaceSettings(), LIP_MODELS)
+    check_face(settings, LIP_MODELS)
+    check_face(settings, [])  # no synthesizer reports its lip models
 
 
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
+        ({"lip_model": "muscles"}, "unknown lip model 'muscles'; use learned, my-lips"),
         ({"acoustic": "fast"}, "unknown acoustic model 'fast'; use full, light"),
         ({"shapes": ["vrm", "clay"]}, "unknown set of shapes 'clay'; use arkit, oculus, vrm"),
         ({"expressions": {"happy": 1.0}}, "unknown expression 'happy'; use joy, sadness, "),
@@ -30,5 +33,5 @@ def test_an_unknown_name_is_refused_with_the_known_ones(
     settings: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(Rejected, match=text) as caught:
-        check_face(FaceSettings(**settings))
+        check_face(FaceSettings(**settings), LIP_MODELS)
     assert caught.value.code == "bad-face"

@@ -63,6 +63,13 @@ def test_a_session_of_a_chosen_language_moves_only_to_a_worker_that_has_it(
     assert record.facts.language == "universal"
 
 
+def test_control_knows_the_lip_models_of_all_synthesizers(cluster: Cluster) -> None:
+    assert cluster.registry.lip_models() == []
+    for instance, lip_models in (("one", ["learned"]), ("two", ["ferguson", "learned"])):
+        cluster.add(replace(worker("synthesizer", instance), lip_models=lip_models))
+    assert cluster.registry.lip_models() == ["ferguson", "learned"]
+
+
 def test_a_face_listens_to_a_session_that_already_speaks(cluster: Cluster) -> None:
     speaker = cluster.open("speaker")
     speaker.speaking = True
