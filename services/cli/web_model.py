@@ -81,7 +81,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "feeling": (feeling, "_GAIN _FILTER_S _SIZE _AROUSED _TIRED _PLEASANT _UNPLEASANT"),
     "learned": (
         model,
-        "HOLD_S MAX_GAP_S NUM_MOUTH_FAPS _TRANSITION_S _MEMORY_S _TEETH_LOG_ODDS "
+        "HOLD_S MAX_GAP_S NUM_MOUTH_FAPS TRANSITION_S _MEMORY_S _TEETH_LOG_ODDS "
         "_CLOSED_FRACTION _EPSILON _UNTRACKED _JITTER_SQUARED",
     ),
     "lips": (lip_predictor, "CLOSURE NUM_OUTPUTS _COLUMNS _ONES _OTHERS"),

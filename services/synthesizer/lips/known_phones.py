@@ -5,6 +5,7 @@ import math
 from kouxing.shared.phones.events import Phone, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
 
+RECOGNIZED_AFTER_S = 0.09  # most phones are recognized within this time after their onset
 _MIN_AGE_S = 0.02  # minimum duration of a phone that ends with the speech
 
 

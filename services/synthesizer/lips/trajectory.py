@@ -12,6 +12,9 @@ from kouxing.shared.fast_record import Record
 
 Array = NDArray[np.float64]
 
+TRANSITION_S = 0.04  # duration of the change to a new target trajectory
+SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
+
 
 class FapState(Record, frozen=True):
     """Value and velocity of FAPs at one time."""

@@ -39,6 +39,8 @@ from kouxing.services.synthesizer.lips.known_phones import KnownPhones
 from kouxing.services.synthesizer.lips.lip_model import MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import (
     NO_TRANSITION,
+    SLOW_TRANSITION_S,
+    TRANSITION_S,
     FapState,
     RestTransition,
     Transition,
@@ -51,8 +53,6 @@ from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
 
 _REST_S = 0.3  # duration of the return to rest without sound
-_TRANSITION_S = 0.04  # duration of the change to a new target trajectory
-_SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 _MEMORY_S = 1.5  # phones that ended earlier have no effect
 
 
@@ -121,16 +121,16 @@ class VisemeStream:
     def add_event(self, event: SoundEvent) -> None:
         """Add a phone, a revision, or the end of speech."""
         if isinstance(event, Phone) and self._known.add_phone(event):
-            self._pending_s = max(self._pending_s or 0.0, _TRANSITION_S)
+            self._pending_s = max(self._pending_s or 0.0, TRANSITION_S)
         elif isinstance(event, SpeechChange) and self._known.add_speech_change(event):
-            self._pending_s = _SLOW_TRANSITION_S  # the event may be late
+            self._pending_s = SLOW_TRANSITION_S  # the event may be late
 
     def flush(self) -> None:
         """Drop all known phones and return to rest within 150 ms."""
         self._known.flush()
         self._closures.flush()
         self._rest = None
-        self._pending_s = _SLOW_TRANSITION_S
+        self._pending_s = SLOW_TRANSITION_S
 
     def frame_at(self, time_s: float) -> MouthFrame:
         """Return the mouth at a media time, seconds; times increase."""
@@ -162,7 +162,7 @@ class VisemeStream:
     def relax(self, step_s: float) -> MouthFrame:
         """Return the mouth one step closer to rest."""
         if self._rest is None:
-            duration_s = _REST_S if len(self._known) else _SLOW_TRANSITION_S
+            duration_s = _REST_S if len(self._known) else SLOW_TRANSITION_S
             self._rest = RestTransition(self._mouth(), self._parameters.neutral, duration_s)
         mouth = self._clip_to_hull(self._rest.step(step_s))
         self._mouth = lambda: mouth
@@ -174,8 +174,8 @@ class VisemeStream:
 
     def _start_transition(self, target: FapState) -> None:
         """Start a transition from the current mouth to ``target`` on the target trajectory."""
-        requested_s = self._pending_s or _TRANSITION_S
-        duration_s = _SLOW_TRANSITION_S if self._rest is not None else requested_s
+        requested_s = self._pending_s or TRANSITION_S
+        duration_s = SLOW_TRANSITION_S if self._rest is not None else requested_s
         durations_s = np.full(NUM_MOUTH_FAPS, duration_s)
         self._transition = Transition(
             self._mouth() - target,

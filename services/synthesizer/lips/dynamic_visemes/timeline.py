@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, visemes_of
+from kouxing.services.synthesizer.lips.known_phones import RECOGNIZED_AFTER_S
 from kouxing.shared.fast_record import Record, replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -27,7 +28,6 @@ EXPECTED = -1
 MAX_HOLD_S = 1.5  # limit for extending a phone beyond its estimated end if nothing follows
 _HOLD_SOFTNESS_S = 0.03
 _HOLD_FACTOR = 2.0  # with lower values, a long vowel half closes before it is held
-_RECOGNIZED_AFTER_S = 0.09  # most phones are recognized within this time after their onset
 _EXPECTED_AFTER_S = 0.3  # the mouth relaxes after the expected viseme has lasted this long
 # expected visemes: a medium vowel; after a vowel, a less open mouth that keeps its rounding
 _EXPECTED_AFTER_INITIAL, _EXPECTED_AFTER_VOWEL, _EXPECTED_AFTER_ROUNDED = "ei", "i", "u"
@@ -90,13 +90,13 @@ class Timeline(Record, frozen=True, kw_only=True):
     def extend_open_phone(self, known_s: float) -> Timeline:
         """Extend the open phone, given that the audio is known up to ``known_s``.
 
-        A successor that started `_RECOGNIZED_AFTER_S` earlier would be known. The phone's end moves
+        A successor that started `RECOGNIZED_AFTER_S` earlier would be known. The phone's end moves
         smoothly from the estimate to that time. A held phone moves beyond it, because a long phone
         is likely to continue. The extension is at most ``MAX_HOLD_S``.
         """
         if self.open_phone is None:
             return self
-        no_successor_before_s = known_s - _RECOGNIZED_AFTER_S
+        no_successor_before_s = known_s - RECOGNIZED_AFTER_S
         overdue_s = _HOLD_SOFTNESS_S * np.logaddexp(
             0.0, (no_successor_before_s - self.open_phone.end_s) / _HOLD_SOFTNESS_S
         )

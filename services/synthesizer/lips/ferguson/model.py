@@ -35,10 +35,12 @@ from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
     EnergySegment,
     SyllableSegmenter,
 )
-from kouxing.services.synthesizer.lips.known_phones import KnownPhones
+from kouxing.services.synthesizer.lips.known_phones import RECOGNIZED_AFTER_S, KnownPhones
 from kouxing.services.synthesizer.lips.lip_model import MouthFrame, SyllableArticulation
 from kouxing.services.synthesizer.lips.trajectory import (
     NO_TRANSITION,
+    SLOW_TRANSITION_S,
+    TRANSITION_S,
     FapState,
     RestTransition,
     Transition,
@@ -53,12 +55,9 @@ from kouxing.shared.phones.inventory import PhoneInventory
 Array = NDArray[np.float64]
 
 _SNAP_S = 0.06  # a syllable this close to the start of a segment starts with the segment
-_RECOGNIZED_AFTER_S = 0.09  # most phones are recognized within this time after their onset
 _EXPECTED_S = 0.15  # wait for an expected phone before the mouth closes
 _CLOSING_S = 0.1
 _MEMORY_S = 1.5
-_TRANSITION_S = 0.04  # duration of the change to new key frames
-_SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 _REST_S = 0.15  # duration of the return to rest without sound
 _DERIVATIVE_STEP_S = 1e-3
 
@@ -117,15 +116,15 @@ class FergusonStream:
                 self._segments += self._segmenter.add_slice(event)
                 self._known_s = event.time_s
                 if self._segmenter.start_s != start_s:
-                    self._request_transition(_TRANSITION_S)
+                    self._request_transition(TRANSITION_S)
             case Phone():
                 if self._known.add_phone(event):
                     self._has_ended = False
-                    self._request_transition(_TRANSITION_S)
+                    self._request_transition(TRANSITION_S)
             case SpeechChange():
                 self._has_ended = not event.active
                 if self._known.add_speech_change(event):
-                    self._request_transition(_SLOW_TRANSITION_S)
+                    self._request_transition(SLOW_TRANSITION_S)
 
     def flush(self) -> None:
         """Drop the known events and return to rest within 150 ms."""
@@ -134,7 +133,7 @@ class FergusonStream:
         self._segments.clear()
         self._has_ended = True
         self._rest = None
-        self._request_transition(_SLOW_TRANSITION_S)
+        self._request_transition(SLOW_TRANSITION_S)
 
     def frame_at(self, time_s: float) -> MouthFrame:
         """Return the mouth at a media time, seconds; times increase."""
@@ -146,7 +145,7 @@ class FergusonStream:
         phones = self._snap_phones()
         self._key_frames = self._make_key_frames(phones)
         if self._pending_s is not None or self._rest is not None:
-            duration_s = _SLOW_TRANSITION_S if self._rest is not None else self._pending_s
+            duration_s = SLOW_TRANSITION_S if self._rest is not None else self._pending_s
             difference = self._mouth - self._target_at(self._time_s)
             self._transition = Transition(
                 difference, np.full(NUM_MOUTH_FAPS, duration_s), self._time_s
@@ -220,7 +219,7 @@ class FergusonStream:
             expected = self._expected_key_frames(frames, phones)
         if bool(expected) != self._has_expected:
             self._has_expected = bool(expected)
-            self._request_transition(_TRANSITION_S if expected else _SLOW_TRANSITION_S)
+            self._request_transition(TRANSITION_S if expected else SLOW_TRANSITION_S)
         frames = _drop_unordered([*frames, *expected] or [(0.0, 0.0)])
         return KeyFrames(
             np.array([time_s for time_s, _ in frames]), np.array([r for _, r in frames])
@@ -261,7 +260,7 @@ class FergusonStream:
         else:
             return []
         closed_s = next_s + _EXPECTED_S
-        next_s = min(max(next_s, self._known_s - _RECOGNIZED_AFTER_S), closed_s - _CLOSING_S)
+        next_s = min(max(next_s, self._known_s - RECOGNIZED_AFTER_S), closed_s - _CLOSING_S)
         return [*expected, (next_s, next_opening), (closed_s, 0.0)]
 
 

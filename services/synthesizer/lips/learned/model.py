@@ -40,6 +40,8 @@ from kouxing.services.synthesizer.lips.learned.resting_lips import RestingLips, 
 from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import (
     NO_TRANSITION,
+    SLOW_TRANSITION_S,
+    TRANSITION_S,
     FapState,
     RestTransition,
     Transition,
@@ -51,8 +53,6 @@ from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent, Speech
 Array = NDArray[np.float64]
 
 _UNTRACKED_FAPS = (14, 44, 45, 46, 47)  # jaw thrust and tongue
-_TRANSITION_S = 0.04  # duration of the change to a new track
-_SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 _REST_S = 0.15  # duration of the return to rest without sound
 _FLUSHED_S = 0.3  # lip positions of this much audio may arrive after an interruption
 _MEMORY_S = 0.5
@@ -157,7 +157,7 @@ class LearnedStream:
             phones.clear()
         self._track, self._on_track = LipTrack(self._neutral), stationary_state(self._neutral)
         self._flushed_until_s = self._known_s + _FLUSHED_S
-        self._start_transition(stationary_state(self._neutral), _SLOW_TRANSITION_S)
+        self._start_transition(stationary_state(self._neutral), SLOW_TRANSITION_S)
 
     def frame_at(self, time_s: float) -> MouthFrame:
         """Return the mouth at a media time, seconds; times increase."""
@@ -190,9 +190,9 @@ class LearnedStream:
         if self._rest is not None or not continues:
             now = self._track.at(self._time_s)
             if self._rest is not None:
-                self._start_transition(now, _SLOW_TRANSITION_S)
+                self._start_transition(now, SLOW_TRANSITION_S)
             elif _is_different(self._on_track, now):
-                self._start_transition(now, _TRANSITION_S)
+                self._start_transition(now, TRANSITION_S)
         self._on_track = self._track.at(time_s)
         self._mouth = self._on_track + self._transition.at(time_s)
 
