@@ -32,7 +32,7 @@ from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_columns
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS, PROTRUSION_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.user_file import check_content, parse_json, read_text, split_lines
 
@@ -52,7 +52,6 @@ _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separ
 _RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
-_DEPTH_FAPS = (16, 17)
 _RIG_DELAY_S = 0.04  # lag of its lips behind filmed speakers' lips
 _RIG_SHAPES = {
     "mouth_stretch_c": [
@@ -241,7 +240,7 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
             raise KeyError(shape)
         weight = np.mean(np.stack(sides), axis=0)
         faps[:, fap_columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
-    faps[:, fap_columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
+    faps[:, fap_columns(PROTRUSION_FAPS)] *= _DEPTH_SCALE
     for upper, lower in fap_columns((4, 5)), fap_columns((8, 10)):
         # lips do not pass through each other
         crossed = np.maximum(faps[:, upper] + faps[:, lower], 0.0)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.expressions import ExpressionName
-from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.faps import LOWER_LIP_FAPS, NUM_FAPS, UPPER_LIP_FAPS
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_gain
@@ -34,8 +34,7 @@ from kouxing.shared.face.smoothing import TwoPoleFilter, smoothing_gain
 CLOSED = 20.0  # largest gap of a closure, FAP units
 OPEN = 80.0  # from this gap upwards, lips have the width of an open mouth
 JAW = 3 - 1
-UPPER = np.array([4, 8, 9, 51, 55, 56]) - 1  # positive is down
-LOWER = np.array([5, 10, 11, 52, 57, 58]) - 1  # positive is up; same points as in UPPER
+UPPER, LOWER = np.array([UPPER_LIP_FAPS, LOWER_LIP_FAPS]) - 1
 
 _VISIBLE = 0.01  # FAP units
 _EASE_S, _FADE_S = 0.09, 0.3  # time constants of each filter pole, at the start and the end

@@ -42,4 +42,11 @@ def _read_table() -> tuple[Fap, ...]:
 FAPS = _read_table()
 MOUTH_FAPS = (*range(3, 15), 16, 17, *range(44, 48), *range(51, 61))  # jaw, lips and tongue
 NUM_MOUTH_FAPS = len(MOUTH_FAPS)
+# heights of six points of each lip, those of the inner lip first; positive closes the mouth
+UPPER_LIP_FAPS = (4, 8, 9, 51, 55, 56)
+LOWER_LIP_FAPS = (5, 10, 11, 52, 57, 58)
+LIP_HEIGHT_FAPS = tuple(sorted(UPPER_LIP_FAPS + LOWER_LIP_FAPS))
+MOUTH_WIDTH_FAPS = (6, 7, 53, 54)  # corners; positive is outward
+PROTRUSION_FAPS = (16, 17)
+TONGUE_FAPS = (44, 45, 46, 47)
 FAP_NUMBER = {fap.name: fap.number for fap in FAPS}

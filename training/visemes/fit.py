@@ -47,7 +47,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
-    LIP_HEIGHT_FAPS,
     REST,
     TRAINED_VISEMES,
     VISEME_INDEX,
@@ -55,7 +54,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
 )
 from kouxing.shared import fast_record
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
+from kouxing.shared.face.faps import LIP_HEIGHT_FAPS, MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 

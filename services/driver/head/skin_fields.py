@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.head.mesh_pieces import FapFields
 from kouxing.services.driver.head.surface import Float, Geodesics, Index, smoothest_fields
-from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_WIDTH_FAPS
 
 INNER_LIPS = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
 OUTER_LIPS = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")
@@ -137,7 +137,7 @@ class SkinFields:
         middles = ("2.2", "2.3", "8.1", "8.2")
         single = self._smoothest_fields(self._points_named(*corners, *between, *middles), fixed)
         self._lip_x = {}
-        for row, (fap_x, name) in enumerate(zip((6, 7, 53, 54), corners, strict=True)):
+        for row, (fap_x, name) in enumerate(zip(MOUTH_WIDTH_FAPS, corners, strict=True)):
             half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
             self._lip_x[name] = single[:, row] + 0.45 * half
             self._add_field(fap_x, self._lip_x[name])

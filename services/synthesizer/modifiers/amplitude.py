@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.lip_model import Articulation
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.shared.face.faps import LIP_HEIGHT_FAPS
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _PER_DB = 0.03
@@ -37,7 +38,7 @@ _MAX_INTERVAL_S = 0.6  # longer intervals are pauses
 _MIN_GAIN, _MAX_GAIN = 0.4, 1.4
 
 # FAPs that open the mouth, and the sign of opening
-_OPENING = {3: 1.0} | dict.fromkeys((4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58), -1.0)
+_OPENING = {3: 1.0} | dict.fromkeys(LIP_HEIGHT_FAPS, -1.0)
 _OPENING_FAPS = np.array(list(_OPENING)) - 1
 _OPENING_SIGNS = np.array(list(_OPENING.values()), dtype=np.float32)
 

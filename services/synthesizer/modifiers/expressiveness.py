@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.expression_motion import CLOSED, JAW, LOWER, OPEN, UPPER
+from kouxing.shared.face.faps import MOUTH_WIDTH_FAPS
 
 _WIDEST = 900.0  # openings of this size or more do not grow
 _USUAL_WIDTH = -40.0  # FAP of a mouth corner in speech, from the dynamic visemes
@@ -34,7 +35,7 @@ _SIDEWAYS = 2.0
 _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
 
 _LIPS = [*zip(UPPER.tolist(), LOWER.tolist(), strict=True)]  # the middle of the inner lips first
-_WIDTH = (5, 6, 52, 53)  # FAP 6, 7, 53 and 54; positive is outward
+_WIDTH = tuple(fap - 1 for fap in MOUTH_WIDTH_FAPS)
 _PUSH = (15, 16)  # FAP 16 and 17; positive is forward
 
 

@@ -7,13 +7,17 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.faps import (
+    LIP_HEIGHT_FAPS,
+    MOUTH_FAPS,
+    MOUTH_WIDTH_FAPS,
+    PROTRUSION_FAPS,
+    TONGUE_FAPS,
+)
 from kouxing.shared.tsv_tables import read_table
 
 Array = NDArray[np.float64]
-_OPENING = (3, 4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)  # jaw and lip heights
-_WIDTH, _PROTRUSION = (6, 7, 53, 54), (16, 17)
-_TONGUE = (44, 45, 46, 47)
+_OPENING = (3, *LIP_HEIGHT_FAPS)  # with the jaw
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +29,7 @@ class DerivedViseme:
     opening: float  # factor on the opening of the base
     rounding: float  # factor on the rounding of the base
     spread: float  # added to the width, FAP units
-    tongue: str  # viseme with the same tongue, or the values of _TONGUE
+    tongue: str  # viseme with the same tongue, or the values of TONGUE_FAPS
 
 
 @cache
@@ -65,7 +69,8 @@ def compute_derived_targets(targets: Array, index: Mapping[str, int]) -> Array:
     """Return the targets (num_derived, num_mouth_faps) from the trained visemes' targets."""
     made = np.empty((len(load_derived_visemes()), len(MOUTH_FAPS)))
     opening, width, protrusion, tongue = (
-        [MOUTH_FAPS.index(fap) for fap in faps] for faps in (_OPENING, _WIDTH, _PROTRUSION, _TONGUE)
+        [MOUTH_FAPS.index(fap) for fap in faps]
+        for faps in (_OPENING, MOUTH_WIDTH_FAPS, PROTRUSION_FAPS, TONGUE_FAPS)
     )
     for row, viseme in zip(made, load_derived_visemes(), strict=True):
         row[:] = targets[index[viseme.base]]

@@ -20,11 +20,10 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     static_targets,
 )
-from kouxing.shared.face.faps import NUM_MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_WIDTH_FAPS, NUM_MOUTH_FAPS, PROTRUSION_FAPS, TONGUE_FAPS
 
 _JAW_FAPS = (3, 14)
-_ROUNDING_FAPS = (6, 7, 16, 17, 53, 54)  # mouth width and protrusion
-_TONGUE_FAPS = (44, 45, 46, 47)
+_ROUNDING_FAPS = MOUTH_WIDTH_FAPS + PROTRUSION_FAPS
 
 # consonant visemes: dominance over lip height, jaw and rounding, and decay
 CONSONANTS = {
@@ -62,7 +61,7 @@ def initial_parameters(c: float = _INITIAL_C) -> VisemeParameters:
             alpha[row] = lips
             alpha[row, fap_columns(_JAW_FAPS)] = jaw
             alpha[row, fap_columns(_ROUNDING_FAPS)] = 2.0 * rounding if variant else rounding
-            alpha[row, fap_columns(_TONGUE_FAPS)] = 1.5
+            alpha[row, fap_columns(TONGUE_FAPS)] = 1.5
             theta_minus[row] = theta_plus[row] = theta
         elif viseme in ROUNDED_VISEMES:
             alpha[row, fap_columns(_ROUNDING_FAPS)] = _ROUNDED_ALPHA

@@ -14,6 +14,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.derived_visemes import (
     load_derived_visemes,
 )
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import LIP_HEIGHT_FAPS, LOWER_LIP_FAPS
 from kouxing.shared.phones.inventory import PhoneInventory, VisemeFractions
 from kouxing.shared.tsv_tables import read_table
 
@@ -26,8 +27,7 @@ TRAINED_VISEMES = (
 VISEMES = (*TRAINED_VISEMES, *(viseme.name for viseme in load_derived_visemes()))
 VISEME_INDEX = {viseme: index for index, viseme in enumerate(VISEMES)}
 
-LIP_HEIGHT_FAPS = (4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)  # lips meet
-LOWER_LIP_FAPS = (5, 10, 11, 52, 57, 58)  # lower lip meets the teeth
+# lips meet; lower lip meets the teeth
 CLOSURE_FAPS = {"b": LIP_HEIGHT_FAPS, "f": LOWER_LIP_FAPS}
 
 ROUNDED_VISEMES = frozenset({"u", "v", "w", "oe"})

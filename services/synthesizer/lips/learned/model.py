@@ -47,12 +47,11 @@ from kouxing.services.synthesizer.lips.trajectory import (
     Transition,
     stationary_state,
 )
-from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS, MOUTH_WIDTH_FAPS, NUM_MOUTH_FAPS, TONGUE_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent, SpeechChange
 
 Array = NDArray[np.float64]
 
-_UNTRACKED_FAPS = (14, 44, 45, 46, 47)  # jaw thrust and tongue
 _REST_S = 0.15  # duration of the return to rest without sound
 _FLUSHED_S = 0.3  # lip positions of this much audio may arrive after an interruption
 _MEMORY_S = 0.5
@@ -62,10 +61,10 @@ _JITTER = 10.0  # FAP units: changes of this size are halved, smaller changes ar
 _MAX_FAP = 4000.0  # FAP units; larger values are invalid
 _EPSILON = 1e-6  # FAP units, and FAP units per second
 
-_WIDTH_FAPS = (6, 7, 53, 54)  # mouth corners, whose movements are a third as large
-_UNTRACKED = np.array([MOUTH_FAPS.index(fap) for fap in _UNTRACKED_FAPS])
+_UNTRACKED = np.array([MOUTH_FAPS.index(fap) for fap in (14, *TONGUE_FAPS)])  # 14: jaw thrust
+# the movements of the mouth corners are a third as large
 _JITTER_SQUARED = np.array(
-    [(_JITTER / 3.0 if fap in _WIDTH_FAPS else _JITTER) ** 2 for fap in MOUTH_FAPS]
+    [(_JITTER / 3.0 if fap in MOUTH_WIDTH_FAPS else _JITTER) ** 2 for fap in MOUTH_FAPS]
 )
 
 
