@@ -38,7 +38,7 @@ from kouxing.services.mouth_profiles.lip_tracks import (
     lip_measures,
 )
 from kouxing.services.recognizer.lip_frames import choose_delay
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor, load_lip_predictor
+from kouxing.services.recognizer.lip_predictor import NUM_LIP_FAPS, LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.shared.errors import UserError
 
@@ -49,7 +49,6 @@ STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # ridge strengths to t
 FACE_DELAY_S = 0.06  # delay of the face for which the gain is measured
 MIN_SPEECH_S = 10.0
 
-_NUM_FAPS = len(LIP_FAPS)
 _BLOCK = 250  # adjacent encoder frames that stay in one fold
 _MAX_FOLDS = 5
 _SCALE_SHRINKAGE = 250.0  # weight of a scale of 1, encoder frames
@@ -109,14 +108,14 @@ def observe(lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
     positions = record_lip_inputs(filmed.samples)
     stream = lip_predictor.create_stream(lip_predictor.delays_s)
     predicted = np.zeros(
-        (len(positions.known_s), len(lip_predictor.delays_s), _NUM_FAPS), np.float32
+        (len(positions.known_s), len(lip_predictor.delays_s), NUM_LIP_FAPS), np.float32
     )
     hidden = np.zeros((len(predicted), len(stream.inner)), np.float32)
     starts = {*positions.starts}
     for position, features in enumerate(positions.features):
         if position in starts:
             stream.reset()
-        predicted[position] = stream.step(features.astype(np.float32))[:, :_NUM_FAPS]
+        predicted[position] = stream.step(features.astype(np.float32))[:, :NUM_LIP_FAPS]
         hidden[position] = stream.inner
     known_s = np.array(positions.known_s)
     time_s = known_s[:, None] - np.array(lip_predictor.delays_s)
@@ -217,9 +216,9 @@ def _fit(observations: Observations, strength: float) -> MouthProfile:
     offset = tracked_mean - scale * predicted_mean
     num_hidden, num_delays = observations.hidden.shape[1], observations.predicted.shape[1]
     profile = MouthProfile(
-        scale=np.ones(_NUM_FAPS, np.float32),
-        offset=np.zeros(_NUM_FAPS, np.float32),
-        residual=np.zeros((num_hidden, num_delays, _NUM_FAPS), np.float32),
+        scale=np.ones(NUM_LIP_FAPS, np.float32),
+        offset=np.zeros(NUM_LIP_FAPS, np.float32),
+        residual=np.zeros((num_hidden, num_delays, NUM_LIP_FAPS), np.float32),
     )
     if np.isfinite(strength):
         mean = observations.hidden.mean(axis=0, dtype=np.float64)

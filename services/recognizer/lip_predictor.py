@@ -53,8 +53,9 @@ FORMAT = "lips 4"
 # FAPs that a camera tracks. The left and the right FAP of a pair have the same value.
 LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 OTHER_SIDE = {6: 7, 8: 9, 10: 11, 12: 13, 53: 54, 55: 56, 57: 58, 59: 60}
-CLOSURE, LIP_TO_TEETH = len(LIP_FAPS), len(LIP_FAPS) + 1  # columns of the outputs, after the FAPs
-NUM_OUTPUTS = len(LIP_FAPS) + 2
+NUM_LIP_FAPS = len(LIP_FAPS)
+CLOSURE, LIP_TO_TEETH = NUM_LIP_FAPS, NUM_LIP_FAPS + 1  # columns of the outputs, after the FAPs
+NUM_OUTPUTS = NUM_LIP_FAPS + 2
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
 _MAX_SIZE = 4096  # limit for the numbers of features, components and units
@@ -126,7 +127,7 @@ class LipPredictor:
     def residual_shape(self) -> tuple[int, int, int]:
         """Shape of a mouth profile's residual."""
         num_inner, num_delays, _ = self.output_weights.shape
-        return num_inner, num_delays, len(LIP_FAPS)
+        return num_inner, num_delays, NUM_LIP_FAPS
 
     def with_mouth_profile(self, content: bytes) -> LipPredictor:
         """Adapt the model to a mouth profile; raises as ``parse_mouth_profile``."""
@@ -134,7 +135,7 @@ class LipPredictor:
 
     def adapt(self, profile: MouthProfile) -> LipPredictor:
         """Adapt the model to one speaker."""
-        faps = slice(len(LIP_FAPS))
+        faps = slice(NUM_LIP_FAPS)
         lips, output, bias = (
             weights.copy() for weights in (self.lip_weights, self.output_weights, self.output_bias)
         )
@@ -170,7 +171,7 @@ class LipPredictorStream:
             LipPositions(
                 time_s=known_s - delay_s,
                 delay_s=delay_s,
-                faps=expand_mouth_faps(row[: len(LIP_FAPS)]),
+                faps=expand_mouth_faps(row[:NUM_LIP_FAPS]),
                 closure=float(_sigmoid(row[CLOSURE])),
                 lip_to_teeth=float(_sigmoid(row[LIP_TO_TEETH])),
             )

@@ -38,7 +38,7 @@ from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.parallel import process_in_order
 from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS
+from kouxing.services.recognizer.lip_predictor import NUM_LIP_FAPS
 from kouxing.shared.output_file import open_output
 from kouxing.shared.pcm import as_integers
 from kouxing.shared.phones.events import Phone
@@ -110,7 +110,7 @@ class LipTeacher:
         inputs = torch.from_numpy(_inputs(self.projection, features))
         outputs = torch.stack([network(inputs[None])[0, :, 0] for network in self.networks])
         lips: Floats = outputs.mean(dim=0).numpy()
-        lips[:, len(LIP_FAPS) :] = expit(lips[:, len(LIP_FAPS) :])
+        lips[:, NUM_LIP_FAPS:] = expit(lips[:, NUM_LIP_FAPS:])
         return lips
 
     def save(self, path: Path) -> None:

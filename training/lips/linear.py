@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from kouxing.services.recognizer.lip_predictor import CLOSURE, LIP_FAPS
+from kouxing.services.recognizer.lip_predictor import CLOSURE, NUM_LIP_FAPS
 from kouxing.training.lips.positions import SpeechStretch, features_of
 
 Floats = NDArray[np.float32]
@@ -33,7 +33,6 @@ _RIDGE, _CLOSURE_RIDGE = 0.1, 0.01
 _MIN_DEVIATION = 1e-2
 _MIN_POSITIONS = 20  # minimum for a speaker
 _MAX_ITERATIONS = 40
-_NUM_FAPS = len(LIP_FAPS)
 
 
 def fit_linear(
@@ -53,7 +52,7 @@ def fit_linear(
     speaker = np.repeat([stretch.clip.speaker for stretch in speech], lengths)
     weights = np.zeros((len(mean), *known_targets.shape[1:]))
     bias = np.zeros(known_targets.shape[1:])
-    unknown = np.isnan(known_targets[..., :_NUM_FAPS])
+    unknown = np.isnan(known_targets[..., :NUM_LIP_FAPS])
     known: NDArray[np.bool_] = np.logical_not(unknown.any(axis=1))  # (positions, 15)
     for columns in _equal_columns(known):
         rows = known[:, columns[0]]

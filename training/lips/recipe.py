@@ -30,6 +30,7 @@ from kouxing.services.recognizer.encoder import LIP_DELAYS_S
 from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     LIP_FAPS,
+    NUM_LIP_FAPS,
     NUM_OUTPUTS,
     LipPredictor,
 )
@@ -58,7 +59,6 @@ COMPONENTS = ((160, 32, 0.5, 0.5), (128, 96, 1.0, 0.2), (128, 96, 1.0, 0.2), (51
 _ENCODER_WEIGHT, _LINEAR_WEIGHT, _NETWORK_WEIGHT = 0.5, 0.3, 0.2
 _LINEAR_CLOSURE = 0.85  # fraction of a closure's log odds; the rest is the network's
 _MAX_REPEATS = 6  # limit for the clips of a small source
-_NUM_FAPS = len(LIP_FAPS)
 _MIN_VARIANCE = 1e-8
 _CLOSURE_BIAS = (0.055, 0.155), (0.1, 0.7)  # by delay, added to the log odds of a closure
 # Predictions vary less than real lips, most of all in width. These factors correct about half of
@@ -188,7 +188,9 @@ def principal_components(features: Floats) -> tuple[Floats, Floats]:
 
 def measure_scale(targets: Sequence[Floats]) -> FapScale:
     """Measure the FAPs; one that no clip tracks gets the extent 0, so it stays at 0."""
-    faps = np.concatenate([target[..., :_NUM_FAPS].reshape(-1, _NUM_FAPS) for target in targets])
+    faps = np.concatenate(
+        [target[..., :NUM_LIP_FAPS].reshape(-1, NUM_LIP_FAPS) for target in targets]
+    )
     known = ~np.isnan(faps)
     count = np.maximum(known.sum(axis=0), 1)
     mean = np.where(known, faps, 0).sum(axis=0) / count
@@ -199,8 +201,8 @@ def measure_scale(targets: Sequence[Floats]) -> FapScale:
 def standardize(target: Floats, units: FapScale) -> Floats:
     """Express the FAPs of targets in units of their extent."""
     scale = np.where(units.extent > 0, units.extent, 1)
-    faps = (target[..., :_NUM_FAPS] - units.mean) / scale
-    return np.concatenate([faps, target[..., _NUM_FAPS:]], axis=-1).astype(np.float32)
+    faps = (target[..., :NUM_LIP_FAPS] - units.mean) / scale
+    return np.concatenate([faps, target[..., NUM_LIP_FAPS:]], axis=-1).astype(np.float32)
 
 
 def combine_parts(
@@ -213,23 +215,23 @@ def combine_parts(
     weights = {name: value.numpy() for name, value in network.state_dict().items()}
     units, shape = basis.units, (len(DELAYS_S), NUM_OUTPUTS)
     scale = np.ones(NUM_OUTPUTS)
-    scale[:_NUM_FAPS] = units.extent * _EXTENT_FACTOR
+    scale[:NUM_LIP_FAPS] = units.extent * _EXTENT_FACTOR
     width = [LIP_FAPS.index(fap) for fap in _WIDTH_FAPS]
     scale[width] = units.extent[width] * _WIDTH_FACTOR
     network_scale, linear_scale = scale.copy(), scale.copy()
-    network_scale[:_NUM_FAPS] *= _NETWORK_WEIGHT
+    network_scale[:NUM_LIP_FAPS] *= _NETWORK_WEIGHT
     network_scale[CLOSURE] = 1 - _LINEAR_CLOSURE
-    linear_scale[:_NUM_FAPS] *= _LINEAR_WEIGHT
+    linear_scale[:NUM_LIP_FAPS] *= _LINEAR_WEIGHT
     linear_scale[CLOSURE] = _LINEAR_CLOSURE
     encoder_weights = np.zeros((len(LIP_DELAYS_S), NUM_OUTPUTS, *shape))
-    for fap in range(_NUM_FAPS):
+    for fap in range(NUM_LIP_FAPS):
         for number, delay_weights in enumerate(np.eye(len(LIP_DELAYS_S))):
             encoder_weights[number, fap, :, fap] = np.interp(DELAYS_S, LIP_DELAYS_S, delay_weights)
     linear = linear_weights * linear_scale
     num_rows = encoder_weights[..., 0, 0].size
     linear[-num_rows:] += _ENCODER_WEIGHT * scale * encoder_weights.reshape(-1, *shape)
     bias = weights["output.bias"].reshape(shape) * network_scale + linear_bias * linear_scale
-    bias[:, :_NUM_FAPS] += units.mean
+    bias[:, :NUM_LIP_FAPS] += units.mean
     bias[:, CLOSURE] += np.interp(DELAYS_S, *_CLOSURE_BIAS)
     output = weights["output.weight"].T.reshape(-1, *shape) * network_scale
     return LipPredictor(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS, NUM_OUTPUTS
+from kouxing.services.recognizer.lip_predictor import NUM_LIP_FAPS, NUM_OUTPUTS
 
 Floats = NDArray[np.float32]
 
@@ -29,7 +29,6 @@ _LEARNING_RATE, _WEIGHT_DECAY = 2e-3, 1e-2
 _PROBABILITY_WEIGHT = 0.3  # weight of closure and lip to teeth in the loss
 _UNITS_WEIGHT = 0.01  # weight of a speaker's squared scale (log) and offset
 _MAX_GRADIENT = 1.0
-_NUM_FAPS = len(LIP_FAPS)
 
 
 class LipNetwork(nn.Module):
@@ -46,8 +45,8 @@ class LipNetwork(nn.Module):
         )
         self.output = nn.Linear((3 if both_ways else 2) * HIDDEN_WIDTH, num_delays * NUM_OUTPUTS)
         self.dropout = nn.Dropout(_DROPOUT)
-        self.log_scale = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
-        self.offset = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
+        self.log_scale = nn.Parameter(torch.zeros(num_speakers, NUM_LIP_FAPS))
+        self.offset = nn.Parameter(torch.zeros(num_speakers, NUM_LIP_FAPS))
 
     def forward(self, components: Tensor) -> Tensor:
         """Compute the outputs in canonical units, (batch, positions, delays, 17)."""
@@ -64,9 +63,9 @@ class LipNetwork(nn.Module):
         offset = self.offset[speakers][:, None, None]
         wanted = torch.nan_to_num(targets)
         known = ~torch.isnan(targets)
-        error = (outputs[..., :_NUM_FAPS] * scale + offset - wanted[..., :_NUM_FAPS]) ** 2
-        total = _mean(error, known[..., :_NUM_FAPS])
-        for column in range(_NUM_FAPS, NUM_OUTPUTS):
+        error = (outputs[..., :NUM_LIP_FAPS] * scale + offset - wanted[..., :NUM_LIP_FAPS]) ** 2
+        total = _mean(error, known[..., :NUM_LIP_FAPS])
+        for column in range(NUM_LIP_FAPS, NUM_OUTPUTS):
             entropy = binary_cross_entropy_with_logits(
                 outputs[..., column], wanted[..., column], reduction="none"
             )
