@@ -13,7 +13,7 @@ enum {
 
 typedef struct {
   float state[2 * ENCODER_WIDTH];
-  float features[NUM_FEATURES]; /* two log-mel frames and the encoder's features, at the newest position */
+  float features[NUM_FEATURES]; /* of the newest encoder frame: two log-mel frames, then its features */
   double voice;                 /* probability of speech or singing */
   double laughter;              /* evidence */
 } AudioEncoder;
@@ -32,9 +32,9 @@ typedef struct {
 void encoder_init_tables(void);
 /* Compute log-mel bands (MEL_NUM_MELS,) of a window (MEL_WINDOW_SAMPLES,). */
 void log_mel(const float *window, float *bands);
-/* Process the next position, whose log-mel frames are at the start of the features. */
+/* Process the next encoder frame, whose log-mel frames are at the start of the features. */
 void encoder_process(AudioEncoder *encoder);
-/* Return the lip frame that follows from the features of a position. */
+/* Return the lip positions that an encoder frame's features determine. */
 LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const float *features);
 
 #endif

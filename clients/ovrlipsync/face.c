@@ -184,7 +184,7 @@ static void move_to_rest(double *faps, double amount) {
   }
 }
 
-/* Compute the FAPs of the next lip frame, stabilized and with closures. */
+/* Compute the FAPs of the next lip positions, stabilized and with closures. */
 static void stabilize(Face *face, const LipFrame *frame, double *faps) {
   if (frame->time_s - track_end_s(&face->track) <= LEARNED_MAX_GAP_S) {
     for (int i = 0; i < NUM_MOUTH_FAPS; i++) {

@@ -1,4 +1,4 @@
-/* Mouths from lip frames; services/synthesizer has the rules. */
+/* Mouths from lip positions; services/synthesizer has the rules. */
 #ifndef FACE_H
 #define FACE_H
 
@@ -17,7 +17,7 @@ typedef struct {
   Mouth mouth;
 } Knot;
 
-/* A trajectory from lip frames; it starts at rest. */
+/* A trajectory from lip positions; it starts at rest. */
 typedef struct {
   Knot knots[MAX_KNOTS];
   int num_knots;
@@ -47,8 +47,8 @@ typedef struct {
 typedef struct {
   LipFrame queue[MAX_QUEUE]; /* frames that are not due yet */
   int num_queued;
-  double stable[NUM_MOUTH_FAPS]; /* the last lip frame, stabilized */
-  double closing[2];             /* closure fractions of the last two lip frames */
+  double stable[NUM_MOUTH_FAPS]; /* the last lip positions, stabilized */
+  double closing[2];             /* closure fractions of the last two lip positions */
   bool has_lip_frames, is_speaking;
   Track track;
   Mouth on_track, mouth; /* the track and the mouth at the last frame */

@@ -27,11 +27,11 @@ struct Lips {
   int num_in_slice;
   float sound[MEL_WINDOW_SAMPLES]; /* of the next window */
   int num_sound;
-  int num_mel_frames; /* of the next position */
+  int num_mel_frames; /* of the next encoder frame */
   int num_frames;
   AudioEncoder encoder;
   LipPredictor predictor;
-  float recent[MAX_RECENT][NUM_FEATURES]; /* the positions before speech */
+  float recent[MAX_RECENT][NUM_FEATURES]; /* the encoder frames before speech */
   int num_recent;
   double evidence; /* of speech */
   int num_improbable;

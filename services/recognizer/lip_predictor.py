@@ -179,7 +179,7 @@ class LipPredictorStream:
         ]
 
     def step(self, features: Floats) -> Floats:
-        """Compute the outputs, (delays, 17), from a position's features, (features,)."""
+        """Compute the outputs, (delays, 17), from an encoder frame's features, (features,)."""
         model = self._model
         centered = features - model.feature_mean
         component = (centered @ model.projection).astype(np.float32, copy=False)
@@ -199,7 +199,7 @@ class LipPredictorStream:
 
 
 def join_features(frames: Floats, features: Floats) -> Floats:
-    """Join a position's frames, (2, 80), with the encoder's features."""
+    """Join an encoder frame's log-mel frames, (2, 80), with the encoder's features."""
     return np.concatenate([frames, features], axis=None)
 
 

@@ -27,7 +27,7 @@ from kouxing.shared.wire import speech
 from kouxing.shared.wire.final_time import FinalTimeTracker
 
 WARM_UP_S = 2.8  # duration of the reprocessed audio; docs/recognition.md explains the choice
-# Audio starts at a multiple of this time. Network blocks and positions divide it, so they are
+# Audio starts at a multiple of this time. Network blocks and encoder frames divide it, so they are
 # aligned as in an uninterrupted session.
 GRID_S = 0.16
 MAX_REPLAYED_MESSAGES = 5000  # limit of audio messages that a client keeps

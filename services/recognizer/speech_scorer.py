@@ -151,7 +151,7 @@ class SpeechScorer:
         self._encoder_queue.append(event)
 
     def next_encoder_input(self) -> EncoderInput | None:
-        """Return the next position for the encoder, or None if the queue has no position."""
+        """Return the next encoder frame to process, or None if the queue has none."""
         while self._encoder_queue:
             item = self._encoder_queue[0]
             if isinstance(item, EncoderInput):
@@ -170,7 +170,7 @@ class SpeechScorer:
 
     @property
     def encoder(self) -> EncoderStream:
-        """The stream that processes the positions."""
+        """The stream that processes the encoder frames."""
         return self._segmenter.encoder
 
     def add_encoder_output(self, position: EncoderInput, output: EncoderOutput) -> None:

@@ -48,14 +48,14 @@ class SpeechEnd(Record, frozen=True):
 
 
 class SpeechFrames(Record, frozen=True):
-    """The next frames of speech; they end with a position."""
+    """The next feature frames of speech; they end with an encoder frame."""
 
     features: Floats  # (n, k), of the front end
     phones: Floats  # (n, phones), the encoder's log posteriors after each frame
 
 
 class EncoderInput(Record, frozen=True):
-    """The input of the audio encoder at a position, and the front end's features."""
+    """The input of the audio encoder for an encoder frame, and the front end's features."""
 
     features: Floats  # (2, k)
     mels: Floats  # (2, 80)
@@ -86,9 +86,9 @@ class SpeechSegmenter:
         self.encoder = load_encoder().create_stream()
         self._detector = VoiceActivityDetector()
         self._traits = load_voice_readout().create_stream()
-        self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next position
-        self._features: Floats | None = None  # feature frames of the next position
-        # Features and positions before speech
+        self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next encoder frame
+        self._features: Floats | None = None  # feature frames of the next encoder frame
+        # Features and encoder frames before speech
         self._recent: deque[tuple[Floats, EncoderOutput]] = deque(maxlen=_MAX_RECENT)
         self._num_frames = 0
         self._is_speaking = False
@@ -104,7 +104,7 @@ class SpeechSegmenter:
             yield from self.process(position, self.encoder.process_position(position.mels))
 
     def encoder_inputs(self, samples: Floats) -> Iterator[EncoderInput]:
-        """Accept samples, 16 kHz mono, shape (n,); yield the new positions, to be processed."""
+        """Accept samples, 16 kHz mono, shape (n,); yield the new encoder frames to process."""
         features = self._front_end.accept_waveform(samples)
         mels = features if self._mel is None else self._mel.accept_waveform(samples)
         self._mels = np.concatenate([self._mels, mels])
@@ -122,7 +122,7 @@ class SpeechSegmenter:
             yield self._end_speech()
 
     def process(self, position: EncoderInput, output: EncoderOutput) -> Iterator[SpeechItem]:
-        """Start or end speech and predict lips after a position, given the encoder's output."""
+        """Start or end speech and predict lips after an encoder frame, given its output."""
         features = position.features
         self._num_frames += len(features)
         if self._is_speaking:

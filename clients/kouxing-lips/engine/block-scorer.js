@@ -9,7 +9,7 @@ export class BlockScorer {
   #network;
   #logPrior;
   #scale;
-  #sizes; // block, length, past: positions
+  #sizes; // block, length, past: encoder frames
   #rings; // keys and values of each layer
   #table; // encodings of the positions
   #frames; // from the next block's first on
@@ -19,7 +19,7 @@ export class BlockScorer {
   #highestBand; // of the speech, for the floor
   #hasEnded;
   #row; // row of the table for the next block
-  #numNeeded; // positions that the next run needs
+  #numNeeded; // encoder frames that the next run needs
   #numCached;
 
   constructor({ blocks, phoneArrays, phones, constants }) {
@@ -47,7 +47,7 @@ export class BlockScorer {
     this.#startTable();
   }
 
-  /** Process the last frames of some positions; return the new settled scores and the provisional scores. */
+  /** Process the last feature frames of some encoder frames; return the new settled and the provisional scores. */
   accept(positions, numFrames) {
     const size = this.#numMels;
     const frames = positions.flatMap(({ features }) => [features.slice(0, size), features.slice(size, 2 * size)]);
@@ -76,7 +76,7 @@ export class BlockScorer {
     return this.#network.shape("frames")[2];
   }
 
-  /** Number of complete positions, from the next block's first on. */
+  /** Number of complete encoder frames, from the next block's first on. */
   get #numPositions() {
     const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#constants;
     return Math.max(0, Math.floor((this.#frames.length - 1 - SEEN_AFTER) / FRAMES_PER_POSITION));
@@ -144,7 +144,7 @@ export class BlockScorer {
     });
   }
 
-  /** Store the state, and the keys and values, after the first positions of the block. */
+  /** Store the state, and the keys and values, after the first encoder frames of the block. */
   #storeContext(numKept) {
     const { past } = this.#sizes;
     const [, , numHeads, numNew, size] = this.#network.shape("new");

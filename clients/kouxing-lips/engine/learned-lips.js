@@ -1,4 +1,4 @@
-// Learned lips: lip frames and levels in, FAPs of the mouth out; services/synthesizer/lips/learned has
+// Learned lips: lip positions and levels in, FAPs of the mouth out; services/synthesizer/lips/learned has
 // the rules in model.py and closure_rule.py. The tongue stays at rest.
 
 import { ClosingPhones, logOddsOf } from "./closing-phones.js";
@@ -12,9 +12,9 @@ export class LearnedLips {
   #delayS;
   #bilabials;
   #labiodentals;
-  #queue = []; // lip frames that are not due yet
-  #stable; // the last lip frame, stabilized
-  #closing = [0, 0]; // closure fractions of the last two lip frames
+  #queue = []; // lip positions that are not due yet
+  #stable; // the last lip positions, stabilized
+  #closing = [0, 0]; // closure fractions of the last two lip positions
   #hasLipFrames = false;
   #isSpeaking = false;
   #track;
@@ -88,7 +88,7 @@ export class LearnedLips {
     this.#track.holdS = this.#isSpeaking ? this.#model.constants.track.HOLD_S + this.#lateS : 0;
   }
 
-  /** Return the FAPs of the next lip frame, stabilized and with closures. */
+  /** Return the FAPs of the next lip positions, stabilized and with closures. */
   #stabilize(frame) {
     const { JITTER_SQUARED, MAX_GAP_S, CLOSED_FRACTION, TEETH_LOG_ODDS } = this.#model.constants.learned;
     const { closures } = this.#model.constants;

@@ -22,7 +22,7 @@ export class LightScorer {
     this.#last = null;
   }
 
-  /** Process the last frames of some positions; return the new { settled, provisional } scores, a row for each frame. */
+  /** Process the last feature frames of some encoder frames; return the new { settled, provisional } scores, a row for each frame. */
   accept(positions, numFrames) {
     const scores = positions.map(({ row }) => this.#scoresOf(row));
     const rows = scores.flatMap((row) => [row, row]).slice(-numFrames);

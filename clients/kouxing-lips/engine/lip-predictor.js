@@ -5,7 +5,7 @@ import { ProductMemory, alignedBytes } from "./products.js";
 
 const LANES = 4; // values that a product of floats processes together
 
-/** The lip frames of one session. */
+/** The lip positions of one session. */
 export class LipPredictor {
   #weights; // arrays by name
   #constants;
@@ -59,9 +59,9 @@ export class LipPredictor {
   }
 
   /**
-   * Return the lip frame that follows from a position.
+   * Return the lip positions that an encoder frame determines.
    *
-   * @param knownS media time of the last sample that the position has seen, seconds
+   * @param knownS media time of the encoder frame's last sample, seconds
    * @param features two log-mel frames and the encoder's features
    * @returns { timeS, delayS, faps: of the mouth, closure: probability }
    */

@@ -63,7 +63,7 @@ export class PhoneRecognizer {
     this.#rule = { lastEmitted: this.#silence, candidate: this.#silence, numAgreeing: 0 };
   }
 
-  /** Process the last frames of some positions; return new and changed phones. */
+  /** Process the last feature frames of some encoder frames; return new and changed phones. */
   accept(positions, numFrames) {
     const { settled, provisional } = this.#scorer.accept(positions, numFrames);
     return this.#decode(settled, provisional);

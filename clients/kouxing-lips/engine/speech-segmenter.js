@@ -36,8 +36,8 @@ export class SpeechSegmenter {
   #detector;
   #traits;
   #phones; // a PhoneRecognizer, or null
-  #frames = []; // frames of the next position
-  #recent = []; // positions before speech: { features, row: log posteriors of the phones }
+  #frames = []; // feature frames of the next encoder frame
+  #recent = []; // encoder frames before speech: { features, row: log posteriors of the phones }
   #numFrames = 0;
   #isSpeaking = false;
 
@@ -56,7 +56,7 @@ export class SpeechSegmenter {
     return this.#traits.newest;
   }
 
-  /** Accept samples at 16 kHz; return speech changes, phones and lip frames, in order. */
+  /** Accept samples at 16 kHz; return speech changes, phones and lip positions, in order. */
   accept(samples) {
     this.#frames.push(...this.#mel.accept(samples));
     const { FRAMES_PER_POSITION } = this.#model.constants.segmenter;
@@ -123,7 +123,7 @@ export class SpeechSegmenter {
     return this.#model.constants.segmenter.FRAMES_PER_POSITION;
   }
 
-  /** Return the phones that follow from the last frames of some positions. */
+  /** Return the phones that follow from the last feature frames of some encoder frames. */
   #recognize(positions, numFrames) {
     return (this.#phones?.accept(positions, numFrames) ?? []).map(eventOf);
   }

@@ -1,4 +1,4 @@
-// Position and velocity of values, transitions between trajectories, and the track of lip frames;
+// Position and velocity of values, transitions between trajectories, and the track of lip positions;
 // services/synthesizer/lips has the formulas in trajectory.py and learned/lip_track.py.
 
 /** Return a state { value, velocity } at rest. */
@@ -38,7 +38,7 @@ export class Transition {
   }
 }
 
-/** A mouth trajectory from lip frames; it starts at rest. */
+/** A mouth trajectory from lip positions; it starts at rest. */
 export class LipTrack {
   holdS = 0;
   #rest;

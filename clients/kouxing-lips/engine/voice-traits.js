@@ -3,7 +3,7 @@
 import { clamp } from "./math.js";
 
 export class VoiceTraits {
-  /** Traits of the voice at the newest position. */
+  /** Traits of the voice at the newest encoder frame. */
   newest = { arousal: 0, valence: 0, isLaughter: false, isBreath: false };
   #constants;
   #voices;
@@ -24,7 +24,7 @@ export class VoiceTraits {
     this.#feeling = this.#mean = [...arrays["traits.mean"].values];
   }
 
-  /** Process the next position's state and probabilities of the kinds of voice. */
+  /** Process the next encoder frame's state and probabilities of the kinds of voice. */
   accept(state, voice) {
     const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_FRACTION } = this.#constants;
     const { values, shape: [, numOutputs] } = this.#weights;

@@ -110,7 +110,7 @@ class GmmModel(AcousticModel):
         return PitchedLogMel()
 
     def create_stream(self) -> GmmStream:
-        """Create the stream of one speaker; it has no positions."""
+        """Create the stream of one speaker; it has no encoder frames."""
         return GmmStream(self)
 
     def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:

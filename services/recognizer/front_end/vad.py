@@ -21,20 +21,20 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.encoder import VoiceKind
 
 _NO_EVIDENCE, _ENOUGH = 0.75, 0.12
-_IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such positions do
+_IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such frames do
 _STOP_POSITIONS = 25  # half a second: longer than a closure or a breath between phrases
 
 
 class VoiceActivityDetector:
-    """Detects speech in one stream, position by position."""
+    """Detects speech in one stream, one encoder frame at a time."""
 
     def __init__(self) -> None:
         self.is_speech = False  # whether there is speech or singing, so the audio is recognized
         self._evidence = 0.0
-        self._num_improbable = 0  # positions in a row
+        self._num_improbable = 0  # encoder frames in a row
 
     def update(self, voice: Floats) -> None:
-        """Process the probabilities of a position, (4,), by ``VoiceKind``."""
+        """Process the probabilities of an encoder frame, (4,), by ``VoiceKind``."""
         probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SUNG])
         self._num_improbable = 0 if probability >= _IMPROBABLE else self._num_improbable + 1
         if self.is_speech:
