@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from operator import attrgetter
 
 from kouxing_client.messages import Message, SessionFacts, Speech
 
@@ -20,16 +19,13 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.audio_intake import AudioIntake
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.live_batch_decoder import (
-    MAX_BATCH_S,
-    SESSIONS_TOGETHER,
-    LiveBatchDecoder,
-)
+from kouxing.services.recognizer.live_batch_decoder import SESSIONS_TOGETHER, LiveBatchDecoder
 from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.pending_sessions import PendingSessions
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
+from kouxing.services.recognizer.unpaced_decoder import UnpacedDecoder
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.keys import NO_PEER, Peer
@@ -46,7 +42,6 @@ from kouxing.shared.wire.speech import Acknowledge, Progress
 
 MAX_QUEUED_S = 60.0  # limit for live audio; later audio waits at the clients
 READ_WAIT_S, MAX_READ_S = 0.005, 0.1  # waiting for more late audio: once, and in total
-MAX_UNPACED_S = 0.06  # limit for unpaced audio decoded at a time, while live audio waits
 FREE_MEMORY_AFTER_S = 10.0  # after the end of a session, because many often end together
 SESSION_TICK_S = 0.04  # interval between ticks while a session is open
 MIN_STEP_S = 0.002  # interval between steps with several sessions, to process their audio together
@@ -61,9 +56,8 @@ class RecognizerService(SessionService):
     def __init__(self, config: RecognizerConfig) -> None:
         super().__init__(config)
         self._sessions: dict[str, RecognizerSession] = {}
-        self._last_unpaced_read_s = time.monotonic()  # when unpaced audio was last read
         self._max_lag_s = config.max_lag_s
-        self._is_live_blocked = self._is_unpaced_blocked = False  # by a synthesizer's backlog
+        self._is_live_blocked = False  # by a synthesizer's backlog
         self._free_memory_at_s = math.inf
         self._last_step_s = 0.0
         self._last_stall_check_s = time.monotonic()
@@ -101,6 +95,14 @@ class RecognizerService(SessionService):
             on_decoded=self._send_decoded,
             on_batch=self.send_heartbeat_if_due,
         )
+        self._unpaced = UnpacedDecoder(
+            self._sessions,
+            self._recognizer,
+            self,
+            self._unpaced_audio,
+            self._live,
+            on_decoded=self._send_decoded,
+        )
         self._intake = AudioIntake(self)
         for socket in (self._audio, self._unpaced_audio):
             self.register(socket, {AudioChunk: partial(self._on_audio, socket)})
@@ -109,16 +111,13 @@ class RecognizerService(SessionService):
     def step(self, timeout_s: float) -> None:
         """Read new messages, then decode some audio of all live sessions together.
 
-        If no live audio is left, decode some unpaced audio. Further unpaced audio waits in the
-        socket, then at the sender.
+        If no live audio is left, decode some unpaced audio.
         """
-        has_unpaced = self._has_unpaced_audio and not self._is_unpaced_blocked
-        super().step(0.0 if has_unpaced or self._has_live_audio else timeout_s)
+        super().step(0.0 if self._unpaced.can_decode or self._has_live_audio else timeout_s)
         self._read_late_audio()
-        self._live.decode(self._select_sessions(paced=True))
-        has_unpaced = self._has_unpaced_audio and not self._is_unpaced_blocked
-        if has_unpaced and not self._is_live_waiting:
-            self._decode_unpaced()
+        self._live.decode(self._live_sessions)
+        if self._unpaced.can_decode and not self._is_live_waiting:
+            self._unpaced.decode()
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Wait for messages; with several sessions, also for those that arrive soon after."""
@@ -221,10 +220,10 @@ class RecognizerService(SessionService):
             self.report_skipped(session.start, session.audio.skip_policy.take_report_s(now_s))
             if session.link.is_full:
                 blocked.add(session.is_paced)
-        self._is_live_blocked = True in blocked or self._queued_s(paced=True) > MAX_QUEUED_S
-        self._is_unpaced_blocked = False in blocked
+        self._is_live_blocked = True in blocked or self._live_queued_s > MAX_QUEUED_S
         self.pause(self._audio, paused=self._is_live_blocked)
-        self._limit_unpaced()
+        self._unpaced.is_blocked = False in blocked
+        self._unpaced.limit_reading()
         return now_s + SESSION_TICK_S if self._sessions else self._free_memory_at_s
 
     def _report_stalled(self, now_s: float) -> None:
@@ -238,18 +237,18 @@ class RecognizerService(SessionService):
     def on_drain(self) -> bool:
         """Hand sessions over to other recognizers; finish the remaining ones."""
         sessions = self._sessions.values()
-        self._live.decode_all(self._select_sessions(paced=True))
+        self._live.decode_all(self._live_sessions)
         if self.is_handing_over and not all(session.is_finished for session in sessions):
             return False
-        while self._has_unpaced_audio:
-            self._decode_unpaced()
+        while self._unpaced.has_audio:
+            self._unpaced.decode()
         for session in sessions:
             self._finish(session)
         return all(session.link.backlog == 0 for session in sessions)
 
     def session_progress(self) -> dict[str, SessionProgress]:
         """Return the input progress of each session."""
-        read_s = {True: time.monotonic(), False: self._last_unpaced_read_s}  # by paced
+        read_s = {True: time.monotonic(), False: self._unpaced.last_read_s}  # by paced
         return {
             name: SessionProgress(
                 idle_s=max(0.0, read_s[session.is_paced] - session.last_audio_s),
@@ -263,7 +262,7 @@ class RecognizerService(SessionService):
         """Return gauges of queued audio, unacknowledged messages and the light model."""
         backlogs = [session.link.backlog for session in self._sessions.values()]
         return {
-            "queued_audio_seconds": self._queued_s(paced=True) + self._queued_s(paced=False),
+            "queued_audio_seconds": self._live_queued_s + self._unpaced.queued_s,
             "unacknowledged_messages": max(backlogs, default=0),
             "network_hop": self._live.hop,
             "light_sessions": sum(
@@ -279,24 +278,22 @@ class RecognizerService(SessionService):
         if session is None:
             return
         if not session.is_paced:
-            self._limit_unpaced()
+            self._unpaced.limit_reading()
         if session.end is not None and not session.is_decoding:
             self._finish(session)
 
-    def _select_sessions(self, *, paced: bool) -> list[RecognizerSession]:
-        return [session for session in self._sessions.values() if session.is_paced == paced]
+    @property
+    def _live_sessions(self) -> list[RecognizerSession]:
+        return [session for session in self._sessions.values() if session.is_paced]
 
-    def _queued_s(self, *, paced: bool) -> float:
-        """Duration of the paced or unpaced audio that is not decoded yet."""
-        return sum(session.audio.duration_s for session in self._select_sessions(paced=paced))
+    @property
+    def _live_queued_s(self) -> float:
+        """Duration of the live audio that is not decoded yet."""
+        return sum(session.audio.duration_s for session in self._live_sessions)
 
     @property
     def _has_live_audio(self) -> bool:
-        return any(session.can_accept for session in self._select_sessions(paced=True))
-
-    @property
-    def _has_unpaced_audio(self) -> bool:
-        return any(session.audio for session in self._select_sessions(paced=False))
+        return any(session.can_accept for session in self._live_sessions)
 
     @property
     def _is_live_waiting(self) -> bool:
@@ -329,37 +326,6 @@ class RecognizerService(SessionService):
                 self.metrics.observe("chunk_ms", 1e3 * (time.monotonic() - session.accepted_s))
             if session.end is not None and not session.is_decoding:
                 self._finish(session)
-
-    @property
-    def _max_unpaced_s(self) -> float:
-        """Duration of unpaced audio that is decoded, and read, at a time."""
-        return MAX_UNPACED_S if self._select_sessions(paced=True) else MAX_BATCH_S
-
-    def _limit_unpaced(self) -> None:
-        """Stop reading unpaced audio while enough of it is queued."""
-        is_full = self._queued_s(paced=False) >= self._max_unpaced_s
-        is_paused = is_full or self._is_unpaced_blocked
-        self.pause(self._unpaced_audio, paused=is_paused)
-        if not is_paused:
-            self._last_unpaced_read_s = time.monotonic()
-
-    def _decode_unpaced(self) -> None:
-        """Decode some unpaced audio, and finish the sessions whose audio ends."""
-        before = self._live.work
-        left_s = self._max_unpaced_s
-        batch = []
-        # the session that has waited longest is first, so that no session starves
-        waiting = sorted(self._select_sessions(paced=False), key=attrgetter("accepted_s"))
-        for session in waiting:
-            if session.audio and left_s > 0.0:
-                queued_s = session.audio.duration_s
-                session.accept_waveform(left_s, time.monotonic(), hop=1)
-                left_s -= queued_s - session.audio.duration_s
-                batch.append(session)
-        self._recognizer.decode_streams([session.stream for session in batch])
-        self._send_decoded(batch)
-        self._limit_unpaced()
-        self._live.unpaced_work += self._live.work - before
 
     def _finish(self, session: RecognizerSession) -> None:
         if not session.is_finished:

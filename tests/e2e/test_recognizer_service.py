@@ -14,7 +14,8 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.live_batch_decoder import MAX_BATCH_S
-from kouxing.services.recognizer.service import MAX_UNPACED_S, RecognizerService
+from kouxing.services.recognizer.service import RecognizerService
+from kouxing.services.recognizer.unpaced_decoder import MAX_UNPACED_S
 from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
@@ -68,9 +69,9 @@ class Recognizer(RecognizerService):
 
     def decode_all(self) -> None:
         while self._has_live_audio:
-            self._live.decode(self._select_sessions(paced=True))
-        while self._has_unpaced_audio:
-            self._decode_unpaced()
+            self._live.decode(self._live_sessions)
+        while self._unpaced.has_audio:
+            self._unpaced.decode()
             self.send_heartbeat_if_due()
 
 
