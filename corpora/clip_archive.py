@@ -39,5 +39,5 @@ def write_clip_archive(folder: Path, archive: Path) -> int:
 
 
 def _may_share(license_name: str) -> bool:
-    """Return whether clips may be passed on: a model may use footage by third parties."""
+    """Return whether the clips may be shared: a model may use footage by third parties."""
     return may_distribute(license_name) and "third part" not in license_name

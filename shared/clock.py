@@ -10,7 +10,7 @@ from collections import deque
 
 MEDIA_RATE_HZ = 16_000
 MAX_GAP_S = 10.0  # longer gaps in media time have no frames
-STALL_LIMIT_S = 0.5  # longer than a busy machine delays a process
+STALL_LIMIT_S = 0.5  # a longer delay is a stall; a busy machine delays a process by less
 
 
 def to_samples(time_s: float) -> int:

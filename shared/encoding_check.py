@@ -18,7 +18,7 @@ Measure = tuple[float, float, float]  # spectral flatness, correlation of neighb
 
 BLOCK = 2400  # samples per channel that are checked together; a multiple of all sample sizes
 _MAX_BLOCKS = 60  # non-silent blocks after which the check ends
-_MAX_REFUSED = 2  # non-PCM blocks after which the data is rejected
+_MAX_REFUSED = 2  # blocks that are not PCM after which the data is rejected
 _MIN_SOUND = 3  # blocks of sound that end the check
 _SEGMENT = 200  # samples of a spectrum
 _MAX_SAMPLE = 1.5  # largest plausible sample in another encoding

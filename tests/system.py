@@ -36,7 +36,7 @@ SKIP_NO_AUDIO = {  # on a busy machine
     "KOUXING_MAX_LAG_S": "3600",
 }
 LONG_TIMEOUTS = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
-ADMIT_ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is refused
+ADMIT_ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is rejected
 LIGHT_MODEL = {"KOUXING_RECOGNIZER_ACOUSTIC": "light"}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
 MAX_RESERVATIONS = 50

@@ -195,7 +195,7 @@ def head_environment(settings: Settings, option: str, out: Path) -> dict[str, st
 
 
 def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment that passes on ``--set``, so that it overrides all other sources."""
+    """Return the environment variables of ``--set``, which override all other sources."""
     environment = {}
     for name, value in assignments.items():
         table, _, key = name.partition(".")

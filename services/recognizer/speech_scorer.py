@@ -151,7 +151,7 @@ class SpeechScorer:
         self._encoder_queue.append(event)
 
     def next_encoder_input(self) -> EncoderInput | None:
-        """Return the next encoder frame to process, or None if the queue has none."""
+        """Return the next encoder frame to process, or None if the queue is empty."""
         while self._encoder_queue:
             item = self._encoder_queue[0]
             if isinstance(item, EncoderInput):

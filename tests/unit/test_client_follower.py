@@ -1,4 +1,4 @@
-"""A follower passes on each message of a session once, through moves and reconnections."""
+"""A follower delivers each message of a session once, through moves and reconnections."""
 
 from __future__ import annotations
 

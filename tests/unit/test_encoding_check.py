@@ -1,4 +1,4 @@
-"""Data of another encoding that a client announced as s16le is refused; loud sound is not."""
+"""Data of another encoding that a client announced as s16le is rejected; loud sound is not."""
 
 import io
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Control refuses unknown names in the settings of a face."""
+"""Control rejects unknown names in the settings of a face."""
 
 from typing import Any
 

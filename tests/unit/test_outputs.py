@@ -1,4 +1,4 @@
-"""Outputs are complete or absent; commands refuse useless options, and overwrite no input."""
+"""Outputs are complete or absent; commands reject useless options, and overwrite no input."""
 
 import errno
 import os

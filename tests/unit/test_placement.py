@@ -1,4 +1,4 @@
-"""Placement by load: where sessions go, and when they are refused; no sockets, no clocks."""
+"""Placement by load: where sessions go, and when they are rejected; no sockets, no clocks."""
 
 import pytest
 

@@ -52,7 +52,7 @@ class Client(BaseClient):
     def follow(self, name: str = "", *, paced: bool = True) -> Session:
         """Follow a session that another program opened. An empty name selects the newest session.
 
-        If ``paced`` is true and this process was suspended, outdated frames are dropped. Use this
+        If ``paced`` is true and this process was stalled, outdated frames are dropped. Use this
         to show a live face. If ``paced`` is false, every result is delivered, even if it is late.
         """
         core = self._thread.submit(lambda core: core.follow(name, is_live=paced)).result()

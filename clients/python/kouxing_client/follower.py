@@ -61,8 +61,8 @@ class Follower:
     classes
         Classes of messages to subscribe to.
     live
-        Whether late frames are worthless. If so, only the newest ``MAX_HELD_FRAMES`` of the frames
-        that queued while this process was suspended are passed on.
+        Whether late frames are worthless. If so, and this process was stalled, only the newest
+        ``MAX_HELD_FRAMES`` of the queued frames are delivered.
     on_complete
         Called when every publisher has confirmed: no later message is missed. Called again after
         each ``start``.
@@ -178,7 +178,7 @@ class Follower:
         return self._connection
 
     def close(self) -> None:
-        """Unsubscribe; from then on, no message is passed on."""
+        """Unsubscribe; from then on, no message is delivered."""
         for connection in (self._connection, self._old_connection):
             if connection is not None:
                 self._transport.close_connection(connection)

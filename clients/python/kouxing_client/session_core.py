@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect again
 MOVE_LIMIT_S = 5.0  # limit for the move of a session whose recognizer is lost
 END_LIMIT_S = 5.0  # maximum wait for the last phones after the last frame
-LAST_S = 0.5  # for the last results of a session that control has closed
+LAST_S = 0.5  # wait for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
 SILENT_S = 2.0  # without results for this time, a session may have moved or ended
 

@@ -23,7 +23,7 @@ RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to conn
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
 _REACH_S = 1.0  # limit for finding out why an address does not answer
-SUSPENDED_S = 0.5  # a wait that takes this much longer than requested: the process was suspended
+SUSPENDED_S = 0.5  # if a wait takes this much longer than requested, the process was stalled
 _MONITORED = zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CONNECT_RETRIED
 
 Connection = zmq.Socket[bytes]
@@ -64,7 +64,7 @@ def connect(raw: Connection, endpoint: str, key: Key | None) -> None:
 
 
 class Sockets:
-    """Opens sockets and passes on what they receive.
+    """Opens sockets and delivers the messages that they receive.
 
     Any thread may use ``call`` and, after ``close``, ``run_calls``. All other methods are for the
     thread that calls ``step``, and for the constructor's thread before that.
