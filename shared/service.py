@@ -124,7 +124,7 @@ class Service(MessageLoop):
     def control_handlers(self) -> dict[type[Message], Handler]:
         """Return the handlers of control's messages; subclasses add theirs."""
         return {
-            HeartbeatReply: self._on_heartbeat_reply,
+            HeartbeatReply: self.on_heartbeat_reply,
             Error: self.on_error,
         }
 
@@ -385,7 +385,8 @@ class Service(MessageLoop):
     def _log_ready(self) -> None:
         LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))
 
-    def _on_heartbeat_reply(self, reply: HeartbeatReply, _sender: Peer) -> None:
+    def on_heartbeat_reply(self, reply: HeartbeatReply, _sender: Peer) -> None:
+        """Measure the clock offset, and detect a restart of control."""
         self._last_reply_s = time.monotonic()
         self._replied_ns = reply.sent_ns
         self.clock_offset.update(reply.sent_ns, reply.received_ns, reply.replied_ns, now_ns())

@@ -196,6 +196,7 @@ class FakeControl:
             received_ns=beat.sent_ns,
             replied_ns=beat.sent_ns,
             control_instance=self.name,
+            missing=[kind for kind in ("recognizer", "synthesizer") if kind not in self.running],
         )
         self.commands.send(reply, to=sender)
         self.heartbeats.append(beat)

@@ -51,6 +51,17 @@ class Placement:
             workers[UNPACED_AUDIO] = workers["audio"]
         return workers
 
+    def missing_kinds(self) -> list[str]:
+        """Return the kinds of worker that every session needs and that do not run."""
+        missing = {
+            PROVIDERS[endpoint]
+            for endpoint in CLIENT_NEEDS
+            if not any(
+                record.state == "ready" for record in self._registry.providers(endpoint).values()
+            )
+        }
+        return sorted(missing)
+
     def _choose(
         self,
         endpoint: str,

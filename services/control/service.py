@@ -67,8 +67,8 @@ class ControlService(Service):
         super().__init__(config, extra_connections=config.max_sessions)
         now_s = time.monotonic()
         self._registry = ServiceRegistry(config.lost_after_s)
-        placement = Placement(self._registry, config.max_load)
-        self._sessions = SessionTable(self._registry, placement, config.max_sessions)
+        self._placement = Placement(self._registry, config.max_load)
+        self._sessions = SessionTable(self._registry, self._placement, config.max_sessions)
         self._status = StatusReporter(self._registry, self._sessions)
         self._process_id = secrets.token_hex(8)  # not the instance name, which may be a setting
         self._faults = FaultLog()
@@ -251,6 +251,7 @@ class ControlService(Service):
             replied_ns=now_ns(),
             control_instance=self._process_id,
             keys=self._requests.changed_keys(heartbeat),
+            missing=self._placement.missing_kinds(),
         )
         self._commands.send(reply, to=sender)
         if heartbeat.state == "draining" and heartbeat.role == "worker":

@@ -1,15 +1,14 @@
 """The gateway service: shows sessions in browsers, and streams microphones into sessions.
 
-Receives start-session, close-session, flush-session, set-face and status-report from control,
+Receives start-session, close-session, flush-session and set-face from control,
 fap-frame and end-of-faps from synthesizers, sound, phone and speech from recognizers, and the
-browsers' messages. Sends status-request and set-face to control, messages to browsers, and
+browsers' messages. Sends set-face to control, messages to browsers, and
 audio-chunk to recognizers, as any client does.
 """
 
 import asyncio
 import ipaddress
 import math
-import secrets
 import time
 from collections.abc import Coroutine
 from dataclasses import dataclass
@@ -42,13 +41,10 @@ from kouxing.shared.phones.syllable_captions import SyllableCaptions
 from kouxing.shared.session_follower import SessionFollower
 from kouxing.shared.session_service import SessionService
 from kouxing.shared.sockets import Socket
-from kouxing.shared.wire.control import SessionProgress, StartSession
+from kouxing.shared.wire.control import HeartbeatReply, SessionProgress, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Acoustic
 
-STATUS_INTERVAL_S = 1.0  # interval between status requests
-STATUS_TIMEOUT_S = 3.0  # the same without an answer, or without viewers
 MISSING_S = 3.0  # delay before a missing service is shown, because control may have restarted
 CONTROL_MISSING_S = 8.0  # delay before a missing control is shown; a restart is faster
 
@@ -122,9 +118,8 @@ class GatewayService(SessionService):
         self._closing: asyncio.Task[None] | None = None
         self._resting_face = RestingFace(config.idle_motion_seed)
         self._rest_due_s = 0.0
-        self._last_report_s = -math.inf
-        self._missing_since_s = math.inf  # time of the first report that lacks a service
-        self._last_request_s = 0.0
+        self._replied_s = -math.inf  # time of control's newest reply
+        self._missing_since_s = math.inf  # time of the first reply that lacks a service
 
     # --- the loop --------------------------------------------------------------------------------
 
@@ -226,10 +221,7 @@ class GatewayService(SessionService):
 
     def control_handlers(self) -> dict[type[Message], Handler]:
         """Return the handlers of control's messages."""
-        return super().control_handlers() | {
-            SetFace: self._on_set_face,
-            StatusReport: self._on_status,
-        }
+        return super().control_handlers() | {SetFace: self._on_set_face}
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
         """Change the face at rest, or notify viewers that a session's lip model has changed."""
@@ -248,7 +240,7 @@ class GatewayService(SessionService):
         return dict.fromkeys(self._sessions, SessionProgress())
 
     def on_tick(self, now_s: float) -> float:
-        """Follow sessions, move the face at rest, and request the status of the services."""
+        """Follow sessions, move the face at rest, and announce a missing control."""
         followers = [session.follower for session in self._sessions.values()]
         if not all(follower.is_following for follower in followers):
             needed = self._needed_sessions()
@@ -259,26 +251,20 @@ class GatewayService(SessionService):
         if now_s >= rest_due_s:
             self._rest_due_s = rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
             self._viewers.show_resting_face(self._resting_face, now_s)
-        is_answered = self._last_report_s >= self._last_request_s
-        interval_s = STATUS_INTERVAL_S if self._viewers.has_viewers else STATUS_TIMEOUT_S
-        due_s = self._last_request_s + (interval_s if is_answered else STATUS_TIMEOUT_S)
-        if now_s >= due_s:
-            self._last_request_s, due_s = now_s, now_s + STATUS_TIMEOUT_S
-            self.send_to_control(StatusRequest(request=secrets.token_hex(8)))
-        if now_s - self._last_report_s > CONTROL_MISSING_S:
+        missing_due_s = self._replied_s + CONTROL_MISSING_S
+        if now_s > missing_due_s:
             self._viewers.set_missing(("control",))
-        return min(due_s, rest_due_s)
+            missing_due_s = math.inf
+        return min(missing_due_s, rest_due_s)
 
-    def _on_status(self, report: StatusReport, _sender: Peer) -> None:
+    def on_heartbeat_reply(self, reply: HeartbeatReply, sender: Peer) -> None:
         """Announce missing services to the viewers."""
-        self._last_report_s = time.monotonic()
-        running = {state.service for state in report.services if state.state == "ready"}
-        required = ("recognizer", "synthesizer")
-        missing = tuple(service for service in required if service not in running)
-        since_s = min(self._missing_since_s, self._last_report_s) if missing else math.inf
+        super().on_heartbeat_reply(reply, sender)
+        self._replied_s = time.monotonic()
+        since_s = min(self._missing_since_s, self._replied_s) if reply.missing else math.inf
         self._missing_since_s = since_s
-        if not missing or self._last_report_s > since_s + MISSING_S:
-            self._viewers.set_missing(missing)
+        if not reply.missing or self._replied_s > since_s + MISSING_S:
+            self._viewers.set_missing(tuple(reply.missing))
 
     def _set_face(self, session: str, face: FaceSettings) -> None:
         self.send_to_control(SetFace(session=session, face=face))

@@ -159,11 +159,6 @@ class ViewerHandler:
         """The sessions that viewers see."""
         return (viewer.shown_session[0] for viewer in self._viewers if viewer.shown_session)
 
-    @property
-    def has_viewers(self) -> bool:
-        """Whether any browser is connected."""
-        return bool(self._viewers)
-
     # --- viewers -------------------------------------------------------------------------------
 
     async def serve(self, request: web.Request) -> web.StreamResponse:

@@ -131,3 +131,14 @@ def test_never_refuses_the_first_sessions_nor_one_that_moves(cluster: Cluster) -
     cluster.lose(record.workers["audio"])
     cluster.lose(record.workers["faps"])
     assert cluster.sessions.move(record, 5.0)
+
+
+def test_control_reports_which_kinds_of_worker_are_missing() -> None:
+    cluster = Cluster()
+    assert cluster.placement.missing_kinds() == []
+    cluster.add(worker("synthesizer", "synthesizer-1", "draining"))
+    assert cluster.placement.missing_kinds() == ["synthesizer"]
+    cluster.lose("recognizer-1")
+    assert cluster.placement.missing_kinds() == ["recognizer", "synthesizer"]
+    cluster.add(worker("synthesizer", "synthesizer-2"))
+    assert cluster.placement.missing_kinds() == ["recognizer"]
