@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.senders.live_link import ANGLES
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.fap_file import FapAnimation
+from kouxing.shared.face.fap_file import MAX_FRAMES, FapAnimation
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shape_names import find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS
@@ -30,7 +30,6 @@ from kouxing.shared.user_file import parse_json, read_file, split_lines
 
 TABLE_SUFFIXES = (".csv", ".jsonl")
 MAX_BYTES = 128 << 20  # about two hours
-MAX_FRAMES = 1_000_000
 _MAX_FAP = 1e6
 _MAX_WEIGHT = 10.0  # limit for the weight of a shape; percentages are larger
 _TIME_CODE = re.compile(r"(\d+):(\d+):(\d+)[:;](\d+(?:\.\d+)?)")  # ";" if frames are dropped

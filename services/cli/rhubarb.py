@@ -17,6 +17,7 @@ from rich.progress import Progress
 
 from kouxing.services.cli.animation import FaceMotion, animate
 from kouxing.services.cli.cue_files import format_cues
+from kouxing.services.cli.spoken_text import MAX_TEXT_BYTES
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
@@ -27,7 +28,6 @@ from kouxing.shared.user_file import read_text
 
 _BASIC_MOUTHS = {"G": "A", "H": "C", "X": "A"}  # shown instead of a mouth that is not drawn
 _PRESTON_BLAIR = dict(zip("ABCDEFGHX", "MBP etc E AI O U FV L rest".split(), strict=True))
-_MAX_TEXT_BYTES = 8 << 20
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -90,7 +90,7 @@ def _check_frame_rate(options: argparse.Namespace) -> None:
 
 def _animate(options: argparse.Namespace) -> FaceMotion:
     """Animate the recording; report messages about its text as Rhubarb reports warnings."""
-    text = "" if options.dialogFile is None else read_text(options.dialogFile, _MAX_TEXT_BYTES)
+    text = "" if options.dialogFile is None else read_text(options.dialogFile, MAX_TEXT_BYTES)
     language = find_language(options.language)
     messages = io.StringIO()
     with redirect_stderr(messages), Progress(disable=True) as progress:

@@ -12,7 +12,7 @@ from kouxing.shared.phones.transcript import Transcript
 from kouxing.shared.terminal import print_message
 from kouxing.shared.user_file import read_file
 
-_MAX_BYTES = 8 << 20
+MAX_TEXT_BYTES = 8 << 20
 _MAX_CHARACTERS = 150_000
 _MAX_DIGITS = 10_000  # converting numbers to words is slow
 _MAX_NAMED = 20  # words in a message
@@ -90,7 +90,7 @@ def read_spoken_text(text: str) -> str:
         given = SpokenText(text) if _is_unicode(text) else decode_text(os.fsencode(text))
         spoken, encoding = extract_text(given.text), given.form
     else:
-        content = read_file(path, _MAX_BYTES)
+        content = read_file(path, MAX_TEXT_BYTES)
         try:
             spoken, encoding = _extract_from(content, path.suffix.lower())
         except UserError as error:

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from typing import TypeAlias
 
 import numpy as np
+from kouxing_client.audio import MAX_KEPT
 from kouxing_client.messages import Message
 from numpy.typing import NDArray
 
@@ -30,7 +31,6 @@ WARM_UP_S = 2.8  # duration of the reprocessed audio; docs/recognition.md explai
 # Audio starts at a multiple of this time. Network blocks and encoder frames divide it, so they are
 # aligned as in an uninterrupted session.
 GRID_S = 0.16
-MAX_REPLAYED_MESSAGES = 5000  # limit of audio messages that a client keeps
 
 Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
 
@@ -42,7 +42,7 @@ class ReplayWindow:
         self.last_droppable_sequence = 0  # last message that a replacement can do without
         self._final = FinalTimeTracker()  # of the messages that the synthesizer has
         # (sequence, end) of each message
-        self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED_MESSAGES)
+        self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_KEPT)
 
     def add(self, sequence: int, end: int) -> None:
         """Add an audio message that ends at a media time in samples."""
