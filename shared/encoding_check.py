@@ -28,9 +28,9 @@ _MIN_WIDE_RMS, _MIN_WIDE_FLATNESS, _MAX_SOUND_FLATNESS = 0.3, 0.45, 0.3
 _MIN_NARROW_RMS, _MIN_NARROW_FLATNESS, _MAX_NARROW_CORRELATION = 0.4, 0.2, 0.9
 _MIN_DISTINCT = 60  # values of a block; clipped sound and square waves have fewer
 _MIN_GAIN = 4.0  # ratio of the two flatnesses
-_MIN_SOUND_CORRELATION, _MIN_READ_CORRELATION = 0.3, 0.4  # of neighbors in sound
+_MIN_SOUND_CORRELATION, _MIN_READ_CORRELATION = 0.3, 0.4  # between neighbors in sound
 _NUM_PACKETS = 10  # messages that start with the same 4 bits: packets of a codec
-_MAX_LOW_BYTE_SHARE = 0.3  # of the most frequent low byte; more in clipped and 8-bit sound
+_MAX_LOW_BYTE_SHARE = 0.3  # share of the most frequent low byte; larger in clipped and 8-bit sound
 
 
 def _decode_mulaw(data: NDArray[np.uint8]) -> Array:

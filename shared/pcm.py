@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 
-FULL_SCALE = 32768.0  # of 16-bit samples
+FULL_SCALE = 32768.0  # divides 16-bit samples, which are then in [-1, 1)
 
 
 def as_floats(samples: NDArray[Any]) -> NDArray[np.float32]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 BUDGET = 5000.0  # per connection
 BUDGET_PER_S = 500.0
-MIN_BUDGET = 100.0  # for a new connection: enough for a good client whose key is misused
+MIN_BUDGET = 100.0  # budget of a new connection: enough for a good client whose key is misused
 
 
 class PeerBudget:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 MAX_CONNECTIONS = 400  # limit for clients; libzmq takes up to 0.1 MB for each
 FILES_PER_CLIENT = 6  # one for the client, one for a service, and four in the tarpit
-RESERVED_FILES = 256  # for models, pages and outgoing connections
+RESERVED_FILES = 256  # files for models, pages and outgoing connections
 
 
 class PeerQuota:

@@ -65,12 +65,12 @@ class Socket:
     ) -> None:
         self.raw = raw
         self._key = key
-        self._zap = zap  # for a socket that is bound with a key
+        self._zap = zap  # set if the socket is bound with a key
         self._limited = limited  # if the socket is bound
         self._routes = routes
         self._publishes = publishes
         self._on_subscribe = on_subscribe
-        self._endpoint_name = endpoint_name  # of a publisher
+        self._endpoint_name = endpoint_name  # set for a publisher
         self._connection: PeerConnection | None = None  # connection of the last message
         self._sender = NO_PEER  # sender of the last message
         self._has_unread_parts = False  # unread parts of the last message remain

@@ -3,10 +3,10 @@
 import { checkOptions } from "./engine/options.js";
 import { FrameTrack } from "./frame-track.js";
 
-const SHOW_AFTER_S = 0.1; // from the sound to its face: the lips' delay, blocks, one frame, and the computation
+const SHOW_AFTER_S = 0.1; // time from the sound to its face: the lips' delay, blocks, one frame, and the computation
 const DEFAULT_SHAPES = ["arkit"];
 const OPTIONS = ["models", "phones", "context", "shapes", "expressiveness", "feeling", "delayMs"];
-const MAX_LATE_S = 0.5; // from the sound to its face
+const MAX_LATE_S = 0.5; // maximum time from the sound to its face
 const TELEPHONE_HZ = 8000;
 const MODELS = new URL("models/", import.meta.url);
 

@@ -4,7 +4,7 @@ import { LipEngine } from "./engine/engine.js";
 import { loadModel } from "./engine/model.js";
 
 let model = null; // a promise
-let engine = null; // of the newest session
+let engine = null; // the engine of the newest session
 let port = null; // port of the audio thread
 
 self.onmessage = async ({ data: { type, ...data } }) => {

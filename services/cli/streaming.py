@@ -19,7 +19,7 @@ from kouxing.shared.terminal import plural
 
 PUSH_TIMEOUT_S = 30.0
 STATUS_S = 1.0  # interval between status requests
-DRIVER_TIMEOUT_S = 20.0  # for a lost driver to restart, on a busy machine
+DRIVER_TIMEOUT_S = 20.0  # time for a lost driver to restart, on a busy machine
 PIPE_PAUSE_S = 0.2  # a pipe that is silent for longer has paused; its next audio is not late
 PIPE_TEMPO = 0.999  # a device with a fast clock would fill the pipe
 QUIET_PEAK = 1e-3  # a file whose peak is lower (-60 dBFS) is called silent

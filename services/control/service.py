@@ -339,7 +339,7 @@ class ControlService(Service):
         if record is None:
             self._recovery.record_speech(speech, instance)
             return
-        if not record.announced:  # of an earlier session with this name
+        if not record.announced:  # it is about an earlier session with this name
             return
         if (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
             return

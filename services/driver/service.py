@@ -35,7 +35,7 @@ from kouxing.shared.wire.session import ErrorCode
 
 LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
 MAX_DRAIN_S = 3.0  # time to draw the remaining images when the driver stops
-RETRY_AFTER_S = 5.0  # for a client whose session cannot be recorded now
+RETRY_AFTER_S = 5.0  # sent to a client whose session cannot be recorded now
 
 
 @dataclass(slots=True)

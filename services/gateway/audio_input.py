@@ -178,7 +178,7 @@ class RealTimeQueue:
             self._session.skip(self._gaps.popleft()[1])
 
     async def _wait_for_audio(self) -> None:
-        """Return once audio is queued. After a long pause, queue a piece of silence."""
+        """Return once audio is queued. After a long pause, queue a chunk of silence."""
         self._not_empty.clear()
         try:
             await asyncio.wait_for(self._not_empty.wait(), self._keep_alive_s)

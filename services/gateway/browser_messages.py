@@ -121,7 +121,7 @@ class ViewerCommand(Struct, frozen=True, kw_only=True):
     follow: SessionName | None = None  # session to show; empty: the newest
     play: Annotated[str, whole_text("(sample)")] | None = None
     avatar: list[list[Annotated[str, Meta(max_length=128)]]] | None = None  # shapes of each mesh
-    format: Annotated[str, whole_text(f"({'|'.join(FORMATS)})")] = FORMATS[0]  # of its weights
+    format: Annotated[str, whole_text(f"({'|'.join(FORMATS)})")] = FORMATS[0]  # the weights' format
     face: FaceSettings | None = None  # settings to change
     problem: str = ""  # error about unknown fields, which are ignored
 

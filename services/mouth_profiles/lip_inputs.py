@@ -25,7 +25,7 @@ class LipInputs:
     def __init__(self) -> None:
         self.starts: list[int] = []  # first encoder frame of each segment of speech
         self.known_s: list[float] = []  # media time up to which the audio is known
-        self.features: list[NDArray[np.float16]] = []  # of each encoder frame, (features,)
+        self.features: list[NDArray[np.float16]] = []  # (features,) of each encoder frame
 
     def process_position(
         self, known_s: float, frames: Floats, features: Floats

@@ -95,7 +95,7 @@ class LiveDecoder:
         self._start_frame = frame
         self._done = 0  # the decoder's frame up to which phones are final
         self._num_checked = 0  # frames that the output rule has processed
-        self._confidence = np.empty(0)  # of the settled frames from ``_done`` on
+        self._confidence = np.empty(0)  # confidence of the settled frames from ``_done`` on
         self._provisional = empty_scores(self._topology.num_states)  # scores of the last search
         self._settled.reset()
         self._decoder = self._settled

@@ -40,7 +40,7 @@ class ReplayWindow:
 
     def __init__(self) -> None:
         self.last_droppable_sequence = 0  # last message that a replacement can do without
-        self._final = FinalTimeTracker()  # of the messages that the synthesizer has
+        self._final = FinalTimeTracker()  # final time of the messages that the synthesizer has
         # (sequence, end) of each message
         self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_KEPT)
 

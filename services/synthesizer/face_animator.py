@@ -55,7 +55,7 @@ _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
 # Duration for which a resumed face is rehearsed. The first rehearsed frame receives all earlier
 # audio levels at once. Any brow or head motion they trigger must end before frames are shown.
 _REHEARSAL_S = 1.6
-_MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # for mouth FAPs, for other FAPs
+_MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # durations for mouth FAPs and for other FAPs
 _CLOSE_LIPS_AFTER_S = 0.04  # from this time of a transition, lips close fully for speech
 _VOICE_LEAD_S = 0.06  # feeling and laughter act this much earlier, if known
 _SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started

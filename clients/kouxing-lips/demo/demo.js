@@ -3,7 +3,7 @@
 import "kouxing-client/face.js";
 
 const HEADS = ["woman", "man", "ada", "leo", "mika", "rosa", "child", "elder"];
-const NUM_PHONES = 12; // on the page
+const NUM_PHONES = 12; // number of phones on the page
 const AVATAR = /\.(vrm|glb)$/i;
 const byId = (id) => document.getElementById(id);
 const [face, note, voice] = [byId("face"), byId("note"), byId("phones")];

@@ -12,11 +12,11 @@ export class BlockScorer {
   #sizes; // block, length, past: encoder frames
   #rings; // keys and values of each layer
   #table; // encodings of the positions
-  #frames; // from the next block's first on
+  #frames; // feature frames from the next block's first on
   #numFrames; // number of frames of the speech
   #numSettled;
   #settled; // scores not yet returned
-  #highestBand; // of the speech, for the floor
+  #highestBand; // highest band of the speech so far, which sets the floor
   #hasEnded;
   #row; // row of the table for the next block
   #numNeeded; // encoder frames that the next run needs

@@ -17,7 +17,7 @@ export class Decoder {
   #tokenOf; // by context
   #entry;
   #entryLink;
-  #probabilities; // of the states, by the scores of one frame
+  #probabilities; // probabilities of the states, from the scores of one frame
   #numPhones;
 
   constructor(lm, hmms, { constants }) {

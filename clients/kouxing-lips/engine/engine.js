@@ -22,7 +22,7 @@ export class LipEngine {
   #segmenter;
   #face;
   #slice; // samples of the next 20 ms
-  #numKnown = 0; // of these
+  #numKnown = 0; // number of these
   #numSamples = 0; // at 16 kHz
   #numIn = 0; // samples, at the rate of the input
   #rateHz;

@@ -8,7 +8,7 @@ const FORMAT = "kouxing-lips 4";
 const FINAL = "final"; // value of the option phones
 const FILES = ["encoder.onnx", "model.bin", "model.json"];
 const PHONES_FILE = "phones.bin";
-const BLOCKS_FILE = "blocks.onnx"; // for final phones
+const BLOCKS_FILE = "blocks.onnx"; // finds final phones
 const ARRAYS = {
   float16: Uint16Array,
   float32: Float32Array,

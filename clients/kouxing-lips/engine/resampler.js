@@ -6,7 +6,7 @@ import { ProductMemory, alignedBytes } from "./products.js";
 const LANES = 4; // taps that a product processes together
 const PIECE_S = 0.1; // longer audio is processed in pieces
 const MIN_RATE_HZ = 8_000;
-const MAX_RATE_HZ = 192_000; // of browsers; the server accepts up to 48 kHz
+const MAX_RATE_HZ = 192_000; // limit of browsers; the server accepts up to 48 kHz
 
 /** Streaming: any chunking gives the same samples. */
 export class Resampler {

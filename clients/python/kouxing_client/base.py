@@ -63,7 +63,7 @@ class BaseClient:
             key = read_key(key)
         key = None if insecure else key or find_key()
         self._thread = ClientThread(control, key, timeout_s, start_s)
-        self._unused: set[Future[None]] = set()  # of cancelled openings whose session may open
+        self._unused: set[Future[None]] = set()  # cancelled openings, whose session may still open
 
     @property
     def is_closed(self) -> bool:

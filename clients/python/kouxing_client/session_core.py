@@ -103,7 +103,7 @@ class Subscription:
         """Stop; ``failure`` is the reason why the session has ended early."""
         try:
             self.follower.drain()
-        except Exception as error:  # of ``on_result``; other subscriptions must also end
+        except Exception as error:  # raised by ``on_result``; other subscriptions must also end
             failure = KouxingError(f"on_result failed: {error!r}")
             failure.__cause__ = error
             self.inbox.end(failure)  # even if the last frame has arrived

@@ -22,7 +22,7 @@ Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB of cente
 
 BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))
 _MIN_ASPECT = 0.7  # narrower pictures show more above and below so that the face still fits
-_TEETH_DEPTH = 500.0  # from the lips at rest back to the teeth, FAP units (MNS / 1024)
+_TEETH_DEPTH = 500.0  # from the lips at rest to the teeth, FAP units (MNS / 1024)
 _LIGHT_SPREAD = 0.25
 _LIGHT_FLOOR = 0.08
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"

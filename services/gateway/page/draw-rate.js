@@ -23,7 +23,7 @@ const FAST_MS = 16; // images that take less time get more pixels
 /** Decides when to draw and with how many pixels. Time is injected. */
 export class DrawRate {
   imageMs = 0; // duration of drawing, mean since the ratio changed
-  visibleDelayMs = 0; // from a face to the middle of the time for which it is visible, median
+  visibleDelayMs = 0; // median time from a face to the middle of the time for which it is visible
   #pauses;
   #maxRatio;
   #startMs = -Infinity; // start of the last image
@@ -32,8 +32,8 @@ export class DrawRate {
   #fastestMs = 0; // fastest image since the ratio changed
   #visibleMs = -Infinity; // when the last image became visible
   #minPeriodMs = 0; // minimum time between two images, chosen by the user
-  #shownMs = 0; // for how long an image is visible
-  #delays = new SlidingWindow(WINDOW_MS); // until images were visible, ms
+  #shownMs = 0; // time for which an image is visible
+  #delays = new SlidingWindow(WINDOW_MS); // delays until images were visible, ms
 
   /**
    * @param ratio pixels drawn per pixel of the page, at first

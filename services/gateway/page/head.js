@@ -28,11 +28,11 @@ export class Head {
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
   #controls;
-  #model = null; // in the scene
+  #model = null; // the model in the scene
   #meshes = []; // moved by FAPs
-  #mouthMaterials = []; // of teeth and tongue
+  #mouthMaterials = []; // materials of teeth and tongue
   #joints = [];
-  #faps = null; // for the next image
+  #faps = null; // the face of the next image
   #front = new THREE.Vector3(); // initial position of the camera
   #fovYDegrees = 22;
   #needsDrawing = true;
@@ -40,7 +40,7 @@ export class Head {
   #drawRate;
   #images;
   #isFilmed = false;
-  #size = [0, 0]; // on the page, pixels
+  #size = [0, 0]; // size on the page, pixels
 
   /** @param canvas to draw on; @param overlays { controls, panel } that may cover its lower part */
   constructor(canvas, overlays) {

@@ -23,7 +23,7 @@ export class Lateness {
   #newest = -1; // media time, samples
   #differences = new SlidingWindow(WINDOW_MS); // arrival - media time, ms
   #recent = new SlidingWindow(RECENT_MS); // lateness, ms
-  #imageDelays = new SlidingWindow(IMAGES_MS); // until images are visible, ms
+  #imageDelays = new SlidingWindow(IMAGES_MS); // delays until images are visible, ms
   #confirmedMs = null; // when isBehind was last correct
 
   /**

@@ -10,7 +10,7 @@ import { UserError, translate, translateResponse } from "./language.js";
 import { curvePath, extent, correlationRows, verdict } from "./lip-curves.js";
 import { READING_TEXTS } from "./texts.js";
 
-const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
+const CLOSED_LIPS_MS = 3000; // time before reading in which the face at rest is recorded
 const SLOW_MS = 100; // a tracker that needs longer for an image runs only after the reading
 const MIN_SLOW = 2; // consecutive slow images; the first image is slow on any computer
 const SLOW_IMAGE = { everyMs: 110, widthPx: 320 }; // images that wait until the reading is over
@@ -30,7 +30,7 @@ export class LearnMouthDialog {
   readingS = 40;
   #profiles;
   #handlers;
-  #abort = new AbortController(); // for the current step
+  #abort = new AbortController(); // ends the current step
   #finish = () => {}; // ends the reading
   #numSlow = 0; // consecutive images that took the tracker long
   #recording = null; // landmark file that is not yet learned from

@@ -6,7 +6,7 @@ import * as THREE from "three";
 const EYES = ["eye_left", "eye_right"];
 const HAIR = "hair";
 const HAIR_CUTOFF = 0.3; // texels with less alpha are not drawn, as in the driver
-const DEFAULT_SHADING = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // for files without these values
+const DEFAULT_SHADING = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // used for files without these values
 const LIGHT = await (await fetch("light.glsl")).text(); // shared with the driver
 
 const PLAIN_VERTEX = `

@@ -1,6 +1,6 @@
 // Light on teeth and tongue, computed as in services/driver/render/renderer.py.
 
-const DEPTH = 500; // from the lips at rest back to the teeth, FAP units (MNS / 1024)
+const DEPTH = 500; // distance from the lips at rest to the teeth, FAP units (MNS / 1024)
 const SPREAD = 0.25;
 const MIN_LIGHT = 0.08;
 

@@ -53,8 +53,8 @@ class Streak {
  */
 export class Playout {
   isAudible = true;
-  outputLatencyMs = 0; // from the audio thread to the loudspeaker; sound is played earlier by this
-  imageDelayMs = 0; // from computing a face until its image is visible; it is drawn earlier by this
+  outputLatencyMs = 0; // time from the audio thread to the loudspeaker; sound is played earlier by this
+  imageDelayMs = 0; // time from computing a face until its image is visible; it is drawn earlier by this
   offsetMs = null; // read only
   #startMs = 0; // when the first offset was set
   #targetMs = null; // target of the offset

@@ -11,7 +11,7 @@ export class SpeechControls {
   session = null;
   #sound;
   #handlers;
-  #wasSoundWanted = false; // before the microphone or Learn my mouth muted the sound
+  #wasSoundWanted = false; // whether sound was on before the microphone or Learn my mouth muted it
 
   /**
    * @param {Sound} sound the session's sound

@@ -27,7 +27,7 @@ function save(video) {
 }
 
 export class Stage {
-  #head = null; // until it is loaded
+  #head = null; // null until it is loaded
   #loading = Promise.resolve(); // done when the head that was chosen last is loaded
   #faps;
   #handlers;

@@ -72,11 +72,11 @@ FORMAT = "blocks 2"
 
 Float16 = NDArray[np.float16]
 
-_INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # before the caches
+_INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # without the caches
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
 # Constants of the file that become inputs: the number of kept encoder frames, and the last of them.
 _NUM_KEPT, _LAST_KEPT = "block", "last_of_block"
-EXTENSION_PREFIX = "universal_"  # before the names of a second readout's input and outputs
+EXTENSION_PREFIX = "universal_"  # starts the names of a second readout's input and outputs
 _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # feature frames after an encoder frame's first one on which it depends
 _MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
@@ -234,7 +234,7 @@ class BlockStream(AcousticStream):
         self._num_frames = 0  # number of frames in the segment
         self._num_settled = 0
         self._loudest = np.float32(-np.inf)  # band of the segment
-        self._frames = np.zeros((_PADDING, NUM_MELS), np.float32)  # from the next block's first on
+        self._frames = np.zeros((_PADDING, NUM_MELS), np.float32)  # starts with the next block
         self._ended = False
         self._start_table()
 

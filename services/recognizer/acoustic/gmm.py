@@ -51,7 +51,7 @@ FORMAT = "gmm 3"
 _MAX_MIXTURES = 1024
 _MAX_HALF_WIDTH = 4  # limit for the half width of the deltas, feature frames
 
-_MIN_LOG_WEIGHT = -1e30  # for an absent component: finite, so that no NaN arises
+_MIN_LOG_WEIGHT = -1e30  # log weight of an absent component; finite, so that no NaN arises
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +97,7 @@ class GmmModel(AcousticModel):
     mixtures: GaussianMixtures
     rotation: Floats  # (39, 39)
     prior_mean: Floats  # (13,) cepstral mean of the training corpus
-    half_width: int  # of the deltas, frames
+    half_width: int  # half of the window of the deltas, frames
     acoustic_scale: float = 1.0  # weight of the log scores: neighboring frames are correlated
 
     @cached_property
