@@ -31,7 +31,7 @@ from tests.system import LIMIT_S, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
 TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls it
-FACTS = SessionFacts(language="mandarin", frame_rate_hz=50.0)
+FACTS = SessionFacts(language="mandarin", frame_rate_hz=50.0, expressiveness=1.0)
 EPOCH = 1
 MessageType = TypeVar("MessageType", bound=Message)
 

@@ -10,6 +10,9 @@ export interface SessionMessage {
   chosen: string;
   epoch: number;
   lip_model: string;
+  /** settings of its face when it started or moved; null: unknown */
+  expressiveness: number | null;
+  feeling: number | null;
   /** code of the language of the phones, such as "zh"; "": unknown */
   language: string;
   acoustic: string;

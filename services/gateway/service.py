@@ -305,9 +305,10 @@ class GatewayService(SessionService):
     def _announce(self, session: _FollowedSession, epoch: int) -> None:
         """Announce a session to its viewers, or its new epoch."""
         start = session.follower.session_start
-        lip_model = start.opening.face.lip_model or ""
-        language = session.syllables.inventory.code
-        self._viewers.add_session(start.session, epoch, lip_model, language)
+        facts, language = start.facts, session.syllables.inventory.code
+        default = FaceSettings(expressiveness=facts.expressiveness, feeling=facts.feeling)
+        face = default.merged_with(start.opening.face)
+        self._viewers.add_session(start.session, epoch, face, language)
 
     def _on_frame(self, frame: FapFrame) -> None:
         now_s, values = time.monotonic(), frame.packed_values

@@ -22,6 +22,7 @@ from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
+from kouxing.shared.fast_record import replace
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.name_rules import NAME_RULE, is_name
 from kouxing.shared.wire.face import FaceSettings
@@ -36,7 +37,7 @@ PAUSE_S = 0.2  # after this time without a frame, a viewer receives the face at 
 @dataclass(slots=True)
 class _ShownSession:
     epoch: int
-    lip_model: str  # its name; empty: unknown
+    face: FaceSettings
     language: str  # its code; empty: unknown
     acoustic: str = AcousticModelName.FULL
 
@@ -83,15 +84,16 @@ class ViewerHandler:
 
     # --- sessions ------------------------------------------------------------------------------
 
-    def add_session(self, session: str, epoch: int, lip_model: str, language: str) -> None:
+    def add_session(self, session: str, epoch: int, face: FaceSettings, language: str) -> None:
         """Announce a session to its viewers, or its new epoch."""
-        self._sessions[session] = _ShownSession(epoch, lip_model, language)
+        self._sessions[session] = _ShownSession(epoch, face, language)
         self._notify_viewers()
 
     def set_lip_model(self, session: str, lip_model: str) -> None:
         """Announce that the lip model of a session has changed."""
         if session in self._sessions:
-            self._sessions[session].lip_model = lip_model
+            shown_session = self._sessions[session]
+            shown_session.face = replace(shown_session.face, lip_model=lip_model)
             self.forward(
                 session, MessageKind.TEXT, browser_messages.text("face", lip_model=lip_model)
             )
@@ -258,12 +260,15 @@ class ViewerHandler:
         announced = shown_session or viewer.chosen_session
         if announced != viewer.announced:
             viewer.announced = announced
+            face = session.face if session else FaceSettings()
             message = browser_messages.text(
                 "session",
                 session=name if session else None,
                 chosen=viewer.chosen_session,
                 epoch=session.epoch if session else 0,
-                lip_model=session.lip_model if session else "",
+                lip_model=face.lip_model or "",
+                expressiveness=face.expressiveness,
+                feeling=face.feeling,
                 language=session.language if session else "",
                 acoustic=session.acoustic if session else "",
                 sample=session is not None

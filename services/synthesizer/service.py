@@ -74,7 +74,11 @@ class SynthesizerService(SessionService):
         self._config = config
         self.frame_rate_hz = config.frame_rate_hz
         self.facts = SessionFacts(
-            frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lip_model=config.lips
+            frame_rate_hz=config.frame_rate_hz,
+            delay_ms=config.delay_ms,
+            lip_model=config.lips,
+            expressiveness=config.expressiveness,
+            feeling=config.feeling,
         )
         self.lip_models = lip_model_names()
         self._face_maker = FaceMaker(config, self._report_bad_face)

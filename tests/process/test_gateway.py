@@ -91,7 +91,8 @@ async def test_viewers_receive_their_session(control: FakeControl, gateway: Gate
         control.start("one")
         publish_all(control, "one")
         shown = {"session": "one", "lip_model": "dynamic-visemes", "language": "zh"}
-        await receive_json(newest, "session", **shown, sample=False)
+        size = {"expressiveness": 1.0, "feeling": None}
+        await receive_json(newest, "session", **shown, **size, sample=False)
         messages = [await receive_session_message(newest) for _ in range(5)]
         binary = {m.data[0]: m.data for m in messages if m.type is aiohttp.WSMsgType.BINARY}
         texts = [json.loads(m.data) for m in messages if m.type is aiohttp.WSMsgType.TEXT]

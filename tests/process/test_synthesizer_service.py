@@ -65,6 +65,10 @@ def service() -> Iterator[RecordingSynthesizer]:
     service.bus.close()
 
 
+def test_states_the_settings_of_faces_that_have_none(service: RecordingSynthesizer) -> None:
+    assert (service.facts.expressiveness, service.facts.feeling) == (1.4, 0.5)
+
+
 def record_events(
     service: RecordingSynthesizer, monkeypatch: pytest.MonkeyPatch
 ) -> list[tuple[str, ...]]:

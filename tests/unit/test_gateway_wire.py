@@ -224,9 +224,9 @@ def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
     with viewers.connect_viewer("talk", None) as viewer:
         (message,) = texts(viewer)
         assert (message["session"], message["chosen"]) == (None, "talk")
-        viewers.add_session("other", 1, "learned", "zh")
+        viewers.add_session("other", 1, FaceSettings(), "zh")
         assert texts(viewer) == []
-        viewers.add_session("talk", 1, "learned", "zh")
+        viewers.add_session("talk", 1, FaceSettings(), "zh")
         assert [message["session"] for message in texts(viewer)] == ["talk"]
         viewers.remove_session("talk")
         assert [message["session"] for message in texts(viewer)] == [None]
@@ -258,7 +258,7 @@ def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
     viewers = make_viewers()
     face = RestingFace(seed=0)
     frame = np.zeros(68, "<f4").tobytes()
-    viewers.add_session("talk", 1, "learned", "zh")
+    viewers.add_session("talk", 1, FaceSettings(), "zh")
     with viewers.connect_viewer("", None) as viewer:
         viewers.show_frame("talk", 1, 0, frame, now_s=0.0)
         assert viewers.rest_due_s < 0

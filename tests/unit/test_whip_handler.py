@@ -15,6 +15,7 @@ from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.services.gateway.whip_handler import MAX_COMMANDS, WhipHandler, _Client
 from kouxing.shared.metrics import Metrics
+from kouxing.shared.wire.face import FaceSettings
 from tests.fake_time import run
 
 UNUSED = cast("Any", None)
@@ -83,7 +84,7 @@ def test_the_session_can_end_before_the_connection(
     handler: WhipHandler, viewers: ViewerHandler
 ) -> None:
     async def stream() -> None:
-        viewers.add_session("s", 1, "", "zh")
+        viewers.add_session("s", 1, FaceSettings(), "zh")
         session = cast("Any", FakeSession(Refused("unknown-session", "it has ended")))
         client = _Client(None, session=session)
         with viewers.connect_viewer("s", None) as viewer:

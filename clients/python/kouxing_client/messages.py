@@ -238,6 +238,10 @@ class SessionFacts(msgspec.Struct, frozen=True, kw_only=True):
     """from audio to its FAP frame"""
     lip_model: Name | None = None
     """lip model of a face whose settings name none"""
+    expressiveness: Annotated[float, msgspec.Meta(ge=0.5, le=2)] | None = None
+    """size of the mouth movements of a face whose settings have none"""
+    feeling: Probability | None = None
+    """strength of the feeling from the voice, of a face whose settings have none"""
 
 
 class Lateness(msgspec.Struct, frozen=True, kw_only=True):

@@ -121,6 +121,7 @@ function showSession(message) {
     // A session that has ended stays visible and audible to its end.
     player.reset(isOther);
     caption.reset(message.language);
+    settings.showSizes(message);
     meter.reset();
   }
   if (isOwnSession()) sendFaceSettings();

@@ -47,6 +47,15 @@ export class Settings {
     element("lips").value = name;
   }
 
+  /** Show the sizes of a session's face, by the ids of the sliders, unless the user has chosen others. */
+  showSizes(sizes) {
+    for (const id of SLIDERS) {
+      if (sizes[id] === null || this.#preferences.get(id) !== null) continue;
+      element(id).value = sizes[id];
+      showAmount(id);
+    }
+  }
+
   /** Connect an input with its preference. A stored value that is no longer offered is ignored. */
   #bind(id, onChange) {
     const input = element(id);
