@@ -169,10 +169,10 @@ class Service(MessageLoop):
     def startup(self) -> None:
         """Register with control. Raises ``UserError`` if the metrics' port cannot be bound."""
         self.on_startup()
+        self._heartbeat_due_s = time.monotonic()  # the startup may have taken long
         if self.config.metrics:
             from kouxing.shared.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used
 
-            self._heartbeat_due_s = time.monotonic()
             host, port = split_endpoint(f"tcp://{self.config.metrics}", "metrics")
             self._metrics_server = MetricsServer(
                 host.strip("[]"), int(port), self.metrics, self.name, is_alive=self.check_health

@@ -81,23 +81,17 @@ class Placement:
         for instance in sorted(placed):
             if instance in names:
                 return instance
-        kind = PROVIDERS.get(endpoint)
-        if not names and providers and language is not None:
-            text = f"no {kind} has the language {language}; choose another one"
-            raise Rejected(ErrorCode.BAD_LANGUAGE, text)
         if not names:
-            missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
-            start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
-            text = f"{missing}; {start} (or everything with 'kouxing run')"
-            raise Rejected(ErrorCode.NO_SERVICE, text)
+            raise _no_worker(endpoint, language if providers else None)
         best = min(names, key=lambda name: self._rank(name, now_s))
         load = self._registry.load(best)
         if not load.has_room(min_room, now_s, self._max_load):
-            needed = 100 * min_room * load.cost
+            kind = PROVIDERS.get(endpoint, f"provider of {endpoint}")
+            required = 100 * min_room * load.cost
             left = 100 * max(0.0, self._max_load - load.expected(now_s))
             text = (
-                f"every {kind or f'provider of {endpoint}'} is busy: {needed:.0f} % of its time "
-                f"must be free, but only {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
+                f"every {kind} is busy: {required:.0f} % of its time must be free, "
+                f"but only {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
             )
             raise Rejected(ErrorCode.BUSY, text, RETRY_AFTER_S)
         return best
@@ -105,6 +99,18 @@ class Placement:
     def _rank(self, instance: str, now_s: float) -> tuple[int, int, str]:
         load = self._registry.load(instance)
         return round(load.expected(now_s) / EQUAL_LOAD), load.num_sessions, instance
+
+
+def _no_worker(endpoint: str, language: str | None) -> Rejected:
+    """Return the rejection if no worker with a language provides an endpoint; None: any."""
+    kind = PROVIDERS.get(endpoint)
+    if language is not None:
+        text = f"no {kind} has the language {language}; choose another one"
+        return Rejected(ErrorCode.BAD_LANGUAGE, text)
+    missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
+    start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
+    text = f"{missing}; {start} (or everything with 'kouxing run')"
+    return Rejected(ErrorCode.NO_SERVICE, text)
 
 
 def _can_serve(record: ServiceRecord, language: str | None) -> bool:

@@ -33,15 +33,18 @@ Request: TypeAlias = OpenSession | CloseSession | FlushSession | SetFace | Statu
 class RequestHandler:
     """Handles requests on control's socket.
 
-    While ``defers`` is set, requests that fail with a temporary error wait for ``retry_deferred``.
+    While ``defers`` returns True, requests that fail with a temporary error wait for
+    ``retry_deferred``.
     """
 
-    def __init__(self, bus: Bus, commands: Socket, metrics: Metrics) -> None:
-        self.defers = False
+    def __init__(
+        self, bus: Bus, commands: Socket, metrics: Metrics, defers: Callable[[], bool]
+    ) -> None:
         self.key_versions: dict[str, tuple[int, int]] = {}  # by instance of the worker
         self._bus = bus
         self._commands = commands
         self._metrics = metrics
+        self._defers = defers
         self._answers: OrderedDict[tuple[Peer, int, str], Message] = OrderedDict()
         self._deferred: list[tuple[Handler, Request, Peer]] = []
 
@@ -136,7 +139,7 @@ class RequestHandler:
 
     def _can_defer(self, rejection: Rejected) -> bool:
         return (
-            self.defers
+            self._defers()
             and rejection.code in TEMPORARY_ERRORS
             and len(self._deferred) < MAX_DEFERRED
         )

@@ -21,6 +21,7 @@ from kouxing.services.control.request_handler import RequestHandler
 from kouxing.services.control.restart_recovery import RestartRecovery
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_lifecycle import SessionLifecycle
+from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
 from kouxing.services.control.status_reporter import StatusReporter
 from kouxing.services.service_kinds import KINDS
@@ -85,8 +86,9 @@ class ControlService(Service):
             name: with_key(config.advertised_endpoint(socket.endpoint), public)
             for name, socket in (("commands", self._commands), ("events", self._events))
         }
-        requests = self._requests = RequestHandler(self.bus, self._commands, self.metrics)
-        requests.defers = True
+        requests = self._requests = RequestHandler(
+            self.bus, self._commands, self.metrics, defers=lambda: self._recovery.is_active
+        )
         self._lifecycle = SessionLifecycle(
             self._registry,
             self._sessions,
@@ -131,7 +133,7 @@ class ControlService(Service):
                 self._keys_version = self.bus.zap.version
                 self._lifecycle.end_revoked()
         if self._recovery.is_active and now_s > self._recovery.end_s:
-            self._recovery.is_active = self._requests.defers = False
+            self._recovery.is_active = False
             self._restore_sessions()
         for connection in self._commands.ended():
             if instance := self._registry.instance_by_connection(connection):
@@ -196,11 +198,12 @@ class ControlService(Service):
         return _done(message)
 
     def _report_status(self, message: StatusRequest, sender: Peer) -> Message:
-        shows_token = self._requests.may_see_token(sender)
         now_s = time.monotonic()
-        resting_face = self._resting_face.at(now_s)
         return self._status.report(
-            message, now_s, resting_face=resting_face, shows_token=shows_token
+            message,
+            now_s,
+            resting_face=self._resting_face.at(now_s),
+            shows_token=self._requests.may_see_token(sender),
         )
 
     # --- messages of services ---
@@ -283,13 +286,7 @@ class ControlService(Service):
                 self._lifecycle.move(record)
         if heartbeat.role == "observer":
             missed_start = [
-                record
-                for record in self._sessions
-                if record.name not in heartbeat.sessions
-                # it missed a move, or has another session with this name, whose end it missed
-                or not (
-                    record.epoch == record.restored_epoch or heartbeat.instance in record.started
-                )
+                record for record in self._sessions if not _has_started(record, heartbeat)
             ]
         for record in missed_start:
             self._commands.send(record.start_message(time.monotonic()), to=sender)
@@ -385,6 +382,15 @@ class ControlService(Service):
                 self._lifecycle.move(record)
         self._lifecycle.end_revoked()
         self._requests.retry_deferred()
+
+
+def _has_started(record: SessionRecord, observer: Heartbeat) -> bool:
+    """Return whether an observer takes part in the current epoch of a session.
+
+    It may have missed a move, or have another session with this name, whose end it missed.
+    """
+    is_current = record.epoch == record.restored_epoch or observer.instance in record.started
+    return is_current and record.name in observer.sessions
 
 
 def _done(message: CloseSession | FlushSession | SetFace) -> Done | None:

@@ -62,7 +62,7 @@ def test_reports_one_session_and_its_services(harness: ControlHarness, client: S
     assert isinstance(report, StatusReport)
     assert [state.session for state in report.sessions] == ["s1"]
     assert {state.instance for state in report.services} == {"recognizer", "synthesizer"}
-    harness.control._requests.defers = False
+    harness.control._recovery.is_active = False
     assert getattr(ask(harness, client, session="none"), "code", "") == "unknown-session"
 
 
