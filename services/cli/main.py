@@ -17,6 +17,7 @@ from typer.core import TyperGroup, TyperOption
 from kouxing.services.cli import clients, cluster, configuration, offline, run
 from kouxing.services.cli.export import app as export_app
 from kouxing.services.cli.heads import app as head_app
+from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.options import Assignments, ConfigFile, Panel
 from kouxing.services.service_kinds import KINDS
@@ -124,6 +125,8 @@ def _service_command(kind: ServiceKind) -> Callable[..., None]:
     def command(config: ConfigFile = None, assignments: Assignments = None) -> None:
         from kouxing.services.process import serve
 
+        if kind.name == "gateway":
+            ensure_page_heads()
         sys.exit(serve(kind.name, config, assignments or []))
 
     return command

@@ -97,7 +97,10 @@ def start(
     containers: Containers, host: str, service: str, keys: Path, *arguments: str
 ) -> subprocess.Popen[bytes]:
     description = COMPOSE["services"][service]
-    environment = description["environment"]
+    # A variable without a value is that of the shell, if it is set.
+    environment = {
+        name: value for name, value in description["environment"].items() if value is not None
+    }
     if service == "control":
         (volume,) = description["volumes"]
         assert (volume["source"], volume["read_only"]) == ("./deploy/keys/kouxing", True)
@@ -164,6 +167,18 @@ def test_every_container_is_isolated() -> None:
         assert (service.get("user") == "root") == (name == "keys"), name
     dockerfile = (ROOT / "deploy" / "Dockerfile").read_text("utf-8")
     assert f"\nUSER {USER_ID}:{USER_ID}\n" in dockerfile
+
+
+def test_the_shell_can_set_the_token_of_the_page() -> None:
+    gateway = COMPOSE["services"]["gateway"]["environment"]
+    assert gateway["KOUXING_GATEWAY_TOKEN"] is None
+
+
+def test_the_image_builds_the_files_of_the_page_itself() -> None:
+    lines = (ROOT / ".gitignore").read_text("utf-8").splitlines()
+    generated = {line.rstrip("/") for line in lines if line.startswith("services/")}
+    assert generated
+    assert generated <= set((ROOT / ".dockerignore").read_text("utf-8").splitlines())
 
 
 def test_the_image_has_all_packages() -> None:

@@ -127,3 +127,14 @@ def test_help_shows_no_python_types() -> None:
     assert "programs: NUMBER" in shown
     types = ("bool", "int", "float", "str", "path", "list")
     assert not [text for text in shown if text.partition("<")[2].startswith(types)]
+
+
+@pytest.mark.parametrize("service", ["gateway", "driver"])
+def test_only_a_gateway_creates_the_heads_of_the_page_before_it_starts(
+    monkeypatch: pytest.MonkeyPatch, service: str
+) -> None:
+    steps: list[str] = []
+    monkeypatch.setattr(command_line, "ensure_page_heads", lambda: steps.append("heads"))
+    monkeypatch.setattr("kouxing.services.process.serve", lambda *_: steps.append("serve"))
+    assert CliRunner().invoke(command_line.app, [service]).exit_code == 0
+    assert steps == (["heads", "serve"] if service == "gateway" else ["serve"])
