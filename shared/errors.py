@@ -3,8 +3,6 @@
 import importlib.util
 import sys
 
-from kouxing_client.field_types import MAX_TEXT
-
 USER_ERROR = 2  # exit status of a program after a ``UserError``
 
 
@@ -30,6 +28,8 @@ class Rejected(Exception):
     """
 
     def __init__(self, code: str, text: str, retry_after_s: float | None = None) -> None:
+        from kouxing_client.field_types import MAX_TEXT  # noqa: PLC0415 - loads ZeroMQ
+
         super().__init__(text)
         self.code = code
         self.text = text[:MAX_TEXT]
