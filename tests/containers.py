@@ -6,12 +6,15 @@ environment, secrets and hosts of its description. Its user may only read this m
 
 import contextlib
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba.core.caching import UserProvidedCacheLocator
 
 from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.shared.errors import UserError
@@ -23,10 +26,14 @@ BECOME_USER = f"""
 exec setpriv --reuid={USER_ID} --regid={USER_ID} --clear-groups --no-new-privs \
     --bounding-set=-all,{READ_CAP} --inh-caps=-all,{READ_CAP} --ambient-caps=-all,{READ_CAP} "$@"
 """
-# Arguments: folder of secrets, file of hosts, where the folder is mounted if it is, the command.
+# Arguments: folder of numba's cache, folder of secrets, file of hosts, where the second folder is
+# mounted if it is, the command.
 ENTER_CONTAINER = f"""
 mount --make-rprivate /
 mount -t tmpfs tmpfs /run
+mkdir /run/numba
+mount --bind "$1" /run/numba
+shift
 cp "$2" /run/hosts
 if test "$3"; then
     mkdir "$3"
@@ -41,6 +48,8 @@ fi
 shift 3
 mount --bind /run/hosts /etc/hosts
 mount -t tmpfs -o noexec,nosuid,nodev tmpfs /tmp
+cp -rT /run/numba "$NUMBA_CACHE_DIR"
+chown -R {USER_ID} "$NUMBA_CACHE_DIR"
 findmnt --raw --noheadings --output TARGET | grep -vE '^/(tmp|run|proc|sys|dev)(/|$)' |
     while read -r target; do mount -o remount,bind,ro "$target"; done
 mount -o remount,bind,ro /run
@@ -66,6 +75,16 @@ def image_environment() -> dict[str, str]:
     return {name: value for name, value in variables.items() if name != "PATH"}
 
 
+def write_numba_cache(folder: Path) -> None:
+    """Copy the compiled functions of this checkout, as the image does: compiling takes long."""
+    locator: Any = UserProvidedCacheLocator  # numba has no types
+    for path in (ROOT / "services" / "recognizer").glob("*/__pycache__/*.nb[ic]"):
+        module = ROOT / "kouxing" / path.relative_to(ROOT).parents[1] / "any.py"
+        target = folder / locator.get_suitable_cache_subpath(str(module))
+        target.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, target)
+
+
 class Containers:
     """Containers by name, on one network.
 
@@ -80,6 +99,8 @@ class Containers:
     def __init__(self, folder: Path, network: Network, names: Mapping[str, str]) -> None:
         self._folder = folder
         self._network = network
+        self._numba = folder / "numba"
+        write_numba_cache(self._numba)
         self._hosts = folder / "hosts"
         self._hosts.write_text(
             "127.0.0.1 localhost\n"
@@ -105,7 +126,7 @@ class Containers:
             (folder / name).write_bytes(path.read_bytes())
         program = [sys.executable, "-m", "kouxing", *arguments]
         enter = ["unshare", "--mount", "sh", "-ec", ENTER_CONTAINER]
-        enter += ["sh", str(folder), str(self._hosts), target]
+        enter += ["sh", str(self._numba), str(folder), str(self._hosts), target]
         own = {
             "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
             "PYTHONPATH": CODE_PATH,
