@@ -10,13 +10,20 @@ from ray.cluster_utils import Cluster
 from tests.e2e.streaming import stream_audio
 from tests.system import VOWELS_FILE, System, kouxing, samples_of_file
 
-HEAD = {"num_cpus": 0, "object_store_memory": 80 << 20, "include_dashboard": False}
-NODE = HEAD | {"num_cpus": 2}
+NODE = {"num_cpus": 2, "object_store_memory": 80 << 20}
+# without the processes that this test does not need
+HEAD = NODE | {
+    "num_cpus": 0,
+    "include_dashboard": False,
+    "include_log_monitor": False,
+    "no_monitor": True,
+}
 
 
 @pytest.fixture
 def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_enable_worker_prestart", "0")
     cluster = Cluster(initialize_head=True, head_node_args=HEAD)
     try:
         cluster.add_node(**NODE)
