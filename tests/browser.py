@@ -50,23 +50,27 @@ class Browser(Chromium):
         self.wait_for("location.href === 'about:blank'")
 
     @contextlib.contextmanager
-    def drawing_seldom(self, module: str) -> Iterator[None]:
+    def drawing_seldom(self, module: str = "/draw-rate.js") -> Iterator[None]:
         """Let pages draw one image in two seconds: without a GPU, an image needs 0.2 s.
 
-        ``module`` is the address of draw-rate.js.
+        This applies to the shown page, and to pages that are opened in the meantime. ``module`` is
+        the address of draw-rate.js.
         """
-        self.command("Page.enable")
-        script = self.command(
-            "Page.addScriptToEvaluateOnNewDocument",
-            source="if (location.protocol.startsWith('http'))"
+        source = (
+            "location.protocol.startsWith('http') &&"
             f" import('{module}').then(({{ ImageQueue: {{ prototype }} }}) => {{"
             "   const { draw } = prototype;"
             "   prototype.draw = function (nowMs, ...functions) {"
             "     if (nowMs < (this.nextMs ?? 0)) return;"
             "     this.nextMs = nowMs + 2000;"
-            "     draw.call(this, nowMs, ...functions); }; });",
+            "     draw.call(this, nowMs, ...functions); };"
+            "   window.drawOften = () => { prototype.draw = draw; }; })"
         )
+        self.command("Page.enable")
+        script = self.command("Page.addScriptToEvaluateOnNewDocument", source=source)
+        self.evaluate(source)
         yield
+        self.evaluate("window.drawOften?.()")
         self.command("Page.removeScriptToEvaluateOnNewDocument", **script)
         self.command("Page.disable")
 

@@ -103,6 +103,13 @@ def page(browser: Browser, gateway: Gateway) -> Browser:
     return browser
 
 
+@pytest.fixture
+def drawing_seldom(page: Browser) -> Iterator[None]:
+    """Save processor time in a test that looks at no image."""
+    with page.drawing_seldom():
+        yield
+
+
 @pytest.fixture(scope="module")
 def session(control: PageControl, gateway: Gateway) -> Iterator[Session]:
     with Client(control.address, insecure=True) as client:

@@ -54,8 +54,9 @@ def browser(control: FakeControl, tmp_path_factory: pytest.TempPathFactory) -> I
     write_speaking_head(folder / "head.mjpeg")
     gateway = Gateway(control.address)
     browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg", (640, 480))
-    browser.open(gateway.page)
-    yield browser
+    with browser.drawing_seldom():  # no test looks at our own face
+        browser.open(gateway.page)
+        yield browser
     browser.close()
     assert gateway.stop() == 0
 

@@ -127,6 +127,7 @@ def test_controls_do_not_cover_the_mouth_on_a_phone(
     assert np.percentile(rows if edge == "top" else columns, 90) < limit
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 @pytest.mark.parametrize(("width", "is_phone"), [(1280, False), (390, True)])
 def test_every_control_can_be_clicked(
     page: Browser, gateway: Gateway, width: int, is_phone: bool
@@ -146,6 +147,7 @@ def test_every_control_can_be_clicked(
     page.resize(*SIZE_PX)
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_the_caption_shows_syllables_or_phones(
     control: PageControl, session: Session, page: Browser
 ) -> None:
@@ -216,6 +218,7 @@ def test_reports_a_face_that_is_behind_and_draws_fewer_pictures(
     control.look_ahead_ms = LOOK_AHEAD_MS
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_the_microphone_reaches_the_recognizer(
     control: PageControl, session: Session, page: Browser
 ) -> None:
@@ -232,6 +235,7 @@ def test_the_microphone_reaches_the_recognizer(
     assert is_loud(control.samples(name))
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_a_microphone_can_be_turned_off_while_it_starts(
     control: PageControl, session: Session, page: Browser
 ) -> None:
@@ -253,6 +257,7 @@ def slider_amounts(control: PageControl) -> list[tuple[str, float]]:
     ]
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_settings_apply_at_once_and_to_later_sessions(
     control: PageControl, session: Session, page: Browser, gateway: Gateway
 ) -> None:
@@ -344,9 +349,9 @@ def test_reports_a_browser_without_webgl(browser: Browser, gateway: Gateway, vie
     browser.command("Page.disable")
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_reports_missing_services(control: PageControl, page: Browser, gateway: Gateway) -> None:
-    with page.drawing_seldom("/draw-rate.js"):  # each notice is shown for seconds
-        page.open(gateway.page)
+    page.open(gateway.page)
     page.wait_for(f"{NOTICE} === ''")
     control.shown, control.running, control.refuse = None, ["synthesizer"], True
     page.wait_for(f"{NOTICE}.includes('Not running: recognizer')")
@@ -359,9 +364,9 @@ def test_reports_missing_services(control: PageControl, page: Browser, gateway: 
     page.wait_for(f"{NOTICE}.includes('缺少服务')")  # also the error of a service
     page.wait_for(f"{NOTICE}.includes('没有运行')")
     choose(page, "language", "en")
-    page.open(gateway.page)  # which draws all images again
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_reconnects_when_the_gateway_restarts(
     control: PageControl, gateway: Gateway, page: Browser
 ) -> None:

@@ -77,6 +77,7 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
     assert images[-1][2, 2].min() > 200  # the page's background, not black
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 @pytest.mark.parametrize(
     ("name", "content", "english", "chinese"),
     [
@@ -104,6 +105,7 @@ def test_a_file_without_sound_is_explained_in_both_languages(
         assert page.evaluate(f"{notice}.scrollWidth <= {notice}.clientWidth")  # long names wrap
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_reading_of_a_file_is_shown_and_can_be_stopped(page: Browser, tmp_path: Path) -> None:
     write_tone(tmp_path / "tone.wav")
     (tmp_path / "empty.wav").touch()
