@@ -1,7 +1,7 @@
 """Fixtures for all tests."""
 
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Collection, Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -45,10 +45,16 @@ def new_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
+@pytest.fixture(scope="module")
+def services() -> Collection[str]:
+    """The services of the system; modules that need fewer override this."""
+    return KINDS
+
+
 @pytest.fixture(scope="module")  # an idle system costs more than a start
-def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    """All services on this host."""
-    with System(KINDS, tmp_path_factory.mktemp("system")) as running:
+def system(services: Collection[str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    """A system on this host."""
+    with System(services, tmp_path_factory.mktemp("system")) as running:
         yield running
 
 

@@ -4,7 +4,7 @@ import asyncio
 import difflib
 import json
 import re
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from fractions import Fraction
 from random import Random
 
@@ -28,13 +28,18 @@ from kouxing.services.gateway.webrtc import WebRtcPeer
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.inventory import load_inventory
 from tests.e2e.streaming import stream_audio
-from tests.system import DEMO, LIMIT_S, System, samples_of_file
+from tests.system import CHAIN, DEMO, LIMIT_S, System, samples_of_file
 
 SDP = "application/sdp"
 RTP_UNIT = Fraction(1, 48_000)
 OPEN_JAW = 2  # index of FAP 3
 SPEECH = DEMO / "lake-male.wav"
 Send = Callable[[RTCDtlsTransport, bytes], Coroutine[None, None, None]]
+
+
+@pytest.fixture(scope="module")
+def services() -> Collection[str]:
+    return (*CHAIN, "gateway")
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from kouxing.shared.wire.events import event_to_message
 from tests.e2e.conftest import CommandRunner
 from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.lips import LIPS
-from tests.system import DEMO, LIMIT_S, VOWELS_FILE, System, samples_of_file, start_python
+from tests.system import CHAIN, DEMO, LIMIT_S, VOWELS_FILE, System, samples_of_file, start_python
 
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
 OPEN_JAW = 2  # index of FAP 3
@@ -40,6 +41,11 @@ LIPS_AND_JAW = [*range(2, 11), *range(50, 58)]  # without the corners' height, w
 def opening(frame: FapFrame) -> float:
     """Return how far lips and jaw are from rest, in FAP units."""
     return float(np.abs(np.frombuffer(frame.values, "<f4")[LIPS_AND_JAW]).max())
+
+
+@pytest.fixture(scope="module")
+def services() -> Collection[str]:
+    return CHAIN
 
 
 @pytest.fixture(scope="module")

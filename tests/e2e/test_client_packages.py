@@ -10,7 +10,7 @@ import sys
 import sysconfig
 import threading
 import venv
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,16 @@ from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.documents import code_blocks
 from tests.glb_writer import BONES, Mesh, add_vrm, read_chunks, write_chunks, write_glb
-from tests.system import DEMO, NODE, ROOT, Gateway, System, samples_of_file
+from tests.system import CHAIN, DEMO, NODE, ROOT, Gateway, System, samples_of_file
 
 SPEECH = DEMO / "hello-female.wav"
 JAVASCRIPT_CLIENT = ROOT / "clients" / "javascript"
 PYTHON_CLIENT = ROOT / "clients" / "python"
+
+
+@pytest.fixture(scope="module")
+def services() -> Collection[str]:
+    return CHAIN
 
 
 def run_program(*command: object, cwd: Path | None = None, **environment: str) -> list[str]:

@@ -1,7 +1,7 @@
 """Clients that send bad input, speak for others or attack: the services continue for all others."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -32,13 +32,18 @@ from kouxing.shared.wire.events import batch_messages
 from kouxing.shared.wire.session import AudioChunk, Error
 from kouxing.shared.wire.speech import Acknowledge, AudioState, Progress
 from tests.e2e.streaming import StreamedSession
-from tests.system import DEMO, LIMIT_S, System, samples_of_file, wait_until
+from tests.system import CHAIN, DEMO, LIMIT_S, System, samples_of_file, wait_until
 
 MessageType = TypeVar("MessageType", bound=Message)
 HEARTBEAT = Heartbeat(
     service="driver", instance="a-false-one", role="observer", state="ready", sent_ns=0
 )
 ENDPOINTS = {"audio": "tcp://127.0.0.1:1", "phones": "tcp://127.0.0.1:1"}
+
+
+@pytest.fixture(scope="module")
+def services() -> Collection[str]:
+    return CHAIN
 
 
 def received_by(socket: Socket) -> Iterator[object]:

@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 import threading
+from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from kouxing.shared.keys import load_key, load_user_key
 from tests.documents import code_blocks
 from tests.e2e.streaming import StreamedSession
 from tests.system import (
+    CHAIN,
     LIMIT_S,
     NODE,
     ROOT,
@@ -31,6 +33,11 @@ from tests.system import (
     free_port,
     samples_of_file,
 )
+
+
+@pytest.fixture(scope="module")
+def services() -> Collection[str]:
+    return (*CHAIN, "gateway")
 
 
 class IndependentProgram:
@@ -132,7 +139,7 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(system: Sys
     send(client, "status-request", "", request="2")
     _, report = receive(client)
     roles = {service["service"]: service["role"] for service in report["services"]}
-    assert roles["lamp"] == roles["driver"] == "observer"
+    assert roles["lamp"] == roles["gateway"] == "observer"
     assert roles["recognizer"] == roles["synthesizer"] == "worker"
 
     send(client, "close-session", "lit", request="3", token=opened["token"])
