@@ -3,7 +3,7 @@
 The floor is the number of multiplications and additions of the networks in a second of speech,
 divided by the rate of one core. This rate is four times the rate of a float32 matrix product,
 because the weights have 8 bits. The block network processes its block and its right context in each
-run, the audio encoder each position once.
+run, the audio encoder each encoder frame once.
 """
 
 import time
@@ -21,7 +21,7 @@ _MATRIX_SIZE, _MEASURE_S = 512, 0.5
 _POSITIONS_PER_S = 50
 _INT8_SPEED_UP = 4
 _BLOCKS, _ENCODER = "block network", "audio encoder"
-_OPERATIONS = 2  # per weight and position
+_OPERATIONS = 2  # per weight and encoder frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def measure() -> Sizes:
     assert isinstance(blocks, BlockModel)  # noqa: S101 - the file of this name is one
     sizes = blocks.runner.sizes
     encoder_bytes = len(np.load(ENCODER_PATH, allow_pickle=False)["network"])
-    weighted_positions = {  # weights are bytes; positions per second of speech
+    weighted_positions = {  # weights are bytes; encoder frames per second of speech
         _BLOCKS: len(blocks.network) * sizes.length * _POSITIONS_PER_S / sizes.block,
         _ENCODER: encoder_bytes * _POSITIONS_PER_S,
     }
