@@ -5,17 +5,17 @@ import { Caption, PhoneTrack } from "../../services/gateway/page/caption.js";
 import { StreamActivity } from "../../services/gateway/page/stream-activity.js";
 import { errorToChinese, toChinese } from "../../services/gateway/page/gateway-texts.js";
 import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
+import { GatewayState } from "../../services/gateway/page/gateway-state.js";
+import { PersistentFault } from "../../services/gateway/page/notice.js";
+import { stateKey } from "../../services/gateway/page/status-bar.js";
 import {
-  GatewayState,
-  PersistentFault,
   delayText,
   drawingText,
   hintText,
   playoutDelaysText,
   secondsText,
-  stateKey,
   turnText,
-} from "../../services/gateway/page/status.js";
+} from "../../services/gateway/page/status-texts.js";
 
 function track(...symbols) {
   const phones = new PhoneTrack();

@@ -1,4 +1,6 @@
-// The sound level for the meter.
+// The sound level and its meter.
+
+import { element } from "./elements.js";
 
 const MAX_QUEUED = 500; // chunks
 const DECAY = 0.9; // factor of the level per image
@@ -45,4 +47,11 @@ export function rms(samples) {
   let squares = 0;
   for (const sample of samples) squares += sample * sample;
   return Math.sqrt(squares / (samples.length || 1)) / 32768;
+}
+
+/** Show a level on the meter, dB of full scale. */
+export function showLevel(decibels) {
+  const level = (1 - decibels / SILENT_DB).toFixed(3);
+  element("meter").firstElementChild.style.transform = `scaleX(${level})`;
+  element("meter").setAttribute("aria-valuenow", Math.round(decibels));
 }

@@ -3,16 +3,18 @@
 import { socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
+import { GatewayState } from "./gateway-state.js";
 import { translate, translateError } from "./language.js";
 import { LearnMouthDialog } from "./learn-mouth.js";
-import { LevelMeter } from "./level.js";
+import { LevelMeter, showLevel } from "./level.js";
+import { Notice } from "./notice.js";
 import { Player } from "./player.js";
 import { SendersPanel } from "./senders-panel.js";
 import { FACE_SETTINGS, Settings } from "./settings.js";
 import { Sound } from "./sound.js";
 import { SpeechControls } from "./speech-controls.js";
 import { Stage } from "./stage.js";
-import { GatewayState, Notice, StatusBar, showLevel } from "./status.js";
+import { StatusBar } from "./status-bar.js";
 import { MouthProfileStore, Preferences } from "./storage.js";
 import { ViewerSocket } from "./viewer-socket.js";
 

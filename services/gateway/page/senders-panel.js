@@ -4,7 +4,7 @@
 import { pathWithToken } from "./address.js";
 import { element, setText } from "./elements.js";
 import { translate, translateReceived, translateResponse } from "./language.js";
-import { roundToTens } from "./status.js";
+import { roundToTens } from "./status-texts.js";
 
 const PERIOD_MS = 1000; // while the panel is open
 const TOLERANCE_MS = 15; // smaller differences of delays are ignored

@@ -3,7 +3,7 @@
 import { element, setText } from "./elements.js";
 import { Head } from "./head.js";
 import { UserError, translate } from "./language.js";
-import { drawingText, turnText } from "./status.js";
+import { drawingText, turnText } from "./status-texts.js";
 import { VideoRecorder } from "./video-recorder.js";
 
 const BACKGROUND = "#e9e8ea"; // the page's own background is not on the canvas

@@ -1,0 +1,70 @@
+// The status line: whether the face is live, its delay, and hints about problems.
+
+import { isThisComputer } from "./address.js";
+import { element, setText } from "./elements.js";
+import { translate } from "./language.js";
+import { PersistentFault } from "./notice.js";
+import { delayText, hintText, playoutDelaysText, secondsText } from "./status-texts.js";
+
+/**
+ * Return the state, a key of TEXTS. The state also sets the color of the status light.
+ * isInterrupted: this page's microphone should be live.
+ */
+export function stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted }) {
+  if (!isConnected) return isStarting ? "connecting" : "disconnected";
+  if (isLive) return isBehind ? "behind" : "live";
+  return isInterrupted ? "interrupted" : "waiting";
+}
+
+export class StatusBar {
+  #parts;
+  #wasLive = false; // in the session that is shown
+  #fault = new PersistentFault();
+  #microphoneFault = new PersistentFault();
+
+  /** @param parts { gateway, player, speech, sound, notice, senders }: sources of the state */
+  constructor(parts) {
+    this.#parts = parts;
+  }
+
+  /** Start again for another session. */
+  reset() {
+    this.#wasLive = false;
+  }
+
+  show() {
+    const { gateway, player, speech, sound, notice, senders } = this.#parts;
+    const { isConnected, isStarting, session } = gateway;
+    const nowMs = performance.now();
+    const isLive = isConnected && player.activity.isLive(nowMs);
+    this.#wasLive ||= isLive;
+    const isMicrophoneInterrupted = speech.state === "interrupted";
+    const isStalled = this.#wasLive && session !== null && session === speech.session;
+    const isInterrupted = isMicrophoneInterrupted || isStalled;
+    player.lateness.update(nowMs, isLive && session !== null);
+    const isBehind = isLive && player.lateness.isBehind;
+    const state = stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted });
+    element("status").dataset.state = state;
+    element("status").title = session === null ? "" : translate("sessionName", { name: session });
+    setText(element("state"), translate(isBehind && isThisComputer() ? "behindBusy" : state));
+    element("behind").hidden = !isBehind;
+    const isLight = gateway.acoustic === "light";
+    for (const name of ["light", "acoustic"]) element(name).hidden = !isLight;
+    element("light-model").hidden = isLight;
+
+    const { playout, voiceToImageMs } = player;
+    const isAudible = isLive && sound.state === "on";
+    const soundMs = isAudible ? playout.delayMs : null;
+    const frameMs = isAudible ? playout.frameWaitMs : null;
+    const delay = isBehind ? secondsText(player.lateness.recentMs) : delayText(voiceToImageMs, soundMs);
+    setText(element("delay"), isLive ? delay : "");
+    setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
+    senders.frameWaitMs = frameMs;
+    const fault = this.#fault.update(nowMs, hintText(gateway));
+    const pause = isMicrophoneInterrupted ? translate("microphoneInterrupted") : "";
+    const microphone = this.#microphoneFault.update(nowMs, pause);
+    if (fault.isOver) notice.showToast(translate("recovered"), "hint");
+    if (microphone.isOver && speech.state === "on") notice.showToast(translate("microphoneResumed"), "hint");
+    notice.showHint(fault.hint || microphone.hint);
+  }
+}
