@@ -62,11 +62,11 @@ WIRE_NAME = {cls: name for name, cls in STRUCTURES.items()}
 
 def section(heading: str, document: str = PROTOCOL) -> str:
     """Return a document's text between a heading and the next one."""
-    found = re.search(
+    match = re.search(
         rf"^#+ {re.escape(heading)}\n(.*?)(?=^#+ |\Z)", document, re.DOTALL | re.MULTILINE
     )
-    assert found, f"the document has no heading {heading!r}"
-    return found[1]
+    assert match, f"the document has no heading {heading!r}"
+    return match[1]
 
 
 def table(text: str, number: int = 0) -> list[list[str]]:
@@ -91,7 +91,9 @@ def type_text(kind: msgspec.inspect.Type) -> str:
 
 def some_type(kind: msgspec.inspect.UnionType) -> msgspec.inspect.Type:
     """Return the type of an optional field's value, if it has one."""
-    (value_type,) = (one for one in kind.types if not isinstance(one, msgspec.inspect.NoneType))
+    (value_type,) = (
+        member for member in kind.types if not isinstance(member, msgspec.inspect.NoneType)
+    )
     return value_type
 
 

@@ -182,9 +182,9 @@ def test_a_slow_start_is_explained_from_the_first_moment(browser: Browser) -> No
 def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
     browser.evaluate(
         "import('/face-tracker.js').then(({ FaceTracker: { prototype } }) => {"
-        " window.find = prototype.find; window.found = [];"
+        " window.find = prototype.find; window.images = [];"
         " prototype.find = async function (image) {"
-        "   found.push([window.kouxing.state.lesson, image.width]);"
+        "   images.push([window.kouxing.state.lesson, image.width]);"
         "   await new Promise((resolve) => setTimeout(resolve, 150));"
         "   return find.call(this, image); }; })"
     )
@@ -192,7 +192,7 @@ def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
     browser.evaluate("window.kouxing.readingS = 1")
     start_recording(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'", 180)
-    problem, found = text_of(browser, "learn-problem"), browser.evaluate("found")
+    problem, images = text_of(browser, "learn-problem"), browser.evaluate("images")
     browser.evaluate(
         "import('/face-tracker.js').then(({ FaceTracker }) => {"
         " FaceTracker.prototype.find = window.find; })"
@@ -200,7 +200,7 @@ def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
     browser.click("learn-mouth [data-step=problem] .close")
     # a busy machine finds a face in too few images, another one too little speech
     assert re.search(r"film (it for )?\d+ s or more", problem), problem
-    later = found[found.index(["learning", 320]) :]
+    later = images[images.index(["learning", 320]) :]
     assert later == [["learning", 320]] * len(later)
     assert len(later) > 1
 

@@ -94,7 +94,8 @@ def test_a_session_continues_without_its_worker(
     )
     assert num_missing_samples(streamed, len(SAMPLES)) == 0, "the lost audio was not resent"
     phones, expected = (
-        [phone for phone in one.phones if phone.is_spoken] for one in (streamed, uninterrupted)
+        [phone for phone in result.phones if phone.is_spoken]
+        for result in (streamed, uninterrupted)
     )
     assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
     for phone, other in zip(phones, expected, strict=True):

@@ -97,7 +97,7 @@ def assert_same(received: ReceivedResults, expected: ReceivedResults, since: int
     """Compare phones and frames from some media time on."""
     assert symbols(received, since) == symbols(expected, since)
     assert len(symbols(received, since)) > 10
-    times = [{frame.media_time for _, frame in one.frames} for one in (received, expected)]
+    times = [{frame.media_time for _, frame in results.frames} for results in (received, expected)]
     assert {time for time in times[1] if time >= since} <= times[0]
 
 

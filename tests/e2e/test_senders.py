@@ -213,14 +213,14 @@ def test_vtube_studio_is_not_asked_again_after_a_denial(
 
 def test_two_senders_share_one_permission(senders: SenderPool) -> None:
     with VTubeStudioStub() as stub:
-        whole = f"vts://127.0.0.1:{stub.port}"
-        senders.start(parse_target(whole))
+        whole_face = f"vts://127.0.0.1:{stub.port}"
+        senders.start(parse_target(whole_face))
         wait_until(lambda: bool(stub.frames))
-        mouth = f"{whole}?only=mouth"
+        mouth = f"{whole_face}?only=mouth"
         senders.start(parse_target(mouth))
         wait_until(lambda: any("EyeOpenLeft" not in frame for frame in stub.frames))
         assert stub.requests.count("AuthenticationTokenRequest") == 1
-        senders.stop(whole)
+        senders.stop(whole_face)
         shown = len(stub.frames)
         wait_until(lambda: len(stub.frames) > shown + 5)
         assert "EyeOpenLeft" not in stub.frames[-1]

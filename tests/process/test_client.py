@@ -90,12 +90,12 @@ def test_a_session_streams_audio_and_receives_results(control: FakeControl, clie
         control.publish(control.phones, PHONE)
         assert isinstance(results.get(), Phone)
         control.publish(control.faps, frame(1), frame(2), END)
-        found = list(results)
+        received = list(results)
         assert results.has_ended
         with pytest.raises(KouxingError, match="complete samples"):
             session.try_push(bytes(6))
-    frames = [result for result in found if isinstance(result, FapFrame)]
-    shapes = [result for result in found if isinstance(result, Shapes)]
+    frames = [result for result in received if isinstance(result, FapFrame)]
+    shapes = [result for result in received if isinstance(result, Shapes)]
     assert [frame.values for frame in frames] == [array("f", [n] * 68) for n in (1.0, 2.0)]
     assert frames[0].time_s == 0.02
     assert [frame.by_name["aa"] for frame in shapes] == [0.5, 0.5]

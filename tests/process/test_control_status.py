@@ -36,9 +36,9 @@ def test_pages_contain_everything_once(
     harness: ControlHarness, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = open_sessions(harness, 5)
-    whole = ask(harness, client)
-    assert isinstance(whole, StatusReport)
-    assert whole.next is None
+    full_report = ask(harness, client)
+    assert isinstance(full_report, StatusReport)
+    assert full_report.next is None
     monkeypatch.setattr(control_status, "PAGE_BYTES", 700)
     services, sessions, after, num_pages = [], [], 0, 0
     while True:
@@ -52,8 +52,8 @@ def test_pages_contain_everything_once(
         assert page.next > after
         after = page.next
     assert num_pages >= 3
-    assert services == [state.instance for state in whole.services]
-    assert sessions == names == [state.session for state in whole.sessions]
+    assert services == [state.instance for state in full_report.services]
+    assert sessions == names == [state.session for state in full_report.sessions]
 
 
 def test_reports_one_session_and_its_services(harness: ControlHarness, client: Socket) -> None:

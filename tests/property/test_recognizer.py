@@ -39,8 +39,8 @@ def last_phone_after(decoder: Decoder, row: np.ndarray) -> LastPhone:
 def test_chunks_do_not_affect_resampling(cuts: list[int], rate_hz: int) -> None:
     resampler = Resampler(rate_hz)
     parts = [resampler.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
-    whole = to_16_khz(NOISE, rate_hz)
-    np.testing.assert_array_equal(np.concatenate([*parts, resampler.finish()]), whole)
+    undivided = to_16_khz(NOISE, rate_hz)
+    np.testing.assert_array_equal(np.concatenate([*parts, resampler.finish()]), undivided)
 
 
 @settings(max_examples=30)
@@ -49,8 +49,8 @@ def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
     model = cached_model(name)
     front_end = model.create_front_end()
     parts = [front_end.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
-    whole = model.create_front_end().accept_waveform(NOISE)
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    undivided = model.create_front_end().accept_waveform(NOISE)
+    np.testing.assert_array_equal(np.concatenate(parts), undivided)
 
 
 @settings(max_examples=50)
@@ -81,16 +81,16 @@ def test_a_search_continues_from_the_state_of_another(
     rng = np.random.default_rng(seed)
     rows = rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32)
     at = data.draw(st.integers(0, num_frames - 1))
-    one, before, after = (Decoder(topology) for _ in range(3))
+    uninterrupted, before, after = (Decoder(topology) for _ in range(3))
     for row in rows[::-1]:
         last_phone_after(after, row)  # an earlier, different search
-    expected = [last_phone_after(one, row) for row in rows]
+    expected = [last_phone_after(uninterrupted, row) for row in rows]
     beginning = [last_phone_after(before, row) for row in rows[:at]]
     after.copy_state(before)
     for decoder in (after, before):
         assert beginning + [last_phone_after(decoder, row) for row in rows[at:]] == expected
-        assert decoder.path_since(0) == one.path_since(0)
-        assert decoder.final_path() == one.final_path()
+        assert decoder.path_since(0) == uninterrupted.path_since(0)
+        assert decoder.final_path() == uninterrupted.final_path()
 
 
 def scores_of(topology: Topology, phones: list[str], frames_per_state: int) -> np.ndarray:

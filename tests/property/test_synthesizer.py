@@ -154,11 +154,11 @@ def run(
 def test_any_chunking_gives_identical_frames(
     emitted: list[tuple[float, Phone | SpeechChange]], cuts: list[float], delay_s: float
 ) -> None:
-    whole, cut = (
+    undivided, cut = (
         run(emitted, make_face(delay_s=delay_s, idle_motion_seed=1), at)
         for at in ((), [time_s for time_s in cuts if time_s < emitted[-1][0]])
     )
-    np.testing.assert_array_equal(whole, cut)
+    np.testing.assert_array_equal(undivided, cut)
 
 
 @few_examples

@@ -103,8 +103,8 @@ def test_densities_match_scipy() -> None:
     scale = np.sqrt(mixtures.covars)
     log_parts = np.sum(norm.logpdf(x[:, None, None, :], mixtures.means, scale), axis=-1)
     expected = logsumexp(log_parts + np.log(mixtures.weights), axis=-1)
-    found = mixture_scores(x, mixtures.score_matrix(), 3)
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    scores = mixture_scores(x, mixtures.score_matrix(), 3)
+    np.testing.assert_allclose(scores, expected, rtol=1e-4)
 
 
 def test_search_weights_are_saved(tmp_path: Path) -> None:
@@ -118,8 +118,8 @@ def test_rejects_broken_files(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no acoustic model at"):
         load_model(path)
     np.savez(pickled, format=np.array([{"a": 1}], dtype=object))
-    whole = model_path("gmm").read_bytes()
-    for content in (b"not a model", whole[: len(whole) // 2], pickled.read_bytes()):
+    model_bytes = model_path("gmm").read_bytes()
+    for content in (b"not a model", model_bytes[: len(model_bytes) // 2], pickled.read_bytes()):
         path.write_bytes(content)
         with pytest.raises(UserError, match="is not an acoustic model"):
             load_model(path)

@@ -83,9 +83,9 @@ def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     run(adapt_app, tmp_path / "me.landmarks", "-o", profile, "--json", figures)
     lips = load_lip_predictor()
     assert lips.with_mouth_profile(profile.read_bytes()).digest != lips.digest
-    found = json.loads(figures.read_text(encoding="utf-8"))
-    assert found["held_out_s"] == pytest.approx(found["speech_s"] / 4, abs=0.05)
-    assert found["after"]["opening"] > found["before"]["opening"] + 0.05
-    assert found["before"]["width"] is None
-    curve = found["curves"]["opening"]
-    assert len(found["curves"]["time_s"]) == len(curve["before"]) == len(curve["tracked"]) > 100
+    report = json.loads(figures.read_text(encoding="utf-8"))
+    assert report["held_out_s"] == pytest.approx(report["speech_s"] / 4, abs=0.05)
+    assert report["after"]["opening"] > report["before"]["opening"] + 0.05
+    assert report["before"]["width"] is None
+    curve = report["curves"]["opening"]
+    assert len(report["curves"]["time_s"]) == len(curve["before"]) == len(curve["tracked"]) > 100

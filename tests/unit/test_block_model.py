@@ -67,7 +67,7 @@ def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
     for frame in FRAMES:
         lone.score(frame[None])
         provisional.append(lone.provisional)
-    whole = scores_of(model, FRAMES)
+    expected = scores_of(model, FRAMES)
     rng = np.random.default_rng(0)
     num_streams = 18  # more than one run has
     streams = [model.create_stream() for _ in range(num_streams)]
@@ -82,15 +82,15 @@ def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
             rows[n].append(scores)
             np.testing.assert_array_equal(streams[n].provisional, provisional[at[n]])
     for stream, parts in zip(streams, rows, strict=True):
-        np.testing.assert_array_equal(np.concatenate([*parts, stream.score(None)]), whole)
+        np.testing.assert_array_equal(np.concatenate([*parts, stream.score(None)]), expected)
 
 
 def test_long_speech_restarts_the_table_with_an_empty_past(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = scores_of(blocks(), FRAMES)
+    expected = scores_of(blocks(), FRAMES)
     monkeypatch.setattr(blocks_module, "MAX_POSITIONS", 40)
     short = scores_of(blocks(), FRAMES)
-    np.testing.assert_array_equal(short[:56], whole[:56])  # with a complete right context
-    assert not np.array_equal(short[80:160], whole[80:160])
+    np.testing.assert_array_equal(short[:56], expected[:56])  # with a complete right context
+    assert not np.array_equal(short[80:160], expected[80:160])
     later = FRAMES.copy()
     later[:78] = later[later[:78].max(axis=1).argmax()]  # frames that only precede the restart
     np.testing.assert_array_equal(scores_of(blocks(), later)[80:], short[80:])

@@ -113,17 +113,17 @@ def test_fast_changes_add_phones_in_any_chunking() -> None:
     model = replace(random_topology(1, rng, table.tree()), phone_penalty=-2.0)
     scores = np.full((60, model.num_states), -1e4, np.float32)
     scores[:, phones] = rng.normal(scale=2.0, size=(60, len(phones)))
-    fixed, whole, first, second = (
+    fixed, undivided, first, second = (
         Decoder(replace(model, rate_weight=weight)) for weight in (0.0, 120.0, 120.0, 120.0)
     )
     fixed.advance(scores)
-    whole.advance(scores)
-    assert len(whole.final_path()) > len(fixed.final_path())
+    undivided.advance(scores)
+    assert len(undivided.final_path()) > len(fixed.final_path())
     for frame in range(30):
         first.advance(scores[frame : frame + 1])
     second.copy_state(first)
     second.advance(scores[30:])
-    assert second.final_path() == whole.final_path()
+    assert second.final_path() == undivided.final_path()
 
 
 def crowded_language() -> PhoneLanguageModel:

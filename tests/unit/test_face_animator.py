@@ -140,7 +140,7 @@ def test_a_longer_delay_is_closer_to_the_full_model() -> None:
         phone(i, symbol, 0.3 + 0.1 * i, 0.1)
         for i, symbol in enumerate("n i h ao b iao j u d an sh uo".split())
     ]
-    whole = synthesize(LIPS, spoken, 90)
+    offline = synthesize(LIPS, spoken, 90)
     errors = []
     for delay_s in (0.0, 0.1, 0.3):
         face = make_face(delay_s=delay_s)
@@ -150,7 +150,7 @@ def test_a_longer_delay_is_closer_to_the_full_model() -> None:
             face.process(animator)
         face.process(SpeechChange(active=False, time_s=1.5))
         frames += advance(face, 2.2)
-        errors.append(float(np.sqrt(np.mean((values(frames)[:90] - whole) ** 2))))
+        errors.append(float(np.sqrt(np.mean((values(frames)[:90] - offline) ** 2))))
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 0.1 * errors[0]
 

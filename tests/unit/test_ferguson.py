@@ -182,13 +182,13 @@ def test_training_recovers_the_openings() -> None:
     relative = relative_openings([clip])[0]
     scale = 5.0 / np.percentile(opening, 98)  # the speaker's widest opening is 5
     np.testing.assert_allclose(relative, np.minimum(scale * opening, 5.0), atol=0.01)
-    found = fit_openings([clip], [phones], INVENTORY)
+    fitted = fit_openings([clip], [phones], INVENTORY)
     for symbol in ("a", "i", "u", "d", "b", "sh"):
         expected = min(scale * true.opening[symbol], 5.0)
-        assert found[symbol] == pytest.approx(expected, abs=0.3)
-    assert found["sil"] == found["b"] == 0.0
+        assert fitted[symbol] == pytest.approx(expected, abs=0.3)
+    assert fitted["sil"] == fitted["b"] == 0.0
     # a phone without data follows its visemes
-    assert found["ang"] == pytest.approx(found["a"], abs=0.3)
+    assert fitted["ang"] == pytest.approx(fitted["a"], abs=0.3)
     travel = opening_to_faps([5.0])[0] / scale
     np.testing.assert_allclose(measure_travel([clip]), travel, rtol=0.05, atol=1e-9)
     assert len(measure_travel([clip])) == len(MOUTH_FAPS)

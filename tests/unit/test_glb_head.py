@@ -105,11 +105,11 @@ def test_skeleton_rotates_the_head_but_not_the_shoulders(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("rotation", [(0, 0, 0, 1), (0, 1, 0, 0)], ids=["z", "-z"])
 def test_a_jaw_bone_moves_teeth_without_shapes(tmp_path: Path, rotation: tuple[int, ...]) -> None:
-    whole = meshes(SHAPES)
-    for mesh in whole:
+    head_meshes = meshes(SHAPES)
+    for mesh in head_meshes:
         if mesh.name.startswith("teeth"):
             mesh.targets = {}
-    path = write_glb(tmp_path / "cc4.glb", whole)
+    path = write_glb(tmp_path / "cc4.glb", head_meshes)
     bones: list[dict[str, Any]] = [
         {"name": "CC_Base_Head", "children": [1]},
         {"name": "CC_Base_JawRoot", "children": [2]},

@@ -40,10 +40,10 @@ def test_any_two_mouths_differ(coarse_head: Head) -> None:
     renderer = Renderer(coarse_head, *SIZE_PX, samples=0, camera=place_camera(coarse_head))
     pictures = {viseme: renderer.draw(spoken(viseme)).astype(np.int32) for viseme in VISEMES}
     renderer.close()
-    for one, other in combinations(VISEMES, 2):
-        change = np.abs(pictures[one] - pictures[other])[240:420, 220:420].max(axis=2)
-        brightness = pictures[one][240:420, 220:420].max(axis=2).mean()
-        assert (change > MIN_CHANGE * brightness).sum() > MIN_PIXELS, (one, other)
+    for first, second in combinations(VISEMES, 2):
+        change = np.abs(pictures[first] - pictures[second])[240:420, 220:420].max(axis=2)
+        brightness = pictures[first][240:420, 220:420].max(axis=2).mean()
+        assert (change > MIN_CHANGE * brightness).sum() > MIN_PIXELS, (first, second)
 
 
 # same values as in tests/page/mouth-light.test.mjs

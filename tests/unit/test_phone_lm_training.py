@@ -118,13 +118,13 @@ def words_of(stream: PhoneStream) -> list[str]:
     readable = [word for word in WORDS if MANDARIN.readable.fullmatch(word)]
     words = {phones_of_text(word, MANDARIN): word for word in readable}
     words[SIL,] = ""
-    found: list[str] = []
+    texts: list[str] = []
     left = tuple(stream.tolist())
     while left:
         (phones,) = (phones for phones in words if left[: len(phones)] == phones)
-        found.append(words[phones])
+        texts.append(words[phones])
         left = left[len(phones) :]
-    return found
+    return texts
 
 
 def test_draws_words_with_their_probabilities(model: Path) -> None:

@@ -53,16 +53,16 @@ def recognize(
 
 
 @pytest.fixture(scope="module")
-def whole(model: AcousticModel) -> list[list[StreamOutput]]:
+def uninterrupted(model: AcousticModel) -> list[list[StreamOutput]]:
     """The results of a session without a loss."""
     return recognize(model, 0, ResumeFilter(0.0))
 
 
 def state_at_loss(
-    whole: Sequence[Sequence[StreamOutput]], lost_s: float
+    uninterrupted: Sequence[Sequence[StreamOutput]], lost_s: float
 ) -> tuple[list[StreamOutput], float, int]:
     """Return the results until a loss, the final time, and the first sample to replay."""
-    before = list(chain.from_iterable(whole[: round(lost_s * 10)]))
+    before = list(chain.from_iterable(uninterrupted[: round(lost_s * 10)]))
     final = FinalTimeTracker()
     for output in before:
         if not isinstance(output, Waveform):
@@ -78,12 +78,12 @@ def final_phones(outputs: Sequence[StreamOutput]) -> list[Phone]:
 
 @pytest.mark.parametrize("lost_s", [2.5, 4.0])
 def test_two_recognizers_emit_the_phones_of_one(
-    model: AcousticModel, whole: list[list[StreamOutput]], lost_s: float
+    model: AcousticModel, uninterrupted: list[list[StreamOutput]], lost_s: float
 ) -> None:
-    before, final_s, begin = state_at_loss(whole, lost_s)
+    before, final_s, begin = state_at_loss(uninterrupted, lost_s)
     assert 0.0 < final_s < lost_s
     after = [*chain.from_iterable(recognize(model, begin, ResumeFilter(final_s)))]
-    expected = final_phones([*chain.from_iterable(whole)])
+    expected = final_phones([*chain.from_iterable(uninterrupted)])
     phones = final_phones(before) + final_phones(after)
     assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
     shifts = [abs(a.onset_s - b.onset_s) for a, b in zip(expected, phones, strict=True)]
@@ -92,15 +92,15 @@ def test_two_recognizers_emit_the_phones_of_one(
 
 @pytest.mark.parametrize("lost_s", [2.8, 4.4])
 def test_phones_come_as_early_as_without_a_loss(
-    model: AcousticModel, whole: list[list[StreamOutput]], lost_s: float
+    model: AcousticModel, uninterrupted: list[list[StreamOutput]], lost_s: float
 ) -> None:
-    before, final_s, begin = state_at_loss(whole, lost_s)
+    before, final_s, begin = state_at_loss(uninterrupted, lost_s)
     (start_s,) = (
         output.time_s for output in before if isinstance(output, SpeechChange) and output.active
     )
     after = recognize(model, begin, ResumeFilter(final_s), to_samples(start_s))
     from_s = final_s + 0.3
-    expected = first_chunks(whole[begin // CHUNK :], from_s)
+    expected = first_chunks(uninterrupted[begin // CHUNK :], from_s)
     actual = first_chunks(after, from_s)
     assert [symbol for symbol, _ in actual] == [symbol for symbol, _ in expected]
     assert all(chunk <= last for (_, chunk), (_, last) in zip(actual, expected, strict=True))

@@ -45,9 +45,9 @@ def test_closed_lips_and_lids_stay_closed(shapes: ShapeSet) -> None:
     assert shapes.faps(shapes.weights(closed))[inner].sum() > -60  # 1 mm
     if shapes is not OCULUS:
         lids = neutral_faps(close_t_l_eyelid=UPPER_LID, close_b_l_eyelid=LOWER_LID)
-        found = weights_by_name(lids, shapes)
-        assert max(found.values()) == found.get("eyeBlinkLeft", found.get("blinkLeft"))
-        assert max(found.values()) > 0.95
+        blink = weights_by_name(lids, shapes)
+        assert max(blink.values()) == blink.get("eyeBlinkLeft", blink.get("blinkLeft"))
+        assert max(blink.values()) > 0.95
 
 
 def test_vrm_blinks_add_up() -> None:

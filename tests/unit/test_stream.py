@@ -80,9 +80,13 @@ def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
     phones = of_kind(Phone, outputs)
     after = [phone for phone in phones if phone.index > max(phone.index for phone in alone)]
     assert phones[: len(alone)] == alone
-    for one, two in zip(alone, after, strict=True):
-        assert (one.symbol, one.final, one.duration_s) == (two.symbol, two.final, two.duration_s)
-        assert two.onset_s - one.onset_s == pytest.approx(gap / RATE_HZ)
+    for earlier, later in zip(alone, after, strict=True):
+        assert (earlier.symbol, earlier.final, earlier.duration_s) == (
+            later.symbol,
+            later.final,
+            later.duration_s,
+        )
+        assert later.onset_s - earlier.onset_s == pytest.approx(gap / RATE_HZ)
     states = [event.active for event in of_kind(SpeechChange, outputs)]
     assert states == [True, False] * (len(states) // 2)
     assert len(of_kind(EndOfSound, outputs)) == 1
@@ -260,11 +264,11 @@ def test_a_longer_hop_changes_only_the_phones() -> None:
     stream.stream.set_hop(4)
     outputs = [*stream.feed(SAMPLES, chunk=320), *stream.finish()]
     assert_same((LipPositions, Progress, SpeechChange), outputs, expected)
-    found, wanted = (
+    symbols, expected_symbols = (
         [phone.symbol for phone in of_kind(Phone, results) if phone.final and phone.is_spoken]
         for results in (outputs, expected)
     )
-    assert found == wanted
+    assert symbols == expected_symbols
 
 
 def hello_phones() -> list[Phone]:

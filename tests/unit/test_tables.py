@@ -28,9 +28,9 @@ def test_a_table_fits_and_keeps_words_whole(width: int) -> None:
 
 
 def test_the_table_of_figures_has_a_column_for_each_result() -> None:
-    one = {"num": 3, "delay_ms": {"p50": 1.234, "p95": 12.34}, "size": (4, 3)}
-    two = {"num": 1234.5, "delay_ms": {}, "note": None}
-    table = figures_table({"1": one, "2": two})
+    first = {"num": 3, "delay_ms": {"p50": 1.234, "p95": 12.34}, "size": (4, 3)}
+    second = {"num": 1234.5, "delay_ms": {}, "note": None}
+    table = figures_table({"1": first, "2": second})
     assert table.columns == ("figure", "1", "2")
     assert table.rows == [
         ["num", "3", "1234"],

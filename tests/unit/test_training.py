@@ -158,14 +158,14 @@ def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
             else:
                 total = -np.inf
         best = max(best, total + log_leave[graph.states[sequence[-1]]])
-    path, found = viterbi_path(
+    path, path_score = viterbi_path(
         scores,
         np.arange(len(graph.states)),
         graph,
         log_stay.astype(np.float32),
         log_leave.astype(np.float32),
     )
-    assert found == pytest.approx(best, rel=1e-4)
+    assert path_score == pytest.approx(best, rel=1e-4)
     assert len(path) == num_frames
 
 

@@ -36,9 +36,9 @@ def test_estimates_the_parameters_behind_curves() -> None:
     curve = blend(true, build_timeline(phones, INVENTORY), time_s)
     faps[:, measured] = curve[:, measured]
 
-    found = fit_parameters(collect_frames([clip_of(time_s, faps)], [phones], INVENTORY))
+    fitted = fit_parameters(collect_frames([clip_of(time_s, faps)], [phones], INVENTORY))
 
-    again = blend(found, build_timeline(phones, INVENTORY), time_s)
+    again = blend(fitted, build_timeline(phones, INVENTORY), time_s)
     before = blend(START, build_timeline(phones, INVENTORY), time_s)
     for column in measured:
         error, start_error = (
@@ -46,15 +46,15 @@ def test_estimates_the_parameters_behind_curves() -> None:
             for faps in (again, before)
         )
         assert error < 0.35 * start_error
-    assert found.target[VISEME_INDEX["i"], JAW] == pytest.approx(150.0, rel=0.2)
-    assert found.target[VISEME_INDEX["a"], JAW] == pytest.approx(270.0, rel=0.2)
-    assert found.offset_s[VISEME_INDEX["a"], JAW] == pytest.approx(-0.02, abs=0.015)
+    assert fitted.target[VISEME_INDEX["i"], JAW] == pytest.approx(150.0, rel=0.2)
+    assert fitted.target[VISEME_INDEX["a"], JAW] == pytest.approx(270.0, rel=0.2)
+    assert fitted.offset_s[VISEME_INDEX["a"], JAW] == pytest.approx(-0.02, abs=0.015)
     # what was not measured, and what is closed by definition, stays
     np.testing.assert_array_equal(
-        found.target[:, MOUTH_FAPS.index(45)], START.target[:, MOUTH_FAPS.index(45)]
+        fitted.target[:, MOUTH_FAPS.index(45)], START.target[:, MOUTH_FAPS.index(45)]
     )
-    assert found.target[VISEME_INDEX["b"], LOWER_LIP] == 0.0
-    assert found.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
+    assert fitted.target[VISEME_INDEX["b"], LOWER_LIP] == 0.0
+    assert fitted.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
 
 
 def write_clip(folder: Path, name: str, language: str, header: str, row: str) -> None:
