@@ -6,7 +6,7 @@ from pathlib import Path
 from kouxing.corpora.lip_clips import read_clips
 from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import write_error
+from kouxing.shared.files.output_file import write_error
 
 _SUFFIXES = (".flac", ".csv", ".json")
 _COLUMNS = ("clip", "split", "language", "speaker", "license")

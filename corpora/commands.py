@@ -10,8 +10,7 @@ import typer
 from rich.console import Console
 
 from kouxing.services.cli.options import AudioTrack, Panel
-from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import (
+from kouxing.shared.command.terminal import (
     CONSOLE,
     Force,
     JsonFile,
@@ -20,6 +19,7 @@ from kouxing.shared.terminal import (
     print_table,
     write_json,
 )
+from kouxing.shared.errors import UserError
 
 if TYPE_CHECKING:
     from kouxing.services.mouth_profiles.learning import FilmedSpeech
@@ -61,7 +61,7 @@ def adapt(
 def _read(source: Path) -> FilmedSpeech:
     from kouxing.corpora.lip_clips import read_clip
     from kouxing.services.mouth_profiles.landmark_file import MAX_BYTES, SUFFIX, parse_landmark_file
-    from kouxing.shared.user_file import read_file
+    from kouxing.shared.files.user_file import read_file
 
     if source.suffix != SUFFIX:
         return read_clip(source).filmed_speech()

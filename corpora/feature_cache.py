@@ -20,9 +20,9 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.shared import audio_file
+from kouxing.shared.audio import audio_file
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_integers
 
 _FORMAT = "4"  # increase it when the front end's log-mel stage changes
 

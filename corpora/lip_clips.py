@@ -33,8 +33,8 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_col
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS, PROTRUSION_FAPS
+from kouxing.shared.files.user_file import check_content, parse_json, read_text, split_lines
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.user_file import check_content, parse_json, read_text, split_lines
 
 Array = NDArray[np.float64]
 

@@ -16,13 +16,13 @@ from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels
-from kouxing.shared.audio_file import MAX_FILE_BYTES, check_video
+from kouxing.shared.audio.audio_file import MAX_FILE_BYTES, check_video
+from kouxing.shared.audio.media_file import OPTIONS, start_of
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.terminal import plural
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
-from kouxing.shared.media_file import OPTIONS, start_of
-from kouxing.shared.terminal import plural
-from kouxing.shared.user_file import check_content, open_file
+from kouxing.shared.files.user_file import check_content, open_file
 
 MAX_DURATION_S = 1200.0
 MAX_SIDE_PX = 960  # larger images are reduced

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.corpora.tables import read_rows
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_integers
 
 _HELD_OUT_BY_FILE = ("music", "noise")
 _BACKGROUNDS = ("music", "noise", "babble")

@@ -33,11 +33,11 @@ from pathlib import Path
 
 from kouxing.corpora.tables import read_rows
 from kouxing.corpora.universal_phones import has_labels, universal_words
-from kouxing.shared.audio_file import read_duration_s
+from kouxing.shared.audio.audio_file import read_duration_s
+from kouxing.shared.command.terminal import plural
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.user_file import check_content, read_text, split_lines
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, Syllable
-from kouxing.shared.terminal import plural
-from kouxing.shared.user_file import check_content, read_text, split_lines
 
 LANGUAGES = Path(__file__).with_name("languages.tsv")  # held-out recordings in several languages
 

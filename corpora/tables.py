@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import read_text, split_lines
+from kouxing.shared.files.user_file import read_text, split_lines
 
 _MAX_BYTES = 256 << 20
 _MAX_ROWS = 1_000_000

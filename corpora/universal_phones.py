@@ -19,6 +19,7 @@ from pathlib import Path
 
 from kouxing.corpora.tables import read_rows
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.tsv_tables import read_table
 from kouxing.shared.phones.alphabets import phones_of_arpabet
 from kouxing.shared.phones.inventory import (
     BUILT_IN,
@@ -28,7 +29,6 @@ from kouxing.shared.phones.inventory import (
     load_inventory,
 )
 from kouxing.shared.phones.universal.segments import read_ipa
-from kouxing.shared.tsv_tables import read_table
 
 _EMODB = "emodb_"
 _MARKS = re.compile("^[!_]|asp$")  # marks for bursts, closures and aspiration

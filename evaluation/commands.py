@@ -20,14 +20,14 @@ from kouxing.evaluation.source_tree import SAMPLE
 from kouxing.evaluation.system.commands import attacks, faults
 from kouxing.evaluation.tables import figures_table, show_results
 from kouxing.services.cli.options import ACOUSTIC_MODEL
-from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import (
+from kouxing.shared.command.terminal import (
     Force,
     JsonFile,
     check_output,
     plural,
     print_message,
 )
+from kouxing.shared.errors import UserError
 
 if TYPE_CHECKING:
     from kouxing.corpora.sounds import Sound

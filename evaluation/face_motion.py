@@ -34,9 +34,9 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
 from kouxing.shared.phones.events import Progress
-from kouxing.shared.terminal import CONSOLE
 
 Floats = NDArray[np.float32]
 Times = NDArray[np.float64]  # (n,) media times, seconds

@@ -18,8 +18,8 @@ from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import CONSOLE
 
 _LENGTH_S = 60.0
 _MIN_PAUSE_S = 0.6  # long enough for the face to finish a phrase

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.metrics import percentile
+from kouxing.shared.monitoring.metrics import percentile
 
 
 def percentiles(values: NDArray[np.float64]) -> dict[str, float]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from kouxing.shared.terminal import print_table, write_json
+from kouxing.shared.command.terminal import print_table, write_json
 
 Figures = Mapping[str, Any]  # results as in a JSON file
 

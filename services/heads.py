@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import BeforeValidator
 
-from kouxing.shared.config import KnownNames
 from kouxing.shared.face.config import FaceConfig
+from kouxing.shared.settings.config import KnownNames
 
 HEAD_NAMES = tuple(
     sorted(path.stem for path in (Path(__file__).parent / "driver/head/assets").glob("*.npz"))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.phones.inventory import PhoneInventory
 
 ENTRY_POINTS = "kouxing.lip_models"

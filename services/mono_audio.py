@@ -9,9 +9,14 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.shared.audio_file import clipping_warnings, count_clipped, limited_blocks, open_audio
-from kouxing.shared.phase_cancellation import Samples
-from kouxing.shared.terminal import print_message
+from kouxing.shared.audio.audio_file import (
+    clipping_warnings,
+    count_clipped,
+    limited_blocks,
+    open_audio,
+)
+from kouxing.shared.audio.phase_cancellation import Samples
+from kouxing.shared.command.terminal import print_message
 
 
 def read_mono_16k(
@@ -20,7 +25,7 @@ def read_mono_16k(
     """Return a file's samples, 16 kHz mono, shape ``(n,)``.
 
     Prints a message if the file is truncated or clipped, or has other tracks. Raises ``UserError``
-    as ``kouxing.shared.audio_file.read_audio``.
+    as ``kouxing.shared.audio.audio_file.read_audio``.
     """
     source = open_audio(path, block_s=1.0, track=track)
     for notice in source.notices:

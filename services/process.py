@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from kouxing.shared.service import Service
+    from kouxing.shared.service.base import Service
 
 
 def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
@@ -25,11 +25,11 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
     Raises ``UserError`` if the configuration is invalid.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during startup prints no traceback
-    from kouxing.shared.priority import raise_priority, use_one_thread
+    from kouxing.shared.service.priority import raise_priority, use_one_thread
 
     use_one_thread()
     from kouxing.services.service_kinds import KINDS, read_settings
-    from kouxing.shared.config import parse_assignments
+    from kouxing.shared.settings.config import parse_assignments
 
     kind = KINDS[name]
     if kind.role != "observer":  # observers draw pictures or start other programs
@@ -45,11 +45,11 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     An invalid setting prints one line and returns 2. An internal error logs a traceback and
     returns 1.
     """
-    from kouxing.shared.connection_limits import raise_file_limit
     from kouxing.shared.errors import UserError, prefix_name
-    from kouxing.shared.logs import LOG, configure
-    from kouxing.shared.metrics import use_single_malloc_arena
-    from kouxing.shared.parent_process import PARENT_VARIABLE
+    from kouxing.shared.monitoring.logs import LOG, configure
+    from kouxing.shared.monitoring.metrics import use_single_malloc_arena
+    from kouxing.shared.network.connection_limits import raise_file_limit
+    from kouxing.shared.service.parent_process import PARENT_VARIABLE
 
     configure(name, log_level)
     use_single_malloc_arena()

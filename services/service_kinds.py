@@ -9,7 +9,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from kouxing.services.heads import HeadConfig
-from kouxing.shared.config import (
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.config import LiveConfig
+from kouxing.shared.service.service_kind import ServiceKind
+from kouxing.shared.settings.config import (
     COMMON,
     BindAddress,
     ServiceConfig,
@@ -17,10 +20,7 @@ from kouxing.shared.config import (
     bound_keys,
     variable_name,
 )
-from kouxing.shared.endpoints import WILDCARDS
-from kouxing.shared.errors import UserError
-from kouxing.shared.face.config import LiveConfig
-from kouxing.shared.service_kind import ServiceKind
+from kouxing.shared.settings.endpoints import WILDCARDS
 
 _FREE_PORTS = range(20_000, 32_000)  # below the range for outgoing connections
 
@@ -75,7 +75,7 @@ PROVIDERS = {endpoint: kind.name for kind in KINDS.values() for endpoint in kind
 def read_settings(
     file: Path | None = None, assignments: Mapping[str, str] | None = None
 ) -> Settings:
-    """Return the settings of all services; raises as ``kouxing.shared.config.Settings``."""
+    """Return the settings of all services; raises as ``shared.settings.config.Settings``."""
     return Settings(CONFIG_TYPES, file=file, assignments=assignments)
 
 

@@ -9,11 +9,11 @@ from kouxing_client.messages import Message
 from kouxing.evaluation.system.attackers import connect
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
-from kouxing.shared.bus import Bus
-from kouxing.shared.endpoints import key_of, with_key
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import load_key
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.settings.endpoints import key_of, with_key
+from kouxing.shared.settings.keys import load_key
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
 from kouxing.shared.wire.session import Error, OpenSession

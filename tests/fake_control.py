@@ -8,10 +8,10 @@ from typing import Any, Self, TypeVar
 
 from kouxing_client.messages import Message, ServiceState, SessionFacts
 
-from kouxing.shared.bus import Bus
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import NO_PEER, Peer
-from kouxing.shared.sockets import Poller, Socket
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Poller, Socket
+from kouxing.shared.settings.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import (

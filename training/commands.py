@@ -9,9 +9,9 @@ import typer
 
 from kouxing.corpora.options import Clips, EmotionalSpeech, OptionalClips, OptionalSounds, Sounds
 from kouxing.services.cli.options import Language
+from kouxing.shared.command.terminal import Force, check_output
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.terminal import Force, check_output
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from kouxing.corpora.speech_corpus import RowErrors
-from kouxing.shared.terminal import write_text
+from kouxing.shared.command.terminal import write_text
 
 
 class LicensedRecording(Protocol):

@@ -12,7 +12,7 @@ from kouxing.services.recognizer import lip_predictor, voice_traits
 from kouxing.services.recognizer.acoustic import blocks, gmm, universal
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.model_file import phone_lm_arrays, shipped_phone_lm
-from kouxing.shared.output_file import open_output
+from kouxing.shared.files.output_file import open_output
 
 _LANGUAGE = ("language", "phones")  # arrays
 

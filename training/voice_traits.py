@@ -35,7 +35,7 @@ from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.voice_traits import MIN_VOICE, VoiceReadout
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.model_card import write_card
 from kouxing.training.model_files import save_voice_readout
 from kouxing.training.networks.augmentation import disturb, scale_level

@@ -17,7 +17,7 @@ from kouxing.corpora.lip_clips import LipClip
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
-from kouxing.shared.user_file import check_content, read_text, split_lines
+from kouxing.shared.files.user_file import check_content, read_text, split_lines
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ from kouxing.evaluation.lips.mouths import CURVES, Mouth, clip_mouth, real_faps
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import training_clip_names
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.terminal import plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.terminal import plural, print_message
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

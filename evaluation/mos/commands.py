@@ -8,7 +8,7 @@ import typer
 
 from kouxing.evaluation.tables import show_results
 from kouxing.services.cli.options import Assignments, ConfigFile, Language, Output
-from kouxing.shared.terminal import (
+from kouxing.shared.command.terminal import (
     Force,
     JsonFile,
     check_output,
@@ -81,7 +81,7 @@ def serve(
     from kouxing.evaluation.mos.study import load_study
     from kouxing.services.gateway.config import GatewayConfig
     from kouxing.services.service_kinds import read_settings
-    from kouxing.shared.config import parse_assignments
+    from kouxing.shared.settings.config import parse_assignments
 
     overrides = parse_assignments(assignments or [], "gateway")
     gateway = read_settings(config).load(GatewayConfig, overrides)

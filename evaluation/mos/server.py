@@ -22,7 +22,7 @@ from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
 from kouxing.services.gateway.web_server import WebServer, bind_port
-from kouxing.shared.user_file import parse_json
+from kouxing.shared.files.user_file import parse_json
 
 FOLDER = Path(__file__).parent / "page"
 FILES = {name: FOLDER / name for name in ("index.html", "main.js", "style.css")}

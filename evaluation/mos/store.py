@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import check_content, parse_json, read_text
+from kouxing.shared.files.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "answers.jsonl"
 MAX_JUDGES = 10_000

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.audio_file import check_video
+from kouxing.shared.audio.audio_file import check_video
+from kouxing.shared.command.terminal import write_json
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import write_json
-from kouxing.shared.user_file import check_content, parse_json, read_text
+from kouxing.shared.files.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "study.json"
 REFERENCE, ANCHOR = "reference", "anchor"  # the best condition, and one that is bad on purpose

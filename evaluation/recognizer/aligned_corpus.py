@@ -15,9 +15,9 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syl
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
+from kouxing.shared.command.terminal import CONSOLE, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.terminal import CONSOLE, print_message
 
 _RATES = (4.0, 5.5, 7.0)  # limits of the classes of speaking rates, syllables per second
 RATE_NAMES = (

@@ -25,8 +25,8 @@ from kouxing.evaluation.recognizer import synthetic_sounds
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples, as_samples, pink_noise
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_floats
 
 Disturb = Callable[[Samples], Samples]
 CONDITIONS = ("clean", "noise 10 dB", "music 10 dB", "babble 10 dB", "room", "telephone")

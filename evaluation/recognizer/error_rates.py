@@ -46,9 +46,9 @@ from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
+from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory
-from kouxing.shared.terminal import CONSOLE
 
 # the paper's rule and a rule with fewer errors, which are measured in clean speech
 COMPARED_RULES = (OutputRuleConfig(3, 0.0), OutputRuleConfig(3, 0.99))

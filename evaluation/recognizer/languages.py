@@ -34,12 +34,12 @@ from kouxing.evaluation.recognizer.error_rates import (
 from kouxing.evaluation.rivals.tables import FOLDER, find_installed
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import UNIVERSAL, find_language, load_inventory
 from kouxing.shared.phones.universal.segments import read_ipa
-from kouxing.shared.terminal import CONSOLE
 
 AUTO, OWN, HAMA = "auto", "own", "hama"
 _HAMA_LANGUAGE = "en"

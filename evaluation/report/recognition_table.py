@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from kouxing.evaluation.recognizer.disturbances import CLEAN
 from kouxing.evaluation.tables import Figures, Table, format_number, join_values, percent
-from kouxing.shared.terminal import plural
+from kouxing.shared.command.terminal import plural
 
 _COLUMNS = (
     "speech",

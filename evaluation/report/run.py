@@ -19,7 +19,7 @@ from typing import Any
 from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.steps import FOLDER_OPTIONS, STEPS
 from kouxing.evaluation.source_tree import ROOT
-from kouxing.shared.terminal import print_message
+from kouxing.shared.command.terminal import print_message
 
 _OMITTED_KEYS = {
     "rules",

@@ -16,9 +16,9 @@ import zmq
 from kouxing_client import Refused
 from kouxing_client.keys import Key
 
-from kouxing.shared import client_connection
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.keys import load_user_key
+from kouxing.shared.command import client_connection
+from kouxing.shared.settings.keys import load_user_key
 
 # The first bytes of ZeroMQ's wire protocol, ZMTP 3.0, and flags of its frames.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)

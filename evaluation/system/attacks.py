@@ -31,9 +31,9 @@ from kouxing.evaluation.system.wait import wait_until
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import UserError
 
 PHASES = ("before", "during", "after")

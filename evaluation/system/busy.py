@@ -24,9 +24,9 @@ from kouxing.evaluation.system.load import SETTLE_S, LoadGenerator, Speaker
 from kouxing.evaluation.system.systems import run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import to_seconds
+from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import UserError
 
 LATE_S = 0.3  # lateness above which the face is behind

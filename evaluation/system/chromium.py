@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.wait import wait_until
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 
 _TIMEOUT_S = 120.0

@@ -14,7 +14,7 @@ from kouxing.evaluation.source_tree import SAMPLE
 from kouxing.evaluation.tables import figures_table, show_results
 from kouxing.services.cli.options import Language
 from kouxing.services.recognizer.hop_controller import MAX_HOP
-from kouxing.shared.terminal import CONSOLE, Force, JsonFile, check_output
+from kouxing.shared.command.terminal import CONSOLE, Force, JsonFile, check_output
 
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
 AudioFiles = Annotated[

@@ -22,7 +22,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
 from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level_faps import VISEMES
 

@@ -30,11 +30,11 @@ from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import CLIENT
+from kouxing.shared.settings.keys import CLIENT
 
 NUM_SESSIONS = 16
 SPIN = """

@@ -26,9 +26,9 @@ from kouxing.evaluation.system.live import CHUNK_S, speak
 from kouxing.evaluation.system.systems import run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
+from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import UserError
 
 NUM_REPEATS = 3  # number of times that the file is streamed

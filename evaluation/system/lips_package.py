@@ -33,9 +33,9 @@ from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent
-from kouxing.shared.terminal import CONSOLE
 
 Samples = NDArray[np.float32]
 Faps = NDArray[np.float32]

@@ -37,7 +37,7 @@ from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone, write_wav
 from kouxing.services.cli.web_model import web_model
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS

@@ -22,10 +22,10 @@ from kouxing.services.service_kinds import (
     free_port_environment,
     read_settings,
 )
-from kouxing.shared.client_connection import connect_client
-from kouxing.shared.config import variable_name
+from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import CLIENT, control_endpoint, load_user_key, read_key
+from kouxing.shared.settings.config import variable_name
+from kouxing.shared.settings.keys import CLIENT, control_endpoint, load_user_key, read_key
 
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 180.0

@@ -28,13 +28,13 @@ from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable
-from kouxing.shared.terminal import print_message
 
 T = TypeVar("T", Phone, TimedSyllable)
 _IMAGE_RATE_HZ = 25.0  # rate of a video that is made from audio

@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import write_error
-from kouxing.shared.terminal import print_message
+from kouxing.shared.files.output_file import write_error
 
 T = TypeVar("T", Path, Path | None)
 

@@ -22,13 +22,7 @@ from kouxing.services.cli.options import (
 )
 from kouxing.services.cli.running_system import RunningSystem, find_control, other_systems
 from kouxing.services.service_kinds import read_settings
-from kouxing.shared.config import ServiceConfig
-from kouxing.shared.endpoints import split_endpoint
-from kouxing.shared.errors import UserError
-from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
-from kouxing.shared.keys import control_endpoint
-from kouxing.shared.name_rules import NAME_RULE, is_name
-from kouxing.shared.terminal import (
+from kouxing.shared.command.terminal import (
     CONSOLE,
     Force,
     JsonFile,
@@ -38,6 +32,12 @@ from kouxing.shared.terminal import (
     print_table,
     write_json,
 )
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
+from kouxing.shared.name_rules import NAME_RULE, is_name
+from kouxing.shared.settings.config import ServiceConfig
+from kouxing.shared.settings.endpoints import split_endpoint
+from kouxing.shared.settings.keys import control_endpoint
 
 if TYPE_CHECKING:
     from kouxing_client import Lateness
@@ -101,9 +101,9 @@ def speak(
     """
     from kouxing.services.cli.streaming import stream
     from kouxing.services.recognizer.mouth_profile import read_mouth_profile
-    from kouxing.shared.audio_file import open_audio
-    from kouxing.shared.media_file import RawFormat
-    from kouxing.shared.sound_devices import open_microphone, open_monitor
+    from kouxing.shared.audio.audio_file import open_audio
+    from kouxing.shared.audio.media_file import RawFormat
+    from kouxing.shared.audio.sound_devices import open_microphone, open_monitor
 
     profile = b"" if mouth is None else read_mouth_profile(mouth)
     if source in ("mic", "monitor"):
@@ -147,7 +147,7 @@ def speak(
 
 def devices() -> None:
     """List the devices for 'kouxing speak mic' and 'kouxing speak monitor'."""
-    from kouxing.shared.sound_devices import list_sound_devices
+    from kouxing.shared.audio.sound_devices import list_sound_devices
 
     devices = list_sound_devices()
     if not devices:
@@ -246,7 +246,7 @@ def express(
     """Show expressions on a face; without expressions, clear the current ones."""
     from kouxing_client import Refused
 
-    from kouxing.shared.client_connection import connect_client
+    from kouxing.shared.command.client_connection import connect_client
 
     words = list(arguments or ())
     session = words.pop(0) if words and "=" not in words[0] else ""
@@ -293,7 +293,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
     """Show services, sessions, rates and latencies."""
     import msgspec
 
-    from kouxing.shared.client_connection import connect_client
+    from kouxing.shared.command.client_connection import connect_client
 
     check_output(json_file, force=force)
     with (

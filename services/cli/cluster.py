@@ -7,9 +7,9 @@ from rich.console import Console
 
 from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.service_kinds import KINDS, read_settings
-from kouxing.shared.config import parse_assignments
+from kouxing.shared.command.terminal import print_table
 from kouxing.shared.errors import UserError, install_command
-from kouxing.shared.terminal import print_table
+from kouxing.shared.settings.config import parse_assignments
 
 NumWorkers = Annotated[
     int | None, typer.Option(min=0, max=1000, help="Number to run. Default: the current number.")

@@ -9,8 +9,8 @@ import typer
 
 from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.service_kinds import CONFIG_TYPES, read_settings
-from kouxing.shared.config import COMMON, Setting, Settings, parse_assignments
 from kouxing.shared.errors import UserError
+from kouxing.shared.settings.config import COMMON, Setting, Settings, parse_assignments
 
 PAGE_HEAD = """\
 # Configuration

@@ -24,13 +24,13 @@ from kouxing.services.cli.options import CurveFormat, ExportOptions
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.output_file import open_output, write_error
+from kouxing.shared.files.output_file import open_output, write_error
 from kouxing.shared.phones.events import Phone
-from kouxing.shared.terminal import write_text
 
 if TYPE_CHECKING:
     from kouxing.services.cli.animation import FaceMotion

@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.senders.live_link import ANGLES
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import MAX_FRAMES, FapAnimation
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shape_names import find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.terminal import print_message
-from kouxing.shared.user_file import parse_json, read_file, split_lines
+from kouxing.shared.files.user_file import parse_json, read_file, split_lines
 
 TABLE_SUFFIXES = (".csv", ".jsonl")
 MAX_BYTES = 128 << 20  # about two hours

@@ -13,12 +13,18 @@ from kouxing_client.reach import reach_error
 from kouxing.services.cli.clients import find_system
 from kouxing.services.cli.running_system import running_systems
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.bus import Bus, ProbeResult
-from kouxing.shared.client_connection import connect_client
-from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
+from kouxing.shared.command.client_connection import connect_client
+from kouxing.shared.command.terminal import plural
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import CLIENT, CLIENT_ROLES, load_local_keys, load_user_key, rejection_hint
-from kouxing.shared.terminal import plural
+from kouxing.shared.network.bus import Bus, ProbeResult
+from kouxing.shared.settings.endpoints import is_loopback, split_endpoint, with_key
+from kouxing.shared.settings.keys import (
+    CLIENT,
+    CLIENT_ROLES,
+    load_local_keys,
+    load_user_key,
+    rejection_hint,
+)
 
 MAX_CLOCK_OFFSET_MS = 1000.0
 MAX_AGE_S = 2.0  # limit for the age of the newest heartbeat

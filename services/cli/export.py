@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
+from kouxing.shared.command.terminal import Force, check_output, print_message
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import Force, check_output, print_message
 
 app = typer.Typer(no_args_is_help=True, help="Export the models for other programs.")
 

@@ -18,7 +18,8 @@ from kouxing.services.cli.curve_exporters import (
 )
 from kouxing.services.cli.options import SPEECH_FORMATS, CurveFormat, ExportOptions, ListenFormat
 from kouxing.services.cli.streaming import missed_warning
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.command.client_connection import connect_client
+from kouxing.shared.command.terminal import CONSOLE, plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
 from kouxing.shared.face.mouth_shapes import mouth_cues
@@ -27,7 +28,6 @@ from kouxing.shared.phones import events
 from kouxing.shared.phones.alphabets import Alphabet, respell
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllable_captions import SyllableCaptions
-from kouxing.shared.terminal import CONSOLE, plural, print_message
 
 OPEN_POLL_S = 0.05  # the services repeat what they published shortly before
 PRINTED_FAPS = (3, 4, 5, 6, 16, 17)  # jaw, lips, lip corner, protrusion

@@ -14,8 +14,8 @@ import typer
 
 from kouxing.services.cli.options import HeadName
 from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES, page_file, page_heads_folder
+from kouxing.shared.command.terminal import Force, check_output, print_message
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import Force, check_output, print_message
 
 _DRIVER_HEADS = Path(str(resources.files("kouxing.services.driver"))) / "head"
 _PAGE = Path(str(resources.files("kouxing.services.gateway"))) / "page"

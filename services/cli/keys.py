@@ -7,8 +7,9 @@ import typer
 from rich.console import Console
 
 from kouxing.services.service_kinds import KINDS
+from kouxing.shared.command.terminal import Force, check_output, print_message, print_table
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import (
+from kouxing.shared.settings.keys import (
     CLIENT,
     add_key,
     key_folder,
@@ -17,7 +18,6 @@ from kouxing.shared.keys import (
     read_grants,
     revoke_key,
 )
-from kouxing.shared.terminal import Force, check_output, print_message, print_table
 
 app = typer.Typer(no_args_is_help=True, help="Manage the keys that may connect to the services.")
 

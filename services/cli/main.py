@@ -21,10 +21,10 @@ from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.options import Assignments, ConfigFile, Panel
 from kouxing.services.service_kinds import KINDS
+from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
-from kouxing.shared.service_kind import ServiceKind
-from kouxing.shared.terminal import CONSOLE
+from kouxing.shared.service.service_kind import ServiceKind
 
 _LINE_END = re.compile(r"(?<!\n)\n(?!\n)")  # within a paragraph
 ENTRY_POINTS = "kouxing.commands"  # such as training and evaluation

@@ -46,14 +46,14 @@ from kouxing.services.synthesizer.lips.ferguson.timing import (
 )
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.terminal import open_progress, plural, print_message, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU
+from kouxing.shared.files.output_file import open_output
 from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
-from kouxing.shared.output_file import open_output
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-from kouxing.shared.terminal import open_progress, plural, print_message, write_text
 
 Array = NDArray[np.float64]
 LabelSpan = tuple[float, float, str]  # start and end in seconds, and the label

@@ -24,9 +24,7 @@ from kouxing.services.cli.options import (
     reject_options,
 )
 from kouxing.services.driver.config import Framing
-from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
-from kouxing.shared.terminal import (
+from kouxing.shared.command.terminal import (
     Force,
     check_output,
     open_progress,
@@ -35,6 +33,8 @@ from kouxing.shared.terminal import (
     show_loading,
     write_output,
 )
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
 Acoustic = Annotated[

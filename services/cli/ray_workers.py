@@ -19,11 +19,11 @@ import ray
 
 from kouxing.services.cli.service_process import POLL_S, ServiceProcess
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.config import BindAddress, Settings, bound_keys, variable_name
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import format_key, load_key
-from kouxing.shared.service import DRAIN_TIMEOUT_S
-from kouxing.shared.service_kind import ServiceKind
+from kouxing.shared.service.base import DRAIN_TIMEOUT_S
+from kouxing.shared.service.service_kind import ServiceKind
+from kouxing.shared.settings.config import BindAddress, Settings, bound_keys, variable_name
+from kouxing.shared.settings.keys import format_key, load_key
 
 NAMESPACE = "kouxing"  # namespace of the actors' names
 PLACEMENT_LIMIT_S = 60.0  # maximum wait for Ray to start one actor per core

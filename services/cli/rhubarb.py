@@ -19,12 +19,12 @@ from kouxing.services.cli.animation import FaceMotion, animate
 from kouxing.services.cli.cue_files import format_cues
 from kouxing.services.cli.spoken_text import MAX_TEXT_BYTES
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.mouth_shapes import REST, Cue, mouth_cues
+from kouxing.shared.files.user_file import read_text
 from kouxing.shared.phones.inventory import AUTO, find_language
-from kouxing.shared.terminal import write_text
-from kouxing.shared.user_file import read_text
 
 _BASIC_MOUTHS = {"G": "A", "H": "C", "X": "A"}  # shown instead of a mouth that is not drawn
 _PRESTON_BLAIR = dict(zip("ABCDEFGHX", "MBP etc E AI O U FV L rest".split(), strict=True))

@@ -38,15 +38,15 @@ from kouxing.services.service_kinds import (
     extra_worker_environments,
     read_settings,
 )
-from kouxing.shared.config import COMMON, Settings, parse_assignments, variable_name
-from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
+from kouxing.shared.command.terminal import CONSOLE, command_name, plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt, install_interrupt_handler
-from kouxing.shared.keys import check_keys, control_endpoint
-from kouxing.shared.terminal import CONSOLE, command_name, plural, print_message
+from kouxing.shared.settings.config import COMMON, Settings, parse_assignments, variable_name
+from kouxing.shared.settings.endpoints import WILDCARDS, split_endpoint, with_host
+from kouxing.shared.settings.keys import check_keys, control_endpoint
 
 if TYPE_CHECKING:
-    from kouxing.shared.audio_file import AudioSource
+    from kouxing.shared.audio.audio_file import AudioSource
 
 CONTROL_VARIABLE = variable_name(COMMON, "control")
 BOUND_CONTROL_VARIABLE = variable_name("control", "control")
@@ -240,7 +240,7 @@ def _open_browser(page: str) -> None:
 
 def _open_sample(path: Path, track: int | None, video: Path) -> AudioSource:
     """Open the file to play, and remove the video of the last one."""
-    from kouxing.shared.audio_file import open_audio
+    from kouxing.shared.audio.audio_file import open_audio
 
     if path.exists() and video.exists() and video.samefile(path):
         raise UserError(f"{path}: the video would overwrite this file; rename it first")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import key_folder
+from kouxing.shared.settings.keys import key_folder
 
 
 class RunningSystem(NamedTuple):

@@ -13,9 +13,9 @@ from kouxing_client import Client, FapFrame, KouxingError, Results, Session
 
 from kouxing.services.senders.sender_pool import SenderPool
 from kouxing.services.senders.target import Target
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.command.client_connection import connect_client
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.interrupt import catch_interrupt, install_interrupt_handler
-from kouxing.shared.terminal import print_message
 
 SEARCH_PERIOD_S = 0.2
 STEP_S = 0.05

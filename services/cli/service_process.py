@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.shared.clock import StallDetector
-from kouxing.shared.parent_process import IDLE_PULSE, PARENT_VARIABLE, PULSE_VARIABLE
-from kouxing.shared.service import HEARTBEAT_S, IDLE_HEARTBEAT_S
+from kouxing.shared.service.base import HEARTBEAT_S, IDLE_HEARTBEAT_S
+from kouxing.shared.service.parent_process import IDLE_PULSE, PARENT_VARIABLE, PULSE_VARIABLE
 
 POLL_S = 0.5  # interval between checks of a process
 SILENT_S = 1.0  # a loop that sends no heartbeat for longer may hang

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from kouxing.services.cli.text_formats import SpokenText, decode_text, extract_text
 from kouxing.services.recognizer.alignment import MIN_FIT, Alignment
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.user_file import read_file
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory
 from kouxing.shared.phones.transcript import Transcript
-from kouxing.shared.terminal import print_message
-from kouxing.shared.user_file import read_file
 
 MAX_TEXT_BYTES = 8 << 20
 _MAX_CHARACTERS = 150_000

@@ -11,11 +11,11 @@ from kouxing_client import Client, KouxingError, Phone, Refused
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from kouxing.shared.audio_file import AudioSource, clipping_warnings, count_clipped
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.audio.audio_file import AudioSource, clipping_warnings, count_clipped
+from kouxing.shared.command.client_connection import connect_client
+from kouxing.shared.command.terminal import plural
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt
-from kouxing.shared.terminal import plural
 
 PUSH_TIMEOUT_S = 30.0
 STATUS_S = 1.0  # interval between status requests

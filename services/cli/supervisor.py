@@ -20,9 +20,9 @@ from rich.console import Console
 from kouxing.services.cli.log_file import LogFile
 from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
 from kouxing.services.service_kinds import KINDS, WORKERS, kind_of
-from kouxing.shared.client_connection import connect_client
+from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import USER_ERROR, UserError, prefix_name
-from kouxing.shared.service import DRAIN_TIMEOUT_S
+from kouxing.shared.service.base import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # delays before restarting a service that crashed twice
 START_LIMIT_S = 120.0

@@ -13,9 +13,9 @@ from itertools import groupby, pairwise
 from typing import NamedTuple
 
 from kouxing.services.cli.text_columns import remove_columns
+from kouxing.shared.audio.sound_formats import audio_file_kind
 from kouxing.shared.errors import UserError
-from kouxing.shared.sound_formats import audio_file_kind
-from kouxing.shared.user_file import parse_json
+from kouxing.shared.files.user_file import parse_json
 
 _BINARY_SIGNATURES = {  # by their first bytes; see also `audio_file_kind`
     b"%PDF": "a PDF document",

@@ -4,8 +4,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from kouxing.shared.config import BoundEndpoint, ServiceConfig
-from kouxing.shared.endpoints import (
+from kouxing.shared.settings.config import BoundEndpoint, ServiceConfig
+from kouxing.shared.settings.endpoints import (
     WILDCARDS,
     is_address,
     is_loopback,

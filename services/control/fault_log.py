@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 SHORT_S = 1.0  # time without a service after which its loss is a warning
 MAX_FAULTS = 1000

@@ -6,12 +6,12 @@ from typing import Any, TypeAlias
 
 from kouxing_client.messages import Message
 
-from kouxing.shared.bus import Bus
 from kouxing.shared.errors import Rejected
-from kouxing.shared.keys import Grant, Peer
-from kouxing.shared.message_loop import Handler
-from kouxing.shared.metrics import Metrics
-from kouxing.shared.sockets import Socket
+from kouxing.shared.monitoring.metrics import Metrics
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.message_loop import Handler
+from kouxing.shared.settings.keys import Grant, Peer
 from kouxing.shared.wire.control import AllowedKey, Heartbeat
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import (

@@ -25,15 +25,15 @@ from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
 from kouxing.services.control.status_reporter import StatusReporter
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.bus import COMMANDS
 from kouxing.shared.clock import StallDetector, now_ns
-from kouxing.shared.endpoints import with_key
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import NO_PEER, Peer
-from kouxing.shared.logs import LOG
-from kouxing.shared.message_loop import Handler
-from kouxing.shared.service import Service
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.network.bus import COMMANDS
+from kouxing.shared.service.base import Service
+from kouxing.shared.service.message_loop import Handler
+from kouxing.shared.settings.endpoints import with_key
+from kouxing.shared.settings.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import EventName, Heartbeat, HeartbeatReply, SessionStarted
 from kouxing.shared.wire.face import CurrentFace, FaceSettings, SetFace
 from kouxing.shared.wire.session import (

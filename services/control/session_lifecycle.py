@@ -14,9 +14,9 @@ from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
 from kouxing.shared.fast_record import replace
-from kouxing.shared.logs import LOG
-from kouxing.shared.metrics import Metrics
-from kouxing.shared.sockets import Socket
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.monitoring.metrics import Metrics
+from kouxing.shared.network.sockets import Socket
 from kouxing.shared.wire.control import EventName
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionMoved

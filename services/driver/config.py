@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from kouxing.services.heads import HeadConfig
-from kouxing.shared.config import KnownNames, Switch, ValueHint
 from kouxing.shared.name_rules import NAME
+from kouxing.shared.settings.config import KnownNames, Switch, ValueHint
 
 COLORS = {
     "black": "#000000", "white": "#ffffff", "gray": "#808080", "green": "#00b140",

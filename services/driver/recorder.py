@@ -20,9 +20,9 @@ from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.scene import open_renderer
 from kouxing.services.driver.video.video_renderer import VideoRenderer
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG, configure
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.monitoring.logs import LOG, configure
 
 MAX_QUEUED_FRAMES = 180_000  # per video: an hour at 50 frames per second, 75 MB
 MAX_COMMANDS = 500  # commands handled before the next image

@@ -12,8 +12,8 @@ from typing import Any
 
 from kouxing.services.driver import recorder
 from kouxing.services.driver.config import DriverConfig
-from kouxing.shared.keys import MAX_KEY_SHARE
-from kouxing.shared.output_file import remove_unfinished
+from kouxing.shared.files.output_file import remove_unfinished
+from kouxing.shared.settings.keys import MAX_KEY_SHARE
 from kouxing.shared.wire.control import StartSession
 
 MAX_QUEUED = 100_000  # unread commands

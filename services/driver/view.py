@@ -18,7 +18,7 @@ from kouxing.services.driver.render.scene import (
 )
 from kouxing.services.driver.video.virtual_camera import VirtualCamera
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 if TYPE_CHECKING:
     from kouxing.services.driver.render.window import Window

@@ -11,7 +11,7 @@ from kouxing_client import KouxingError
 from kouxing.services.gateway.audio_sessions import AudioSession
 from kouxing.services.gateway.limits import COMMAND_S, RealTimeLimit
 from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
-from kouxing.shared.encoding_check import EncodingCheck
+from kouxing.shared.audio.encoding_check import EncodingCheck
 
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone

@@ -23,9 +23,9 @@ from kouxing.services.gateway.pcm_format import (
 from kouxing.services.lip_models import lip_model_names
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, check_expressions
-from kouxing.shared.field_errors import describe_field_error
-from kouxing.shared.user_file import parse_json
+from kouxing.shared.files.user_file import parse_json
 from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.field_errors import describe_field_error
 from kouxing.shared.wire.session import MouthProfile
 from kouxing.shared.wire.speech import AcousticModelName
 

@@ -12,8 +12,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import write_private
-from kouxing.shared.user_file import open_file
+from kouxing.shared.files.output_file import write_private
+from kouxing.shared.files.user_file import open_file
 
 _MAX_BYTES = 1 << 20
 _VALID_DAYS = 397  # browsers reject certificates that are valid for longer

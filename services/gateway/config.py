@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator
 
 from kouxing.services.heads import HeadConfig
-from kouxing.shared.config import BoundHost, BoundPort, HostNames, TextList, ValueHint
 from kouxing.shared.errors import UserError
+from kouxing.shared.settings.config import BoundHost, BoundPort, HostNames, TextList, ValueHint
 
 ADDRESS_SHARE = 0.75  # maximum fraction of each quota for one address, which may be a proxy
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")

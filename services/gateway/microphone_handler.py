@@ -12,7 +12,7 @@ from kouxing.services.gateway.limits import ConnectionQuota
 from kouxing.services.gateway.pcm_format import PcmFormat, WrongFormat
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 MAX_MICROPHONES = 16
 OPTIONS_TIMEOUT_S = 10.0

@@ -13,7 +13,7 @@ from kouxing.services.gateway.upload_handler import UPLOAD_LIMIT_S, UploadHandle
 from kouxing.services.gateway.web_application import discard_body
 from kouxing.services.mouth_profiles import learning_process
 from kouxing.shared.errors import USER_ERROR, UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 MAX_BYTES = 8 << 20
 LEARNING_LIMIT_S = 180.0

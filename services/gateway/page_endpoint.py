@@ -9,7 +9,7 @@ from urllib.parse import quote
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.certificate import load_tls_context
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback
+from kouxing.shared.settings.endpoints import WILDCARDS, is_address, is_loopback
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,9 +6,9 @@ import numpy as np
 from kouxing_client.audio import MAX_FLOAT, SAMPLE_BYTES
 from msgspec import Struct
 
+from kouxing.shared.audio.sound_formats import audio_file_kind
 from kouxing.shared.errors import UserError
-from kouxing.shared.sound_formats import audio_file_kind
-from kouxing.shared.user_file import parse_json
+from kouxing.shared.files.user_file import parse_json
 from kouxing.shared.wire.session import Encoding, NumChannels, SampleRate
 
 MAX_OBJECT_BYTES = 128 * 1024  # limit for a JSON message

@@ -9,9 +9,9 @@ from pathlib import Path
 from kouxing_client import KouxingError
 
 from kouxing.services.gateway.audio_sessions import AudioClient, error_text
-from kouxing.shared.audio_file import open_audio
+from kouxing.shared.audio.audio_file import open_audio
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_integers
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.text_captions import Characters, split_characters
 

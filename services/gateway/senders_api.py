@@ -17,7 +17,7 @@ from kouxing.services.senders.sender_pool import SenderPool
 from kouxing.services.senders.target import Target, parse_delay_s
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 
 class SendersApi:

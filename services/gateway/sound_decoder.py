@@ -5,9 +5,14 @@ import sys
 import wave
 from pathlib import Path
 
-from kouxing.shared.audio_file import clipping_warnings, count_clipped, limited_blocks, open_audio
+from kouxing.shared.audio.audio_file import (
+    clipping_warnings,
+    count_clipped,
+    limited_blocks,
+    open_audio,
+)
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import USER_ERROR, UserError
-from kouxing.shared.pcm import as_integers
 
 MAX_DURATION_S = 3600
 MAX_CPU_S = 60

@@ -16,7 +16,7 @@ from kouxing.services.gateway import sound_decoder
 from kouxing.services.gateway.upload_handler import UPLOAD_LIMIT_S, UploadHandler, upload_error
 from kouxing.services.gateway.web_application import discard_body
 from kouxing.shared.errors import USER_ERROR, UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 MAX_BYTES = 200 << 20
 DECODING_LIMIT_S = 60.0

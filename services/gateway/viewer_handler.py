@@ -23,7 +23,7 @@ from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.fast_record import replace
-from kouxing.shared.metrics import Metrics
+from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.name_rules import NAME_RULE, is_name
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.speech import AcousticModelName

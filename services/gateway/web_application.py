@@ -17,7 +17,7 @@ from kouxing.services.heads import HEAD_NAMES, page_file, page_heads_folder
 from kouxing.services.lip_models import lip_models
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.phones.inventory import language_titles
 
 PAGE_FOLDER = Path(__file__).parent / "page"

@@ -16,8 +16,8 @@ from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG, RateLimit
-from kouxing.shared.metrics import trim_heap
+from kouxing.shared.monitoring.logs import LOG, RateLimit
+from kouxing.shared.monitoring.metrics import trim_heap
 
 MAX_CONNECTIONS = 256
 IDLE_TIMEOUT_S = 10.0  # limit for the wait for the next request

@@ -26,7 +26,7 @@ from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_qu
 from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.viewer_queue import MessageKind
 from kouxing.shared.errors import UserError
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 if TYPE_CHECKING:
     from aiortc import RTCDataChannel

@@ -18,11 +18,11 @@ from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mo
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels, select_lip_faps
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.shared.audio_file import MAX_RATE_HZ, MIN_RATE_HZ
+from kouxing.shared.audio.audio_file import MAX_RATE_HZ, MIN_RATE_HZ
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_floats
-from kouxing.shared.user_file import parse_json
+from kouxing.shared.files.user_file import parse_json
 
 SUFFIX = ".landmarks"
 MAX_BYTES = 64 * 1024 * 1024

@@ -5,9 +5,9 @@ import time
 
 from kouxing.services.recognizer.session import RecognizerSession
 from kouxing.shared.errors import Rejected
-from kouxing.shared.keys import Peer
-from kouxing.shared.message_loop import MessageLoop
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.message_loop import MessageLoop
+from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from kouxing.services.recognizer.resumption import Chunk
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
-from kouxing.shared.overload import SkipPolicy
+from kouxing.shared.service.overload import SkipPolicy
 
 _MIN_CHUNK_S = 0.001  # shorter chunks count as this duration, because decoding them takes as long
 

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
-from kouxing.shared.config import BoundEndpoint, KnownNames
 from kouxing.shared.face.config import LiveConfig
+from kouxing.shared.settings.config import BoundEndpoint, KnownNames
 
 MODEL_NAMES = ("blocks", "light", "gmm", "universal")
 

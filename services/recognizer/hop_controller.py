@@ -1,8 +1,8 @@
 """Runs the block network less often while a recognizer is overloaded.
 
 All sessions have the same *hop*, the number of blocks between two runs of the network. A longer hop
-saves time, but phones are emitted and corrected later. :mod:`kouxing.shared.overload` describes the
-later stages of the degradation, which affect single sessions.
+saves time, but phones are emitted and corrected later. :mod:`kouxing.shared.service.overload`
+describes the later stages of the degradation, which affect single sessions.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from kouxing.services.recognizer.hop_controller import MAX_HOP, HopController, P
 from kouxing.services.recognizer.network_thread import NetworkThread
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
-from kouxing.shared.metrics import LoadMeter
+from kouxing.shared.monitoring.metrics import LoadMeter
 
 MAX_BATCH_S = 0.3  # audio of all sessions that is decoded together
 MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
-from kouxing.shared.user_file import read_file
+from kouxing.shared.files.user_file import read_file
 
 Floats = NDArray[np.float32]
 

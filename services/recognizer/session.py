@@ -13,16 +13,16 @@ from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, ResumeFilter
 from kouxing.services.recognizer.sound_packets import SoundPackets
 from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
+from kouxing.shared.audio.encoding_check import EncodingCheck
+from kouxing.shared.audio.pcm import decode_pcm
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
-from kouxing.shared.encoding_check import EncodingCheck
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import NO_PEER
-from kouxing.shared.overload import CATCH_UP_S, SkipPolicy
-from kouxing.shared.pcm import decode_pcm
+from kouxing.shared.network.replaying_publisher import ReplayingPublisher
+from kouxing.shared.network.sockets import Socket
 from kouxing.shared.phones.events import Waveform
-from kouxing.shared.replaying_publisher import ReplayingPublisher
-from kouxing.shared.sockets import Socket
+from kouxing.shared.service.overload import CATCH_UP_S, SkipPolicy
+from kouxing.shared.settings.keys import NO_PEER
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_to_message
 from kouxing.shared.wire.face import CurrentFace

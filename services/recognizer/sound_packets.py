@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from kouxing_client.messages import Sound
 
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
-from kouxing.shared.pcm import as_integers
 from kouxing.shared.phones.events import Waveform
 from kouxing.shared.wire.speech import AudioState, Progress
 

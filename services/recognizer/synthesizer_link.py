@@ -10,9 +10,9 @@ from collections.abc import Set as AbstractSet
 from kouxing_client.messages import Message, Phone, Speech
 
 from kouxing.shared.clock import to_samples
-from kouxing.shared.message_loop import Handler, MessageLoop
-from kouxing.shared.reliable import ReliableSender
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.reliable import ReliableSender
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.message_loop import Handler, MessageLoop
 from kouxing.shared.wire.events import is_state_report
 from kouxing.shared.wire.speech import Acknowledge, LipPositions, NewestFrame, Progress
 

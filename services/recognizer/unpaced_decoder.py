@@ -7,8 +7,8 @@ from operator import attrgetter
 from kouxing.services.recognizer.live_batch_decoder import MAX_BATCH_S, LiveBatchDecoder
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
-from kouxing.shared.message_loop import MessageLoop
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.message_loop import MessageLoop
 
 MAX_UNPACED_S = 0.06  # limit for unpaced audio decoded at a time, while live sessions are open
 

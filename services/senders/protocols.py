@@ -8,8 +8,8 @@ from kouxing.services.senders.osc import OscConnection
 from kouxing.services.senders.target import Target, is_host, parse_delay_s
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
-from kouxing.shared.endpoints import is_loopback
 from kouxing.shared.errors import UserError
+from kouxing.shared.settings.endpoints import is_loopback
 
 LOOPBACK = "127.0.0.1"
 MAX_TEXT = 64  # characters of an option without fixed values

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from kouxing.shared.endpoints import is_loopback
 from kouxing.shared.errors import UserError
+from kouxing.shared.settings.endpoints import is_loopback
 
 MAX_DELAY_MS = 10_000.0
 

@@ -18,10 +18,10 @@ from kouxing.services.senders.connection import RETRY_S, TargetConnection
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import key_folder
-from kouxing.shared.logs import LOG
-from kouxing.shared.output_file import write_private
-from kouxing.shared.user_file import parse_json, read_text
+from kouxing.shared.files.output_file import write_private
+from kouxing.shared.files.user_file import parse_json, read_text
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.settings.keys import key_folder
 
 _TOKENS = "vtube-studio.json"
 _MAX_TOKENS_BYTES = 1 << 20

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from kouxing.services.lip_models import lip_model_info, lip_model_names
-from kouxing.shared.config import BoundEndpoint, KnownNames, ValueHint
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig, LiveConfig
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
+from kouxing.shared.settings.config import BoundEndpoint, KnownNames, ValueHint
 
 
 def _delay_ms(values: Mapping[str, Any]) -> float:

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from kouxing_client.messages import Lateness
 
-from kouxing.shared.metrics import percentile
+from kouxing.shared.monitoring.metrics import percentile
 
 NO_LATENESS = Lateness(p50_ms=0.0, p95_ms=0.0, worst_ms=0.0)
 WINDOW_S = 10.0  # as in services/gateway/page/lateness.js

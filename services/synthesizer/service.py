@@ -27,19 +27,19 @@ from kouxing.services.synthesizer.face_animator import REST_S, Frame
 from kouxing.services.synthesizer.face_maker import FaceMaker
 from kouxing.services.synthesizer.lateness import NO_LATENESS
 from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
-from kouxing.shared.bus import PHONES
 from kouxing.shared.clock import to_samples, to_seconds
-from kouxing.shared.endpoints import key_of
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.keys import Peer
-from kouxing.shared.logs import LOG
-from kouxing.shared.message_loop import MAX_TURN_S, Handler
-from kouxing.shared.overload import CATCH_UP_S, MAX_LATE_FOR_S
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.network.bus import PHONES
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.session_service import SessionService
+from kouxing.shared.service.message_loop import MAX_TURN_S, Handler
+from kouxing.shared.service.overload import CATCH_UP_S, MAX_LATE_FOR_S
+from kouxing.shared.service.session_service import SessionService
+from kouxing.shared.settings.endpoints import key_of
+from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.events import (
     SpeechMessage,

@@ -13,12 +13,12 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.overload import SkipPolicy
+from kouxing.shared.network.reliable import ReliableReceiver
+from kouxing.shared.network.replaying_publisher import ReplayingPublisher
+from kouxing.shared.network.sockets import Socket
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, SoundEvent
-from kouxing.shared.reliable import ReliableReceiver
-from kouxing.shared.replaying_publisher import ReplayingPublisher
-from kouxing.shared.sockets import Socket
+from kouxing.shared.service.overload import SkipPolicy
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.final_time import FinalTimeTracker
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from kouxing.shared.config import ServiceConfig, Switch
+from kouxing.shared.settings.config import ServiceConfig, Switch
 
 _IDLE_MOTION_SEED = 3
 

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.output_file import open_output
-from kouxing.shared.user_file import read_file, split_lines
+from kouxing.shared.files.output_file import open_output
+from kouxing.shared.files.user_file import read_file, split_lines
 
 _VERSION = "2.1"
 MAX_BYTES = 256 << 20  # several hours

@@ -7,7 +7,7 @@ is ``value * FAPU / 1024``, an angle ``value * 1e-5`` rad.
 import math
 from dataclasses import dataclass
 
-from kouxing.shared.tsv_tables import read_table
+from kouxing.shared.files.tsv_tables import read_table
 
 NUM_FAPS = 68
 FAP_UNITS_PER_FAPU = 1024.0

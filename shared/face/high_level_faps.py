@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.tsv_tables import read_table
+from kouxing.shared.files.tsv_tables import read_table
 
 Float32 = NDArray[np.float32]
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
+from kouxing.shared.files.tsv_tables import read_table
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable, load_inventory
 from kouxing.shared.phones.universal.segments import nearest_phone, symbol_to_ipa
-from kouxing.shared.tsv_tables import read_table
 
 if TYPE_CHECKING:  # it needs NumPy, which commands import only if they need it
     from kouxing.shared.phones.events import Phone

@@ -42,9 +42,9 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.tsv_tables import read_table
 from kouxing.shared.phones.table_language import SETTINGS, TableLanguage, load_table_language
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
-from kouxing.shared.tsv_tables import read_table
 
 TABLE_LANGUAGES = (
     "cantonese dutch english french german hindi indonesian italian japanese korean polish"

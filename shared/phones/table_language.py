@@ -33,6 +33,7 @@ from importlib import resources
 from itertools import chain
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.tsv_tables import read_table
 from kouxing.shared.phones.espeak import transcribe_phrases
 from kouxing.shared.phones.mecab import has_mecab, read_numbers, split_words
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
@@ -42,7 +43,6 @@ from kouxing.shared.phones.universal.segments import (
     remove_language_flags,
     symbol_to_ipa,
 )
-from kouxing.shared.tsv_tables import read_table
 
 SETTINGS = "language.toml"
 _REQUIRED = ("code", "titles", "voice", "scripts")  # keys of the settings

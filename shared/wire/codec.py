@@ -11,7 +11,7 @@ import msgspec
 from kouxing_client.field_types import Name, Version
 from kouxing_client.messages import VERSION, Message, topic
 
-from kouxing.shared.field_errors import describe_field_error
+from kouxing.shared.wire.field_errors import describe_field_error
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import DOCUMENT
 

@@ -22,7 +22,7 @@ from kouxing_client.messages import Lateness, SessionFacts
 from msgspec import Meta, Struct, field
 
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import MAX_KEYS, MAX_ROLES
+from kouxing.shared.settings.keys import MAX_KEYS, MAX_ROLES
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import RegisteredMessage
 from kouxing.shared.wire.session import OpenSession, session_id_of

@@ -8,8 +8,8 @@ import pytest
 from kouxing_client import Client, Session
 
 from kouxing.services.cli.main import main
-from kouxing.shared.bus import Bus
-from kouxing.shared.keys import load_user_key
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.settings.keys import load_user_key
 from tests.browser import Browser
 from tests.e2e.page_actions import write_tone
 from tests.e2e.page_control import PageControl

@@ -13,13 +13,13 @@ from kouxing_client.keys import Key
 from kouxing_client.messages import FapFrame, Joined, Message
 
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.bus import Bus, ProbeResult
-from kouxing.shared.config import ServiceConfig
-from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import key_folder, load_key
-from kouxing.shared.service import Service
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.bus import Bus, ProbeResult
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.base import Service
+from kouxing.shared.settings.config import ServiceConfig
+from kouxing.shared.settings.endpoints import split_endpoint, with_key
+from kouxing.shared.settings.keys import key_folder, load_key
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import AllowedKey
 from kouxing.shared.wire.session import StatusRequest

@@ -18,7 +18,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones import events

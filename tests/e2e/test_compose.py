@@ -15,7 +15,7 @@ import yaml
 from kouxing_client import Client
 
 from kouxing.evaluation.system.network import Network, NetworkLink
-from kouxing.shared.keys import control_endpoint
+from kouxing.shared.settings.keys import control_endpoint
 from tests.containers import READ_CAP, USER_ID, Containers, network_or_skip
 from tests.system import ROOT, VOWELS_FILE
 

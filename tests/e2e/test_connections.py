@@ -9,10 +9,10 @@ import pytest
 from kouxing_client.field_types import MAX_AUDIO_BYTES
 from kouxing_client.messages import FapFrame, Message
 
-from kouxing.shared import connection_limits, peer_quota, tarpit
-from kouxing.shared.bus import Bus
-from kouxing.shared.connection_limits import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
-from kouxing.shared.sockets import MAX_DROPPED, Poller, ReceivedMessage, Socket
+from kouxing.shared.network import connection_limits, peer_quota, tarpit
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.connection_limits import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
+from kouxing.shared.network.sockets import MAX_DROPPED, Poller, ReceivedMessage, Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.session import AudioChunk
 from kouxing.shared.wire.speech import Progress

@@ -22,11 +22,11 @@ from kouxing_client.messages import Event, Message, Phone, Speech
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
 from kouxing.evaluation.system.attacks import MemoryUsage
 from kouxing.services.control.service_registry import MAX_SERVICES_PER_KEY
-from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import add_key, key_folder, load_key, load_user_key, revoke_key
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.bus import Bus, ProbeResult
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.settings.keys import add_key, key_folder, load_key, load_user_key, revoke_key
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionProgress
 from kouxing.shared.wire.events import batch_messages
 from kouxing.shared.wire.session import AudioChunk, Error

@@ -20,7 +20,7 @@ from kouxing_client import Client
 from kouxing_client.keys import Key
 
 from kouxing.evaluation.system.attackers import connect
-from kouxing.shared.keys import load_key, load_user_key
+from kouxing.shared.settings.keys import load_key, load_user_key
 from tests.documents import code_blocks
 from tests.e2e.streaming import StreamedSession
 from tests.system import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.keys import key_folder, read_grants
+from kouxing.shared.settings.keys import key_folder, read_grants
 from tests.e2e.conftest import CommandRunner
 from tests.e2e.streaming import stream_audio
 from tests.system import SERVICE, System, kouxing, own_addresses, start_python, wait_until

@@ -12,7 +12,7 @@ import pytest
 from kouxing_client import Client
 from kouxing_client.messages import FapFrame, Phone
 
-from kouxing.shared.bus import Bus
+from kouxing.shared.network.bus import Bus
 from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.system import CHAIN, DEMO, LIMIT_S, System, samples_of_file
 

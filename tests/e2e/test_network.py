@@ -13,7 +13,7 @@ from kouxing_client import Client
 from kouxing.evaluation.system.live import ReceivedResults, speak, speak_undisturbed
 from kouxing.evaluation.system.network import NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
-from kouxing.shared.keys import CLIENT
+from kouxing.shared.settings.keys import CLIENT
 from tests.containers import network_or_skip
 from tests.system import DEMO, SKIP_NO_AUDIO, samples_of_file
 

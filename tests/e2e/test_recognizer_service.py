@@ -16,10 +16,10 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.live_batch_decoder import MAX_BATCH_S
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.recognizer.unpaced_decoder import MAX_UNPACED_S
-from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import Peer
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import AudioChunk, Error

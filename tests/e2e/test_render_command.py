@@ -25,7 +25,7 @@ from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.service_kinds import read_settings
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL

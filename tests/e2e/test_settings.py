@@ -19,7 +19,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.config import variable_name
+from kouxing.shared.settings.config import variable_name
 from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.system import LIMIT_S, VOWELS_FILE, System, samples_of_file, wait_until
 

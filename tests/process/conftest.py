@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from kouxing.shared.bus import Bus
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Socket
 from tests.control_harness import ControlHarness
 from tests.fake_control import FakeControl
 

@@ -29,7 +29,7 @@ from kouxing_client import (
 from kouxing_client.base import MAX_LIVE
 from kouxing_client.messages import EndOfFaps, Event
 
-from kouxing.shared.keys import add_key, load_user_key
+from kouxing.shared.settings.keys import add_key, load_user_key
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import CloseSession, Error, OpenSession
 from tests.fake_control import FakeControl

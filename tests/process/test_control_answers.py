@@ -11,10 +11,10 @@ import pytest
 import zmq
 from kouxing_client.messages import Message, Speech
 
-from kouxing.shared.bus import Bus
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import add_key, load_user_key, read_key, revoke_key
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.settings.keys import add_key, load_user_key, read_key, revoke_key
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionProgress
 from kouxing.shared.wire.face import FaceSettings, SetFace

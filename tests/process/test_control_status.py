@@ -6,10 +6,10 @@ import secrets
 import pytest
 
 from kouxing.services.control import status_reporter as control_status
-from kouxing.shared.bus import Bus
-from kouxing.shared.endpoints import key_of
-from kouxing.shared.keys import load_key
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.settings.endpoints import key_of
+from kouxing.shared.settings.keys import load_key
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import Error, StatusReport, StatusRequest
 from tests.control_harness import ControlHarness

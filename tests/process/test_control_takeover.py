@@ -7,7 +7,7 @@ from kouxing_client.messages import Speech
 
 from kouxing.services.control import restart_recovery, session_lifecycle
 from kouxing.shared.fast_record import replace
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.sockets import Socket
 from kouxing.shared.wire.control import (
     Heartbeat,
     SessionProgress,

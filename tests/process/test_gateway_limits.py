@@ -24,7 +24,7 @@ from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.services.gateway.web_server import WebServer
 from kouxing.services.gateway.whip_handler import NO_WEBRTC, WhipHandler
-from kouxing.shared.metrics import Metrics
+from kouxing.shared.monitoring.metrics import Metrics
 from tests.process.web_clients import async_test
 from tests.system import LIMIT_S
 

@@ -46,7 +46,7 @@ print(signal.getitimer(signal.ITIMER_REAL))
 # `CTRL_C_COMMAND` runs as the command line, with Ctrl-C in a function that FFmpeg calls.
 INTERRUPT_IN_FFMPEG = """
 import signal
-from kouxing.shared import media_file
+from kouxing.shared.audio import media_file
 call = media_file._GuardedFile._call
 presses = [signal.SIGINT]
 

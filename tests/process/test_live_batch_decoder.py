@@ -6,8 +6,8 @@ from typing import Any, cast
 from kouxing.services.recognizer.live_batch_decoder import LiveBatchDecoder
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.session import RecognizerSession
-from kouxing.shared.metrics import LoadMeter
-from kouxing.shared.overload import SkipPolicy
+from kouxing.shared.monitoring.metrics import LoadMeter
+from kouxing.shared.service.overload import SkipPolicy
 
 
 class FakeAudio(list[int]):

@@ -13,11 +13,11 @@ from kouxing_client import Client, FapFrame
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
-from kouxing.shared.audio_file import read_audio
-from kouxing.shared.config import variable_name
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
-from kouxing.shared.metrics import Metrics
-from kouxing.shared.prometheus import MAX_REQUESTS, MetricsServer
+from kouxing.shared.monitoring.metrics import Metrics
+from kouxing.shared.monitoring.prometheus import MAX_REQUESTS, MetricsServer
+from kouxing.shared.settings.config import variable_name
 from tests.raw_bytes import flood
 from tests.system import CHAIN, LIMIT_S, ROOT, VOWELS_FILE, System, free_port
 

@@ -10,12 +10,11 @@ from kouxing_client.keys import Key, read_key
 
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
-from kouxing.shared.bus import Bus
 from kouxing.shared.clock import now_ns
-from kouxing.shared.config import ServiceConfig
 from kouxing.shared.fast_record import replace
-from kouxing.shared.keys import format_key, key_folder, revoke_key
-from kouxing.shared.service import (
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.base import (
     EXIT_AFTER_S,
     HEARTBEAT_S,
     IDLE_HEARTBEAT_S,
@@ -26,9 +25,10 @@ from kouxing.shared.service import (
     TICK_S,
     Service,
 )
-from kouxing.shared.service_kind import ServiceKind
-from kouxing.shared.session_service import SessionService
-from kouxing.shared.sockets import Socket
+from kouxing.shared.service.service_kind import ServiceKind
+from kouxing.shared.service.session_service import SessionService
+from kouxing.shared.settings.config import ServiceConfig
+from kouxing.shared.settings.keys import format_key, key_folder, revoke_key
 from kouxing.shared.wire.control import Heartbeat, SessionProgress, SessionStarted
 from kouxing.shared.wire.session import Error, FlushSession
 from kouxing.shared.wire.speech import Progress
@@ -56,8 +56,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     new_clock = Clock()
-    for module in ("service", "message_loop"):
-        monkeypatch.setattr(f"kouxing.shared.{module}.time", new_clock)
+    for module in ("base", "message_loop"):
+        monkeypatch.setattr(f"kouxing.shared.service.{module}.time", new_clock)
     return new_clock
 
 
@@ -235,7 +235,7 @@ def test_resyncs_with_control_after_a_stall(
 ) -> None:
     run_until(worker, lambda: worker._control_instance)
     # While a machine is suspended, its wall clock may be set back.
-    monkeypatch.setattr("kouxing.shared.service.now_ns", lambda: now_ns() + step_ns)
+    monkeypatch.setattr("kouxing.shared.service.base.now_ns", lambda: now_ns() + step_ns)
     with Bus() as bus:
         bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
         assert worker.input.wait(LIMIT_S)
@@ -288,8 +288,8 @@ def test_registers_at_an_address_where_another_program_answered_before(
     monkeypatch: pytest.MonkeyPatch, curve: bool, rest: bytes
 ) -> None:
     for limit in ("NO_REPLY_S", "FIRST_REPLY_S"):
-        monkeypatch.setattr(f"kouxing.shared.service.{limit}", 0.3)
-    monkeypatch.setattr("kouxing.shared.service.reach_error", lambda *_, **__: "not asked")
+        monkeypatch.setattr(f"kouxing.shared.service.base.{limit}", 0.3)
+    monkeypatch.setattr("kouxing.shared.service.base.reach_error", lambda *_, **__: "not asked")
     listener = socket.create_server(("127.0.0.1", 0))
     commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
     worker = Worker(commands)
@@ -365,7 +365,7 @@ def test_a_health_check_ends_a_process_whose_loop_hangs(
     slow: SlowService, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[int] = []
-    monkeypatch.setattr("kouxing.shared.service.os._exit", ends.append)
+    monkeypatch.setattr("kouxing.shared.service.base.os._exit", ends.append)
     slow.step(0.0)
     assert slow.check_health()
     clock.now_s += IDLE_HEARTBEAT_S + MAX_LATE_S

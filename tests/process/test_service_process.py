@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.shared.config import variable_name
+from kouxing.shared.settings.config import variable_name
 from tests.system import (
     CODE_PATH,
     LIMIT_S,

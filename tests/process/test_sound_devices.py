@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kouxing.shared.audio.sound_devices import list_sound_devices, open_monitor
 from kouxing.shared.errors import UserError
-from kouxing.shared.sound_devices import list_sound_devices, open_monitor
 
 SOURCES = [
     {"name": "mic0", "description": "A microphone", "properties": {"device.class": "sound"}},

@@ -7,7 +7,7 @@ from collections.abc import Generator, Iterator
 import numpy as np
 import pytest
 
-from kouxing.shared.sound_devices import list_sound_devices, open_monitor
+from kouxing.shared.audio.sound_devices import list_sound_devices, open_monitor
 from tests.sound_server import sound_server
 from tests.system import wait_until
 

@@ -14,7 +14,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange, Waveform
 from tests.live_streams import recognize_live

@@ -20,13 +20,13 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import SynthesizerService
-from kouxing.shared import connection_limits, sockets
-from kouxing.shared.bus import Bus
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
-from kouxing.shared.service import Service
-from kouxing.shared.session_service import SessionService
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network import connection_limits, sockets
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.base import Service
+from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import SessionProgress, SessionStarted, StartSession
 from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest

@@ -9,7 +9,7 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from kouxing.shared.audio_file import AudioSource
+from kouxing.shared.audio.audio_file import AudioSource
 
 SUFFIXES = {  # of each codec, for formats that soundfile cannot write
     "aac": "aac m4a mp4 flv ts latm", "libopus": "webm opus", "pcm_s16le": "avi mkv voc sf",

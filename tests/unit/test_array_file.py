@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.array_file import read_arrays
 
 MIB = 1024 * 1024
 

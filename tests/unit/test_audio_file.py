@@ -6,7 +6,7 @@ import pytest
 import soundfile
 
 from kouxing.services.mono_audio import read_mono_16k
-from kouxing.shared.audio_file import open_audio, read_audio
+from kouxing.shared.audio.audio_file import open_audio, read_audio
 from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
 from tests.unit.media import samples_of, write_media

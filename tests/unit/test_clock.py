@@ -9,7 +9,7 @@ from kouxing.services.cli.service_process import POLL_S, SilenceMeter
 from kouxing.services.control.fault_log import FaultLog
 from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import ClockOffset, StallDetector
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
 
 
 def test_the_exchange_with_the_shortest_round_trip_gives_the_offset() -> None:

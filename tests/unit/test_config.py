@@ -16,8 +16,8 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES
 from kouxing.services.service_kinds import CONFIG_TYPES, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.config import KnownNames, ServiceConfig, Settings, parse_assignments
 from kouxing.shared.errors import UserError
+from kouxing.shared.settings.config import KnownNames, ServiceConfig, Settings, parse_assignments
 from tests.documents import code_blocks
 from tests.system import ROOT
 

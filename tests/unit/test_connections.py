@@ -6,9 +6,9 @@ from unittest import mock
 
 import pytest
 
-from kouxing.shared import connection_limits, kernel_sockets, peer_quota
-from kouxing.shared.bus import AUDIO
-from kouxing.shared.connection_limits import (
+from kouxing.shared.network import connection_limits, kernel_sockets, peer_quota
+from kouxing.shared.network.bus import AUDIO
+from kouxing.shared.network.connection_limits import (
     NEW_CHECKS,
     NUM_ENDED_BEFORE_TRIM,
     PENALTY_S,
@@ -16,10 +16,10 @@ from kouxing.shared.connection_limits import (
     ConnectionLimiter,
     PeerConnection,
 )
-from kouxing.shared.kernel_sockets import Traffic
-from kouxing.shared.peer_budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, PeerBudget
-from kouxing.shared.socket_limits import MAX_QUEUED
-from kouxing.shared.tarpit import GAP_S, HOLD_S
+from kouxing.shared.network.kernel_sockets import Traffic
+from kouxing.shared.network.peer_budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, PeerBudget
+from kouxing.shared.network.socket_limits import MAX_QUEUED
+from kouxing.shared.network.tarpit import GAP_S, HOLD_S
 
 
 class SocketHarness:

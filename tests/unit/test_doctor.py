@@ -6,7 +6,7 @@ import pytest
 from kouxing_client import ServiceState
 
 from kouxing.services.cli import doctor
-from kouxing.shared.bus import Bus
+from kouxing.shared.network.bus import Bus
 
 ELSEWHERE = {
     "recognizer": {"audio": "tcp://10.0.0.2:5560", "phones": "tcp://10.0.0.2:5561"},

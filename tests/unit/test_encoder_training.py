@@ -11,8 +11,8 @@ import torch
 from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
 from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
 from kouxing.services.recognizer.onnx_session import create_inference_session
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_integers
 from kouxing.training.encoder import batches, lip_teacher, recipe, targets
 from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
 from kouxing.training.encoder.export import export_onnx

@@ -9,7 +9,7 @@ import pytest
 import soundfile
 from numpy.typing import NDArray
 
-from kouxing.shared.encoding_check import EncodingCheck
+from kouxing.shared.audio.encoding_check import EncodingCheck
 from kouxing.shared.errors import UserError
 from tests.system import DEMO, samples_of_file
 from tests.unit.media import write_media

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.endpoints import local_address
+from kouxing.shared.settings.endpoints import local_address
 
 ROUTES = {"10.77.0.1": "10.77.0.2", "fd77::1": "fd77::2", "192.0.2.1": "10.88.0.2"}
 

@@ -8,7 +8,7 @@ import pytest
 from kouxing_client import Refused
 
 from kouxing.services.cli.clients import express
-from kouxing.shared import client_connection
+from kouxing.shared.command import client_connection
 
 
 class FakeClient:

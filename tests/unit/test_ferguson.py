@@ -22,7 +22,7 @@ from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
 )
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.fast_record import replace

@@ -5,8 +5,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from kouxing.shared.field_errors import describe_field_error
 from kouxing.shared.name_rules import NAME_RULE
+from kouxing.shared.wire.field_errors import describe_field_error
 from kouxing.shared.wire.session import OpenSession
 
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.lips.four_schemes import delay_by_one_phone, without_corrections
-from kouxing.shared.audio_file import check_video
+from kouxing.shared.audio.audio_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.corpora import write_manifest
 from tests.lips import phone

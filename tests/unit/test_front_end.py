@@ -15,7 +15,7 @@ from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
 from kouxing.services.recognizer.front_end.slices import level_db
 from kouxing.services.recognizer.front_end.vtln import REFERENCE_HZ, VocalTractNormalizer
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel, mel_bands
-from kouxing.shared.pcm import decode_pcm
+from kouxing.shared.audio.pcm import decode_pcm
 
 
 def test_int16_samples_are_scaled_to_one() -> None:

@@ -27,7 +27,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.face.shapes import VRM
-from kouxing.shared.metrics import Metrics
+from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
 
 LONG_PROFILE = "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import (
+from kouxing.shared.settings.keys import (
     MAX_KEYS,
     MAX_ROLES,
     Grant,
@@ -43,7 +43,7 @@ def test_creates_private_keys_on_first_use() -> None:
 
 
 def test_concurrent_processes_create_one_key() -> None:
-    program = "from kouxing.shared.keys import load_user_key; print(load_user_key())"
+    program = "from kouxing.shared.settings.keys import load_user_key; print(load_user_key())"
     started = [
         subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(4)
     ]

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from kouxing.services.service_kinds import CONFIG_TYPES, KINDS
-from kouxing.shared.config import BindAddress, Settings, bound_keys
+from kouxing.shared.settings.config import BindAddress, Settings, bound_keys
 from tests.system import ROOT
 
 FOLDER = ROOT / "deploy" / "kubernetes"

@@ -13,7 +13,7 @@ import pytest
 
 from kouxing.services.cli.log_file import LogFile
 from kouxing.services.process import run_service
-from kouxing.shared.logs import LOG, configure
+from kouxing.shared.monitoring.logs import LOG, configure
 
 
 class Crashing:

@@ -8,7 +8,7 @@ import pytest
 import soundfile
 
 from kouxing.corpora.lip_tracking import read_video
-from kouxing.shared.audio_file import AudioSource, check_video, open_audio, read_audio
+from kouxing.shared.audio.audio_file import AudioSource, check_video, open_audio, read_audio
 from kouxing.shared.errors import UserError
 from tests.unit.media import samples_of, write_media, write_sound, write_tracks
 

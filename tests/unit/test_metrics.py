@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kouxing.shared.metrics import WINDOW, LoadMeter, Metrics, percentile
+from kouxing.shared.monitoring.metrics import WINDOW, LoadMeter, Metrics, percentile
 
 
 def test_a_snapshot_has_counts_percentiles_and_rates() -> None:

@@ -21,9 +21,9 @@ from kouxing.services.cli.options import ExportOptions
 from kouxing.services.cli.running_system import lock_output_folder
 from kouxing.services.driver.video.film import TimedFaps
 from kouxing.services.driver.video.video_writer import PictureSequence, check_name
+from kouxing.shared.command.terminal import check_output, write_text
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import open_output
-from kouxing.shared.terminal import check_output, write_text
+from kouxing.shared.files.output_file import open_output
 from tests.system import VOWELS_FILE
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.audio_queue import AudioQueue
-from kouxing.shared.overload import CATCH_UP_S, LIGHT_FOR_S, MAX_LATE_FOR_S, SkipPolicy
+from kouxing.shared.service.overload import CATCH_UP_S, LIGHT_FOR_S, MAX_LATE_FOR_S, SkipPolicy
 
 MAX_LAG_S = 0.2
 CHUNK_S = 0.02

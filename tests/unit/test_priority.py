@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import kouxing
-from kouxing.shared import priority
+from kouxing.shared.service import priority
 
 
 @pytest.mark.parametrize("leads_session", [False, True])

@@ -21,8 +21,8 @@ from kouxing.services.recognizer.session import (
 )
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
+from kouxing.shared.network.sockets import Socket
 from kouxing.shared.phones.events import SpeechChange
-from kouxing.shared.sockets import Socket
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import AudioChunk, ErrorCode
 from kouxing.shared.wire.speech import (

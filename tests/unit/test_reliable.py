@@ -6,14 +6,14 @@ from typing import Any, cast
 
 from kouxing_client.messages import Message
 
-from kouxing.shared.keys import Peer
-from kouxing.shared.reliable import (
+from kouxing.shared.network.reliable import (
     ACKNOWLEDGE_INTERVAL_S,
     MAX_UNACKNOWLEDGED_S,
     RESEND_AFTER_S,
     ReliableReceiver,
     ReliableSender,
 )
+from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.events import split_batch
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
 

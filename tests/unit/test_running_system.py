@@ -17,7 +17,7 @@ from kouxing.services.cli.running_system import (
     lock_startup,
 )
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import load_user_key
+from kouxing.shared.settings.keys import load_user_key
 
 
 @pytest.fixture(autouse=True)

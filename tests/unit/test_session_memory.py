@@ -11,8 +11,8 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
-from kouxing.shared.audio_file import read_audio
-from kouxing.shared.metrics import memory_mb, trim_heap
+from kouxing.shared.audio.audio_file import read_audio
+from kouxing.shared.monitoring.metrics import memory_mb, trim_heap
 from tests.system import DEMO
 
 pytestmark = pytest.mark.slow

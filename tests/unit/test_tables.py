@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from kouxing.evaluation.tables import figures_table
-from kouxing.shared.terminal import print_table
+from kouxing.shared.command.terminal import print_table
 
 COLUMNS = ("scale", "condition", "all scores", "without outliers", "judges", "outliers")
 ROWS = [

@@ -17,7 +17,7 @@ from kouxing.services.recognizer.alignment import align_text, drop_pauses
 from kouxing.services.recognizer.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.audio_file import read_audio
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory

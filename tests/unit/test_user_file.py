@@ -21,7 +21,7 @@ from kouxing.services.driver.render.scene import load_head
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from kouxing.shared.audio_file import (
+from kouxing.shared.audio.audio_file import (
     check_video,
     limited_blocks,
     open_audio,
@@ -29,9 +29,9 @@ from kouxing.shared.audio_file import (
     read_duration_s,
 )
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import read_key
+from kouxing.shared.files.user_file import open_file, parse_json, read_file, read_text
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.user_file import open_file, parse_json, read_file, read_text
+from kouxing.shared.settings.keys import read_key
 
 
 def read_manifest(path: Path) -> None:

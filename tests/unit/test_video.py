@@ -18,7 +18,7 @@ from kouxing.services.driver.video.video_renderer import VideoRenderer
 from kouxing.services.driver.video.video_writer import VideoWriter, open_writer
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.output_file import remove_unfinished
+from kouxing.shared.files.output_file import remove_unfinished
 
 
 def test_pictures_and_sound_are_in_sync(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from kouxing.services.gateway.sample_sentence import SampleSentence
 from kouxing.services.gateway.viewer_handler import ViewerHandler
 from kouxing.services.gateway.web_application import OpenWebSockets
 from kouxing.services.gateway.whip_handler import MAX_COMMANDS, WhipHandler, _Client
-from kouxing.shared.metrics import Metrics
+from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
 from tests.fake_time import run
 

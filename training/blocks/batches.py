@@ -20,7 +20,7 @@ from scipy.ndimage import uniform_filter1d
 
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.networks.augmentation import (
     Samples,
     add_sounds,

@@ -34,8 +34,8 @@ from kouxing.services.recognizer.acoustic.model_file import (
     parse_topology,
 )
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, count_frames
-from kouxing.shared.pcm import as_floats, as_integers
-from kouxing.shared.terminal import print_message
+from kouxing.shared.audio.pcm import as_floats, as_integers
+from kouxing.shared.command.terminal import print_message
 from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, BatchSource
 from kouxing.training.blocks.export import export_onnx
 from kouxing.training.blocks.network import READOUT, BlockEncoder, BlockReadout

@@ -16,7 +16,7 @@ from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
 from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.encoder.network import NUM_INPUTS
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, Samples, TargetColumns
 from kouxing.training.encoder.teachers import POSITION_SAMPLES

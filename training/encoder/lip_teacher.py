@@ -39,8 +39,8 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
 from kouxing.services.recognizer.lip_predictor import NUM_LIP_FAPS
-from kouxing.shared.output_file import open_output
-from kouxing.shared.pcm import as_integers
+from kouxing.shared.audio.pcm import as_integers
+from kouxing.shared.files.output_file import open_output
 from kouxing.shared.phones.events import Phone
 from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.lips.recipe import measure_scale, repeats_by_source, standardize

@@ -31,10 +31,10 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, rea
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.encoder import VoiceKind
+from kouxing.shared.audio.pcm import as_integers
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_integers
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.terminal import print_message
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.encoder.batches import BATCH_S, Batch, BatchSource, draw_batch
 from kouxing.training.encoder.export import save_encoder

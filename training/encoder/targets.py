@@ -33,9 +33,9 @@ from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.encoder import VoiceKind
+from kouxing.shared.audio.pcm import as_floats, as_integers
+from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_floats, as_integers
-from kouxing.shared.terminal import write_text
 from kouxing.training.encoder.lip_teacher import LipTeacher, TeacherFeatures
 from kouxing.training.encoder.singing import sing
 from kouxing.training.encoder.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers

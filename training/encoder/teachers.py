@@ -33,7 +33,7 @@ from torch.nn.functional import pad
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.blocks.exported import rebuild_encoder, rebuild_readout
 from kouxing.training.blocks.network import block_layout
 from kouxing.training.device import DEVICE, mixed_precision

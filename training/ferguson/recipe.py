@@ -39,11 +39,11 @@ from kouxing.services.synthesizer.lips.ferguson.contour import load_lip_points
 from kouxing.services.synthesizer.lips.ferguson.key_frames import build_anchors
 from kouxing.services.synthesizer.lips.ferguson.phone_table import COLUMNS, MAX_OPENING, PhoneTable
 from kouxing.services.synthesizer.lips.ferguson.timing import OnsetCrossings
+from kouxing.shared.command.terminal import print_message, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
-from kouxing.shared.terminal import print_message, write_text
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from kouxing.services.recognizer.front_end.features import (
     LogMel,
     compute_cepstra_batch,
 )
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.audio.pcm import as_floats
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.terminal import print_message
 from kouxing.training.gmm.estimation import (
     FrameSet,
     HmmParameters,

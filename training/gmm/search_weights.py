@@ -12,8 +12,8 @@ from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology, score_segment
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
 from kouxing.services.recognizer.search.decoder import Decoder
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
-from kouxing.shared.terminal import print_message
 from kouxing.training.training_set import Example, load_examples
 
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import check_content
+from kouxing.shared.files.user_file import check_content
 from kouxing.training.heads import subdivision
 
 Float = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import FORMAT
-from kouxing.shared.output_file import open_output
+from kouxing.shared.files.output_file import open_output
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.fitted_mesh import FittedMesh
 from kouxing.training.heads.makehuman import FEATURE_POINTS, METERS_PER_UNIT, PIVOT, BaseMesh

@@ -32,7 +32,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import butter, fftconvolve, resample_poly, sosfilt
 
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.audio.pcm import as_floats
 
 Samples = NDArray[np.float32]
 Sound = NDArray[np.floating[Any]]  # samples during processing

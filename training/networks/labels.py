@@ -29,8 +29,8 @@ from kouxing.services.recognizer.search.forced_path import (
     viterbi_path,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import as_floats
 from kouxing.training.durations import PhoneDurations
 from kouxing.training.networks.batches import FrameTargets, LabeledRecording
 from kouxing.training.networks.teacher import WholeEncoder, train_teacher

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from kouxing.shared.terminal import print_message
+from kouxing.shared.command.terminal import print_message
 from kouxing.training.seed import SEED
 
 SAVE_EVERY = 25  # steps

@@ -38,7 +38,7 @@ from torch import Tensor
 
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, count_frames
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
-from kouxing.shared.pcm import as_floats
+from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.batches import (
     FrameTargets,

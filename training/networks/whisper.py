@@ -35,7 +35,7 @@ import torch
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import open_file
+from kouxing.shared.files.user_file import open_file
 from kouxing.training.device import DEVICE
 from kouxing.training.networks.network import Encoder, EncoderShape
 from kouxing.training.networks.teacher import KEPT_LAYERS, NUM_LAYERS, WholeEncoder

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.user_file import open_file, read_file
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.user_file import open_file, read_file
 from kouxing.training.phone_lm.recipe import PhoneStream, phones_of_text
 from kouxing.training.seed import SEED
 

@@ -34,10 +34,10 @@ from kouxing.services.recognizer.acoustic.model_file import (
     read_archive,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.user_file import read_text
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.terminal import print_message
-from kouxing.shared.user_file import read_text
 from kouxing.training.model_files import write_archive
 from kouxing.training.training_set import Example
 

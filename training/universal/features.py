@@ -25,7 +25,7 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import load_or_compute, read_audio
 from kouxing.corpora.speech_corpus import Utterance
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.terminal import write_text
+from kouxing.shared.command.terminal import write_text
 from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.seed import SEED
 from kouxing.training.universal.encoder import BLOCK_LENGTH, LENGTH, MAX_FRAMES, FeatureEncoder

@@ -17,9 +17,9 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.decoder import PathSegment
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
-from kouxing.shared.terminal import print_message
 from kouxing.training.model_card import write_card
 from kouxing.training.model_files import save_universal
 from kouxing.training.networks.labels import STATES_PER_PHONE, Alignment, alignment_statistics

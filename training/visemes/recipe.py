@@ -26,10 +26,10 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     VISEMES,
 )
+from kouxing.shared.command.terminal import write_text
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.shared.terminal import write_text
 from kouxing.training.visemes.fit import Array, collect_frames, fit_parameters
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones

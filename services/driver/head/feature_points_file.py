@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import read_file
+from kouxing.shared.files.user_file import read_file
 
 MAX_BYTES = 4 * 1024 * 1024
 # ISO/IEC 14496-2, annex C: number of points per group

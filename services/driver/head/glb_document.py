@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.output_file import open_output
+from kouxing.shared.files.output_file import open_output
 
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
 MAX_SHORT_VERTICES = 65535  # more vertices need 4-byte indices; 65535 itself is not a valid index

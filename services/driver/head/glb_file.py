@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import check_content, parse_json, read_file
+from kouxing.shared.files.user_file import check_content, parse_json, read_file
 
 MAX_BYTES = 512 << 20  # limit for all files together, unpacked
 MAX_COUNT = 2_000_000  # elements of an accessor

@@ -34,10 +34,10 @@ from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.head.normal_updater import NormalUpdater
 from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
-from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.user_file import check_content
+from kouxing.shared.files.array_file import read_arrays
+from kouxing.shared.files.user_file import check_content
 
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"

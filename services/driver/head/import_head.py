@@ -30,7 +30,7 @@ from kouxing.services.driver.head.skin_fields import (
 from kouxing.services.driver.head.surface import Geodesics
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
-from kouxing.shared.output_file import open_output
+from kouxing.shared.files.output_file import open_output
 
 MAX_VERTICES = 65_535  # limit of 16-bit indices in the page's GLB
 REQUIRED_POINTS = ("2.1", *sorted(INNER_LIPS), "2.10", *sorted(OUTER_LIPS))

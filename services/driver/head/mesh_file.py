@@ -14,7 +14,7 @@ from kouxing.services.driver.head.glb_file import Float64, GlbFile, check_glb
 from kouxing.services.driver.head.glb_pieces import read_pieces
 from kouxing.services.driver.head.mesh_pieces import MeshPiece
 from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import check_content, read_file
+from kouxing.shared.files.user_file import check_content, read_file
 
 MAX_MESH_BYTES = 32 << 20
 MAX_WORDS = 3_000_000

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import (
+from kouxing.shared.files.output_file import (
     UnfinishedFile,
     open_output,
     remove_unfinished,

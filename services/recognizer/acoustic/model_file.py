@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSITIONS, Topology
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
-from kouxing.shared.array_file import read_arrays
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.array_file import read_arrays
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
 # For model files without a phone language model.

@@ -31,8 +31,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.audio.pcm import FULL_SCALE
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.pcm import FULL_SCALE
 
 SAMPLE_RATE_HZ = MEDIA_RATE_HZ
 WINDOW_S = 0.025

@@ -11,8 +11,8 @@ import kaldi_native_fbank
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.audio.pcm import FULL_SCALE
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.pcm import FULL_SCALE
 
 _SLICE_MS = 20.0
 _PITCH_STEP = 0.01  # ratio of neighboring pitches minus 1; half of Kaldi's takes twice the time

@@ -4,7 +4,7 @@ import re
 import unicodedata
 from functools import cache
 
-from kouxing.shared.tsv_tables import read_table
+from kouxing.shared.files.tsv_tables import read_table
 
 _TIE = "\u0361"
 _OTHER_TIES = str.maketrans("\u035c\u200d", _TIE * 2)

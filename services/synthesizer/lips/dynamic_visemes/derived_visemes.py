@@ -14,7 +14,7 @@ from kouxing.shared.face.faps import (
     PROTRUSION_FAPS,
     TONGUE_FAPS,
 )
-from kouxing.shared.tsv_tables import read_table
+from kouxing.shared.files.tsv_tables import read_table
 
 Array = NDArray[np.float64]
 _OPENING = (3, *LIP_HEIGHT_FAPS)  # with the jaw

@@ -21,7 +21,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
-from kouxing.shared.user_file import check_content, parse_json, read_text
+from kouxing.shared.files.user_file import check_content, parse_json, read_text
 
 FORMAT = "kouxing viseme parameters 2"
 _BUILT_IN = Path(__file__).with_name("parameters.json")

@@ -15,8 +15,8 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.derived_visemes import (
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import LIP_HEIGHT_FAPS, LOWER_LIP_FAPS
+from kouxing.shared.files.tsv_tables import read_table
 from kouxing.shared.phones.inventory import PhoneInventory, VisemeFractions
-from kouxing.shared.tsv_tables import read_table
 
 REST = "rest"
 TRAINED_VISEMES = (

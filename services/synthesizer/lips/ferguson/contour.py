@@ -32,7 +32,7 @@ from scipy.interpolate import CubicSpline
 
 from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
-from kouxing.shared.tsv_tables import read_table
+from kouxing.shared.files.tsv_tables import read_table
 
 Array = NDArray[np.float64]
 

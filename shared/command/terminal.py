@@ -17,7 +17,7 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.output_file import open_output, write_error
+from kouxing.shared.files.output_file import open_output, write_error
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from kouxing.shared.audio_file import AudioSource, raw_audio
+from kouxing.shared.audio.audio_file import AudioSource, raw_audio
+from kouxing.shared.audio.media_file import RawFormat
+from kouxing.shared.audio.phase_cancellation import Samples
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.media_file import RawFormat
-from kouxing.shared.phase_cancellation import Samples
 
 _LATENCY_MS = 20  # latency of recordings of outputs and programs
 _TIMEOUT_S = 5.0

@@ -4,7 +4,7 @@ import contextlib
 import select
 import sys
 
-from kouxing.shared.waker import Waker
+from kouxing.shared.network.waker import Waker
 
 _REPORTS_ARRIVALS = sys.platform == "linux"  # elsewhere, every wait returns immediately
 

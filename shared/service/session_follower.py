@@ -7,8 +7,8 @@ from typing import Any
 from kouxing_client.follower import Follower
 from kouxing_client.messages import Message
 
-from kouxing.shared.session_service import SessionService
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.wire.control import StartSession
 
 

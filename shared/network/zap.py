@@ -7,9 +7,9 @@ import zmq
 from zmq.utils import z85
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.kernel_sockets import get_network
-from kouxing.shared.keys import Grant, Grants, grants_file, read_grants
-from kouxing.shared.logs import LOG
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.network.kernel_sockets import get_network
+from kouxing.shared.settings.keys import Grant, Grants, grants_file, read_grants
 
 
 class Zap:

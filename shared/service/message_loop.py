@@ -9,11 +9,11 @@ from typing import Any
 from kouxing_client.field_types import MAX_TEXT
 from kouxing_client.messages import Message
 
-from kouxing.shared.bus import Bus
-from kouxing.shared.keys import Peer
-from kouxing.shared.logs import LOG, RateLimit
-from kouxing.shared.metrics import Metrics
-from kouxing.shared.sockets import Poller, ReceivedMessage, Socket
+from kouxing.shared.monitoring.logs import LOG, RateLimit
+from kouxing.shared.monitoring.metrics import Metrics
+from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.sockets import Poller, ReceivedMessage, Socket
+from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.codec import BadMessage
 from kouxing.shared.wire.session import Error, ErrorCode
 

@@ -8,7 +8,7 @@ import math
 import socket
 from collections import deque
 
-from kouxing.shared import kernel_sockets
+from kouxing.shared.network import kernel_sockets
 
 MAX_HELD = 1600
 HOLD_S = 2.0  # minimum time

@@ -1,6 +1,6 @@
 """Serves the metrics of a service for Prometheus, and its health check, over HTTP.
 
-``/metrics`` has the metrics of ``shared.metrics`` under names by Prometheus' conventions;
+``/metrics`` has the metrics of ``monitoring.metrics`` under names by Prometheus' conventions;
 docs/metrics.md lists them. ``/healthz`` answers 200 while the service's loop runs, and 503 if it
 hangs. Neither contains session names, so readers cannot identify speakers.
 """
@@ -22,7 +22,7 @@ from prometheus_client.core import (
 )
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.metrics import BUCKETS_MS, Distribution, Metrics
+from kouxing.shared.monitoring.metrics import BUCKETS_MS, Distribution, Metrics
 
 REQUEST_LIMIT_S = 5.0  # limit for a peer to send its request and read the answer
 MAX_REQUESTS = 16  # concurrent requests; above this, the oldest connection is closed

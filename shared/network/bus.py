@@ -18,14 +18,14 @@ from kouxing_client.messages import Message
 from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
 from zmq.utils.monitor import recv_monitor_message
 
-from kouxing.shared.connection_limits import ConnectionLimiter
-from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
-from kouxing.shared.socket_limits import KIB, SocketLimits
-from kouxing.shared.sockets import Socket
-from kouxing.shared.waker import Waker
+from kouxing.shared.network.connection_limits import ConnectionLimiter
+from kouxing.shared.network.socket_limits import KIB, SocketLimits
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.network.waker import Waker
+from kouxing.shared.network.zap import Zap, answer_handshakes
+from kouxing.shared.settings.endpoints import split_endpoint
 from kouxing.shared.wire.message import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
-from kouxing.shared.zap import Zap, answer_handshakes
 
 # Few answers to audio are queued, because not every client reads them.
 AUDIO = SocketLimits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)

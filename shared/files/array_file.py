@@ -10,7 +10,7 @@ from typing import Any
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from kouxing.shared.user_file import check_content, open_file
+from kouxing.shared.files.user_file import check_content, open_file
 
 MAX_ARRAYS = 1000
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # other methods need much memory

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from kouxing.shared.config import ServiceConfig
-    from kouxing.shared.service import Service
+    from kouxing.shared.service.base import Service
+    from kouxing.shared.settings.config import ServiceConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

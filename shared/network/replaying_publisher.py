@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from kouxing_client.messages import Message
 
-from kouxing.shared.sockets import Socket
+from kouxing.shared.network.sockets import Socket
 
 REPLAY_S = 10.0  # time after the start of a session; connecting is slow on a busy machine
 MAX_REPLAYED = 2000  # messages

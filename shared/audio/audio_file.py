@@ -11,17 +11,16 @@ from typing import Any, BinaryIO
 import numpy as np
 import soxr
 
-from kouxing.shared.errors import UserError
-from kouxing.shared.media_file import (
+from kouxing.shared.audio.media_file import (
     MediaSound,
     RawFormat,
     WavPcm,
     has_video,
     pcm_of_wav,
 )
-from kouxing.shared.pcm import as_floats
-from kouxing.shared.phase_cancellation import PhaseCancellationGuard, Samples
-from kouxing.shared.sound_formats import (
+from kouxing.shared.audio.pcm import as_floats
+from kouxing.shared.audio.phase_cancellation import PhaseCancellationGuard, Samples
+from kouxing.shared.audio.sound_formats import (
     MAX_ZERO_BYTES,
     NUM_BEGIN_BYTES,
     NUM_MARK_BYTES,
@@ -32,8 +31,9 @@ from kouxing.shared.sound_formats import (
     non_audio_kind,
     read_stated_size,
 )
-from kouxing.shared.user_file import check_content, open_file
-from kouxing.shared.wav_parts import Readable, WavParts, count_parts
+from kouxing.shared.audio.wav_parts import Readable, WavParts, count_parts
+from kouxing.shared.errors import UserError
+from kouxing.shared.files.user_file import check_content, open_file
 
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # limit for a session; files above are resampled to it

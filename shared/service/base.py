@@ -22,18 +22,18 @@ from kouxing_client.keys import Key
 from kouxing_client.messages import Message, SessionFacts
 from kouxing_client.reach import reach_error
 
-from kouxing.shared import parent_process
-from kouxing.shared.bus import Bus, ProbeResult
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
-from kouxing.shared.config import ServiceConfig
-from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Grant, Peer, load_key, rejection_hint, save_grants
-from kouxing.shared.logs import LOG
-from kouxing.shared.message_loop import Handler, MessageLoop
-from kouxing.shared.metrics import LoadMeter, memory_mb, trim_heap
-from kouxing.shared.service_kind import ServiceKind
-from kouxing.shared.sockets import Socket
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.monitoring.metrics import LoadMeter, memory_mb, trim_heap
+from kouxing.shared.network.bus import Bus, ProbeResult
+from kouxing.shared.network.sockets import Socket
+from kouxing.shared.service import parent_process
+from kouxing.shared.service.message_loop import Handler, MessageLoop
+from kouxing.shared.service.service_kind import ServiceKind
+from kouxing.shared.settings.config import ServiceConfig
+from kouxing.shared.settings.endpoints import is_loopback, split_endpoint, with_key
+from kouxing.shared.settings.keys import Grant, Peer, load_key, rejection_hint, save_grants
 from kouxing.shared.wire.control import (
     AllowedKey,
     Heartbeat,
@@ -43,7 +43,7 @@ from kouxing.shared.wire.control import (
 from kouxing.shared.wire.session import Error
 
 if TYPE_CHECKING:
-    from kouxing.shared.prometheus import MetricsServer
+    from kouxing.shared.monitoring.prometheus import MetricsServer
 
 TICK_S = 0.01  # minimum time between ticks
 FOLLOW_UP_S = 0.03  # time between two ticks if a message arrived within ``TICK_S``
@@ -171,7 +171,7 @@ class Service(MessageLoop):
         self.on_startup()
         self._heartbeat_due_s = time.monotonic()  # the startup may have taken long
         if self.config.metrics:
-            from kouxing.shared.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used
+            from kouxing.shared.monitoring.prometheus import MetricsServer  # noqa: PLC0415 - slow, rarely used
 
             host, port = split_endpoint(f"tcp://{self.config.metrics}", "metrics")
             self._metrics_server = MetricsServer(

@@ -7,10 +7,10 @@ from kouxing_client.field_types import MAX_TEXT
 from kouxing_client.messages import Event, Message
 
 from kouxing.shared.errors import Rejected, StartFailure, UserError
-from kouxing.shared.keys import Peer
-from kouxing.shared.logs import LOG
-from kouxing.shared.message_loop import Handler
-from kouxing.shared.service import HEARTBEAT_S, Service
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.service.base import HEARTBEAT_S, Service
+from kouxing.shared.service.message_loop import Handler
+from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import EventName, SessionStarted, StartSession
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession
 

@@ -24,16 +24,16 @@ from functools import partial
 
 import zmq
 
-from kouxing.shared import kernel_sockets
-from kouxing.shared.descriptor_waiter import DescriptorWaiter
-from kouxing.shared.kernel_sockets import Traffic
-from kouxing.shared.logs import LOG, RateLimit
-from kouxing.shared.metrics import trim_heap
-from kouxing.shared.peer_budget import BUDGET, MIN_BUDGET, PeerBudget
-from kouxing.shared.peer_quota import PeerQuota
-from kouxing.shared.socket_limits import KIB, MAX_QUEUED, SocketLimits
-from kouxing.shared.tarpit import MAX_HELD, Tarpit
-from kouxing.shared.waker import Waker
+from kouxing.shared.monitoring.logs import LOG, RateLimit
+from kouxing.shared.monitoring.metrics import trim_heap
+from kouxing.shared.network import kernel_sockets
+from kouxing.shared.network.descriptor_waiter import DescriptorWaiter
+from kouxing.shared.network.kernel_sockets import Traffic
+from kouxing.shared.network.peer_budget import BUDGET, MIN_BUDGET, PeerBudget
+from kouxing.shared.network.peer_quota import PeerQuota
+from kouxing.shared.network.socket_limits import KIB, MAX_QUEUED, SocketLimits
+from kouxing.shared.network.tarpit import MAX_HELD, Tarpit
+from kouxing.shared.network.waker import Waker
 
 MIB = 1024 * KIB
 CHECK_INTERVAL_S = 0.05  # interval between checks of all connections while data arrives

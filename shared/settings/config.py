@@ -40,15 +40,15 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import core_schema
 
-from kouxing.shared.endpoints import (
+from kouxing.shared.errors import UserError
+from kouxing.shared.files.user_file import check_content, read_text
+from kouxing.shared.settings.endpoints import (
     WILDCARDS,
     is_loopback,
     local_address,
     split_endpoint,
     with_host,
 )
-from kouxing.shared.errors import UserError
-from kouxing.shared.user_file import check_content, read_text
 
 PREFIX = "KOUXING_"
 _MAX_FILE_BYTES = 64 << 10

@@ -14,22 +14,22 @@ from kouxing_client.keys import Key
 from kouxing_client.messages import Joined, Message, topic
 from kouxing_client.sockets import connect
 
-from kouxing.shared.connection_limits import (
+from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import Record
+from kouxing.shared.name_rules import is_name
+from kouxing.shared.network.connection_limits import (
     LONG_PENALTY_S,
     PENALTY_S,
     LimitedSocket,
     PeerConnection,
 )
-from kouxing.shared.endpoints import split_endpoint
-from kouxing.shared.errors import UserError
-from kouxing.shared.fast_record import Record
-from kouxing.shared.keys import NO_PEER, Grant, Peer, may_subscribe
-from kouxing.shared.name_rules import is_name
-from kouxing.shared.socket_limits import KIB
-from kouxing.shared.waker import Waker
+from kouxing.shared.network.socket_limits import KIB
+from kouxing.shared.network.waker import Waker
+from kouxing.shared.network.zap import Zap
+from kouxing.shared.settings.endpoints import split_endpoint
+from kouxing.shared.settings.keys import NO_PEER, Grant, Peer, may_subscribe
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.session import Error
-from kouxing.shared.zap import Zap
 
 ERROR_COST = 4.0  # cost for the sender's budget of a message that is answered with an error
 ANSWER_COST = 0.25  # cost per KiB of an answer: the longest status report is 15 MB

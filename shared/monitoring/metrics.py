@@ -1,6 +1,6 @@
 """Counters, gauges and latencies of a service, compact enough for every heartbeat.
 
-Heartbeats and the Prometheus page (``shared.prometheus``) have the same values.
+Heartbeats and the Prometheus page (``monitoring.prometheus``) have the same values.
 """
 
 import contextlib

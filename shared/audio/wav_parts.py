@@ -3,8 +3,8 @@
 import math
 from typing import BinaryIO, Protocol
 
+from kouxing.shared.audio.sound_formats import MIN_UNKNOWN_BYTES
 from kouxing.shared.errors import UserError
-from kouxing.shared.sound_formats import MIN_UNKNOWN_BYTES
 
 _MAX_CHUNK_BYTES = 16 << 20  # limit for pictures and notes between two parts
 

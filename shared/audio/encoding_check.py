@@ -9,9 +9,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.audio.pcm import FULL_SCALE
+from kouxing.shared.audio.sound_formats import NUM_BEGIN_BYTES, audio_file_kind, find_sound_start
 from kouxing.shared.errors import UserError
-from kouxing.shared.pcm import FULL_SCALE
-from kouxing.shared.sound_formats import NUM_BEGIN_BYTES, audio_file_kind, find_sound_start
 
 Array = NDArray[np.float64]
 Measure = tuple[float, float, float]  # spectral flatness, correlation of neighbors, RMS

@@ -27,11 +27,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from kouxing.shared.endpoints import is_local, split_endpoint, with_key
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.output_file import write_private
+from kouxing.shared.files.user_file import parse_json, read_text
 from kouxing.shared.name_rules import NAME, NAME_RULE, is_name
-from kouxing.shared.output_file import write_private
-from kouxing.shared.user_file import parse_json, read_text
+from kouxing.shared.settings.endpoints import is_local, split_endpoint, with_key
 
 if TYPE_CHECKING:
     from kouxing_client.keys import Key

@@ -1,0 +1,1 @@
+"""Reads and converts audio: files, pipes, devices and PCM."""

@@ -1,0 +1,1 @@
+"""Helpers of all commands: terminal output, and the connection to control."""

@@ -1,0 +1,1 @@
+"""Reads users' files and tables, and writes output files."""

@@ -1,0 +1,1 @@
+"""ZeroMQ sockets, reliable streams, and limits for peers."""

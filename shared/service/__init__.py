@@ -1,0 +1,1 @@
+"""The base of every service: life cycle, messages, sessions, overload and priority."""

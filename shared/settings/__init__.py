@@ -1,0 +1,1 @@
+"""The settings of a process: configuration, keys and endpoints."""
