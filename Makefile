@@ -213,7 +213,7 @@ $(BLENDER)/installed: $(BLENDER_LOCK)
 # Fills Numba's cache. Otherwise all services that start at the same time compile the same functions.
 $(COMPILED): $(wildcard services/recognizer/front_end/*.py services/recognizer/search/*.py) | .venv/installed
 	$(BIN)/python -c "from kouxing.services.recognizer.acoustic.load import load_model; \
-		from kouxing.services.recognizer.recognizer import Recognizer; Recognizer(load_model()).warm_up()"
+		from kouxing.services.recognizer.live.recognizer import Recognizer; Recognizer(load_model()).warm_up()"
 	touch $@
 
 $(HEADS): $(HEAD_SOURCES) | .venv/installed

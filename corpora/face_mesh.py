@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from kouxing.services.recognizer.onnx_session import create_inference_session
+from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]

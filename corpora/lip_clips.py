@@ -27,8 +27,8 @@ from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import select_lip_faps
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.alignment import align_text
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.offline.alignment import align_text
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_columns
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError

@@ -9,7 +9,7 @@ from operator import ne
 
 import numpy as np
 
-from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.live.live_decoder import StreamOutput
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.universal.segments import features
 

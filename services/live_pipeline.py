@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline_recognition import WithProgress
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.services.recognizer.lips.lip_frames import LipFrameModel
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.live.stream import SpeechStream
+from kouxing.services.recognizer.offline.offline_recognition import WithProgress
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.lip_model import LipModel

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.front_end.slices import SliceMeter
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.offline_recognition import WithProgress
-from kouxing.services.recognizer.speech_segmenter import (
+from kouxing.services.recognizer.lips.lip_frames import LipFrameModel
+from kouxing.services.recognizer.live.speech_segmenter import (
     SpeechEnd,
     SpeechItem,
     SpeechSegmenter,
     SpeechStart,
 )
+from kouxing.services.recognizer.offline.offline_recognition import WithProgress
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learned.closure_rule import ClosureRule

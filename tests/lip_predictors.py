@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS, LipPredictor
+from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS, LipPredictor
 
 NUM_FEATURES, NUM_COMPONENTS, UNITS, NUM_LIPS = 160 + 307, 6, 5, 51  # log-mel, encoder's features
 DELAYS_S = (-0.005, 0.055, 0.155)

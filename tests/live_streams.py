@@ -7,8 +7,8 @@ from kouxing_client.messages import SessionFacts
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.live_decoder import StreamOutput
-from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.live.live_decoder import StreamOutput
+from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.fast_record import replace
 from tests.samples import START as START_AT_16_KHZ

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer import lip_predictor, voice_traits
 from kouxing.services.recognizer.acoustic import blocks, gmm, universal
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.model_file import phone_lm_arrays, shipped_phone_lm
+from kouxing.services.recognizer.lips import lip_predictor
+from kouxing.services.recognizer.live import voice_traits
 from kouxing.shared.files.output_file import open_output
 
 _LANGUAGE = ("language", "phones")  # arrays

@@ -31,10 +31,10 @@ from scipy.stats import spearmanr
 from kouxing.corpora.emotions import FEELINGS, read_emotions, speakers_of
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.sounds import read_sounds
+from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.voice_traits import MIN_VOICE, VoiceReadout
+from kouxing.services.recognizer.live.voice_traits import MIN_VOICE, VoiceReadout
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.model_card import write_card
 from kouxing.training.model_files import save_voice_readout

@@ -28,8 +28,8 @@ from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.recording_pipeline import (
     AnalyzedRecording,
     analyze_recording,

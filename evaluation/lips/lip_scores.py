@@ -29,8 +29,8 @@ from kouxing.evaluation.recognizer.disturbances import (
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.lips.lip_frames import LipFrameModel
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.lip_model import LipModel

@@ -13,7 +13,7 @@ from kouxing.corpora.scoring import is_emitted
 from kouxing.services.live_pipeline import recognize_events
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_frames import LipFrameModel, LipFrameStream, choose_delay
+from kouxing.services.recognizer.lips.lip_frames import LipFrameModel, LipFrameStream, choose_delay
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent

@@ -14,7 +14,7 @@ from kouxing.corpora.lip_clips import LipClip, aligned_phones
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.alignment import align_syllables
+from kouxing.services.recognizer.offline.alignment import align_syllables
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 

@@ -34,10 +34,10 @@ from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.slices import measure_slices
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.offline.alignment import align_syllables, drop_pauses
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, build_key_frames
 from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING, load_table

@@ -14,7 +14,7 @@ from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
+from kouxing.services.recognizer.offline.alignment import align_syllables, drop_pauses
 from kouxing.shared.command.terminal import CONSOLE, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone

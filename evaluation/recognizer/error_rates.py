@@ -41,11 +41,11 @@ from kouxing.evaluation.recognizer.disturbances import CLEAN, Disturb
 from kouxing.evaluation.recognizer.labials import LabialCounts
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.alignment import drop_pauses
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.live_decoder import LiveDecoder
+from kouxing.services.recognizer.live.live_decoder import LiveDecoder
+from kouxing.services.recognizer.live.speech_scorer import ScoreEvent, SpeechScorer, score_streams
+from kouxing.services.recognizer.offline.alignment import drop_pauses
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory

@@ -26,7 +26,7 @@ from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.slices import SLICE, split_slices
-from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.phones.events import Phone, Progress, SpeechChange

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from kouxing.evaluation.report.lip_tables import display_floor_ms
 from kouxing.evaluation.tables import Figures, Table, format_number, join_values, percent
-from kouxing.services.recognizer.hop_controller import MAX_HOP
+from kouxing.services.recognizer.sessions.hop_controller import MAX_HOP
 from kouxing.shared.face.faps import NUM_FAPS
 
 _LOOK_AHEAD_MS, _FRAME_MS = 60, 20

@@ -13,7 +13,7 @@ from kouxing.corpora.options import OptionalClips, Picture
 from kouxing.evaluation.source_tree import SAMPLE
 from kouxing.evaluation.tables import figures_table, show_results
 from kouxing.services.cli.options import Language
-from kouxing.services.recognizer.hop_controller import MAX_HOP
+from kouxing.services.recognizer.sessions.hop_controller import MAX_HOP
 from kouxing.shared.command.terminal import CONSOLE, Force, JsonFile, check_output
 
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]

@@ -20,8 +20,8 @@ from kouxing.services.heads import DEFAULT_HEAD
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
-from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.lips.lip_predictor import LipPredictor, load_lip_predictor
+from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level_faps import VISEMES

@@ -29,7 +29,7 @@ from kouxing.services.cli.web_model import web_model
 from kouxing.services.live_pipeline import recognize_events
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model

@@ -13,8 +13,8 @@ import numpy as np
 from kouxing_client.messages import encode
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.encoder import ENCODER_PATH
 from kouxing.services.recognizer.acoustic.load import MODELS_FOLDER, load_model
-from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.shared.face.faps import NUM_FAPS
 
 _MATRIX_SIZE, _MEASURE_S = 512, 0.5

@@ -21,10 +21,10 @@ from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-from kouxing.services.recognizer.alignment import align_syllables
-from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
-from kouxing.services.recognizer.mouth_profile import read_mouth_profile
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.lips.lip_predictor import LipPredictor, load_lip_predictor
+from kouxing.services.recognizer.lips.mouth_profile import read_mouth_profile
+from kouxing.services.recognizer.offline.alignment import align_syllables
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model

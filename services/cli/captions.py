@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from kouxing.services.cli.options import CaptionKind
 from kouxing.services.driver.render.captions import Caption, CaptionDrawer
-from kouxing.services.recognizer.alignment import find_syllable_times
+from kouxing.services.recognizer.offline.alignment import find_syllable_times
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw

@@ -100,7 +100,7 @@ def speak(
     The exit status is 1 if --record was given and no video was written.
     """
     from kouxing.services.cli.streaming import stream
-    from kouxing.services.recognizer.mouth_profile import read_mouth_profile
+    from kouxing.services.recognizer.lips.mouth_profile import read_mouth_profile
     from kouxing.shared.audio.audio_file import open_audio
     from kouxing.shared.audio.media_file import RawFormat
     from kouxing.shared.audio.sound_devices import open_microphone, open_monitor

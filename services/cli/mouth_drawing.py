@@ -22,11 +22,14 @@ from kouxing.services.cli.spoken_text import print_mismatch, read_transcript, re
 from kouxing.services.driver.video.video_writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.slices import measure_slices
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline_recognition import WithProgress, recognize_recording
-from kouxing.services.recognizer.transcriber import Transcriber
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.offline.alignment import align_syllables, drop_pauses
+from kouxing.services.recognizer.offline.offline_recognition import (
+    WithProgress,
+    recognize_recording,
+)
+from kouxing.services.recognizer.offline.transcriber import Transcriber
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.ferguson import drawing

@@ -249,7 +249,7 @@ def phones(
     with show_loading():
         from kouxing.services.mono_audio import read_mono_16k
         from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-        from kouxing.services.recognizer.offline_recognition import recognize_recording
+        from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
         from kouxing.shared.clock import MEDIA_RATE_HZ
         from kouxing.shared.phones.alphabets import respell
         from kouxing.shared.phones.phone_files import format_phones
@@ -300,7 +300,10 @@ def align(
         from kouxing.services.cli.spoken_text import read_transcript, report_mismatch
         from kouxing.services.mono_audio import read_mono_16k
         from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-        from kouxing.services.recognizer.alignment import align_syllables, find_syllable_times
+        from kouxing.services.recognizer.offline.alignment import (
+            align_syllables,
+            find_syllable_times,
+        )
         from kouxing.shared.clock import MEDIA_RATE_HZ
         from kouxing.shared.phones.alphabets import respell
         from kouxing.shared.phones.inventory import load_inventory

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from kouxing.services.cli.text_formats import SpokenText, decode_text, extract_text
-from kouxing.services.recognizer.alignment import MIN_FIT, Alignment
+from kouxing.services.recognizer.offline.alignment import MIN_FIT, Alignment
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import read_file

@@ -24,21 +24,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer import (
-    encoder,
-    lip_frames,
-    lip_predictor,
-    live_decoder,
-    speech_segmenter,
-    stream,
-    voice_traits,
-)
-from kouxing.services.recognizer.acoustic import blocks, model_file, network
+from kouxing.services.recognizer.acoustic import blocks, encoder, model_file, network
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.light import parse_light_model
 from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end import resample, slices, vad, whisper_mel
+from kouxing.services.recognizer.lips import lip_frames, lip_predictor
+from kouxing.services.recognizer.live import live_decoder, speech_segmenter, stream, voice_traits
 from kouxing.services.recognizer.search import frame_search
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.services.synthesizer import face_animator

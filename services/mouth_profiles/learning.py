@@ -37,9 +37,13 @@ from kouxing.services.mouth_profiles.lip_tracks import (
     interpolate_track,
     lip_measures,
 )
-from kouxing.services.recognizer.lip_frames import choose_delay
-from kouxing.services.recognizer.lip_predictor import NUM_LIP_FAPS, LipPredictor, load_lip_predictor
-from kouxing.services.recognizer.mouth_profile import MouthProfile
+from kouxing.services.recognizer.lips.lip_frames import choose_delay
+from kouxing.services.recognizer.lips.lip_predictor import (
+    NUM_LIP_FAPS,
+    LipPredictor,
+    load_lip_predictor,
+)
+from kouxing.services.recognizer.lips.mouth_profile import MouthProfile
 from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]

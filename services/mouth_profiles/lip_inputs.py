@@ -10,8 +10,8 @@ from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lip_predictor import join_features
-from kouxing.services.recognizer.speech_segmenter import SpeechSegmenter
+from kouxing.services.recognizer.lips.lip_predictor import join_features
+from kouxing.services.recognizer.live.speech_segmenter import SpeechSegmenter
 from kouxing.shared.phones.events import LipPositions
 
 Floats = NDArray[np.float32]

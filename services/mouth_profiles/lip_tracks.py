@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.slices import level_db
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS, OTHER_SIDE
+from kouxing.services.recognizer.lips.lip_predictor import LIP_FAPS, OTHER_SIDE
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.faps import MOUTH_FAPS
 

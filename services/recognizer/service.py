@@ -16,16 +16,19 @@ from kouxing_client.messages import Message, SessionFacts, Speech
 
 from kouxing.services.recognizer.acoustic.languages import MODEL_LANGUAGES
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.audio_intake import AudioIntake
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.live_batch_decoder import SESSIONS_TOGETHER, LiveBatchDecoder
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.load_numba import load_numba
-from kouxing.services.recognizer.pending_sessions import PendingSessions
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import RecognizerSession
-from kouxing.services.recognizer.synthesizer_link import SynthesizerSockets
-from kouxing.services.recognizer.unpaced_decoder import UnpacedDecoder
+from kouxing.services.recognizer.sessions.audio_intake import AudioIntake
+from kouxing.services.recognizer.sessions.live_batch_decoder import (
+    SESSIONS_TOGETHER,
+    LiveBatchDecoder,
+)
+from kouxing.services.recognizer.sessions.pending_sessions import PendingSessions
+from kouxing.services.recognizer.sessions.session import RecognizerSession
+from kouxing.services.recognizer.sessions.synthesizer_link import SynthesizerSockets
+from kouxing.services.recognizer.sessions.unpaced_decoder import UnpacedDecoder
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.monitoring.logs import LOG

@@ -1,8 +1,8 @@
 """Overload policy: how live sessions degrade under load.
 
 First, the block network runs less often for all sessions, so phones are emitted and corrected later
-(``services.recognizer.hop_controller``). Next, a session uses the light acoustic model. Finally, it
-skips audio (:class:`SkipPolicy`).
+(``services.recognizer.sessions.hop_controller``). Next, a session uses the light acoustic model.
+Finally, it skips audio (:class:`SkipPolicy`).
 
 A session is *behind* if late audio is queued. If it is slightly behind, it uses the light acoustic
 model until it has been on time for a while. A session that stays too far behind skips all queued

@@ -15,7 +15,7 @@ from kouxing.evaluation.lips.live_faces import live_events, live_frames
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio.audio_file import read_audio

@@ -9,13 +9,13 @@ import pytest
 from kouxing_client.field_types import MAX_AUDIO_BYTES
 from kouxing_client.messages import Message, SessionFacts
 
-from kouxing.services.recognizer import pending_sessions
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.live_batch_decoder import MAX_BATCH_S
 from kouxing.services.recognizer.service import RecognizerService
-from kouxing.services.recognizer.unpaced_decoder import MAX_UNPACED_S
+from kouxing.services.recognizer.sessions import pending_sessions
+from kouxing.services.recognizer.sessions.live_batch_decoder import MAX_BATCH_S
+from kouxing.services.recognizer.sessions.unpaced_decoder import MAX_UNPACED_S
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.bus import Bus

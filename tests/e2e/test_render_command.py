@@ -21,8 +21,8 @@ from kouxing.services.driver.head.head import ASSETS, Head
 from kouxing.services.heads import page_heads_folder
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.mouth_profile import MouthProfile
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.lips.mouth_profile import MouthProfile
 from kouxing.services.service_kinds import read_settings
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio.audio_file import read_audio

@@ -164,7 +164,7 @@ def test_ctrl_c_ends_every_kind_of_command_and_leaves_no_output(tmp_path: Path) 
 
 
 def test_onnxruntime_stores_no_usage_data(tmp_path: Path) -> None:
-    program = "import kouxing.services.recognizer.onnx_session"
+    program = "import kouxing.services.recognizer.acoustic.onnx_session"
     without_ci = {"CI": "", "ORT_DISABLE_TELEMETRY": ""}
     process = start_python("-c", program, HOME=str(tmp_path), **without_ci)
     assert process.communicate(timeout=LIMIT_S) == ("", "")

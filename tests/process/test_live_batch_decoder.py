@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import Any, cast
 
-from kouxing.services.recognizer.live_batch_decoder import LiveBatchDecoder
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.sessions.live_batch_decoder import LiveBatchDecoder
+from kouxing.services.recognizer.sessions.session import RecognizerSession
 from kouxing.shared.monitoring.metrics import LoadMeter
 from kouxing.shared.service.overload import SkipPolicy
 

@@ -5,9 +5,13 @@ from typing import Any, cast
 
 import pytest
 
-from kouxing.services.recognizer.network_thread import MAX_SESSIONS, MAX_WAIT_S, NetworkThread
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.sessions.network_thread import (
+    MAX_SESSIONS,
+    MAX_WAIT_S,
+    NetworkThread,
+)
+from kouxing.services.recognizer.sessions.session import RecognizerSession
 
 
 class FakeSession:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from kouxing.evaluation.system.lips_package import server_events
 from kouxing.services.cli.web_model import web_model
-from kouxing.services.recognizer.encoder import load_encoder
+from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.voice_traits import load_voice_readout
+from kouxing.services.recognizer.live.voice_traits import load_voice_readout
 from kouxing.shared.face.shapes import OCULUS
 from kouxing.shared.phones.events import Phone
 from tests.documents import code_blocks

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio.audio_file import read_audio

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
-from kouxing.services.recognizer.live_decoder import LiveDecoder
+from kouxing.services.recognizer.live.live_decoder import LiveDecoder
+from kouxing.services.recognizer.live.speech_scorer import FrameScores
+from kouxing.services.recognizer.live.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.services.recognizer.search.decoder import Decoder, LastPhone
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import FrameScores
-from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.shared.phones.events import Phone
 
 NOISE = np.random.default_rng(0).normal(0, 0.1, 12_000).astype(np.float32)

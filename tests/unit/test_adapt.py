@@ -13,7 +13,7 @@ from kouxing.corpora.commands import adapt_app, track_app
 from kouxing.corpora.lip_clips import read_clip
 from kouxing.services.driver.video.video_writer import VideoWriter
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.face_landmarks import FACE, landmark_file

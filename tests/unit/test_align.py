@@ -10,7 +10,7 @@ import typer
 
 from kouxing.services.cli.offline import align
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import (
+from kouxing.services.recognizer.offline.alignment import (
     align_syllables,
     align_text,
     drop_pauses,

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from kouxing.services.recognizer.acoustic import blocks as blocks_module
+from kouxing.services.recognizer.acoustic.encoder import ENCODER_PATH
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.acoustic.network import encode_integer_inputs
-from kouxing.services.recognizer.encoder import ENCODER_PATH
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import export_onnx
 from kouxing.training.blocks.network import block_layout

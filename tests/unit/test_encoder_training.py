@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
-from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
-from kouxing.services.recognizer.onnx_session import create_inference_session
+from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
+from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
+from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, recipe, targets

@@ -13,7 +13,7 @@ from kouxing.services.mouth_profiles.face_landmarks import (
     compute_mouth_faps,
 )
 from kouxing.services.mouth_profiles.landmark_file import parse_landmark_file
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS
+from kouxing.services.recognizer.lips.lip_predictor import LIP_FAPS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.face_landmarks import NUM_FRAMES, TIMES, film, landmark_file

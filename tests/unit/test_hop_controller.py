@@ -2,7 +2,7 @@
 
 import pytest
 
-from kouxing.services.recognizer.hop_controller import (
+from kouxing.services.recognizer.sessions.hop_controller import (
     HOP_PERIOD_S,
     MAX_HOP,
     RESTORE_AFTER_S,

@@ -10,7 +10,7 @@ from kouxing.services.cli.options import WidthSource
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language, restrict_phones
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import (

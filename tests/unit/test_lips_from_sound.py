@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lip_predictor import (
+from kouxing.services.recognizer.lips.lip_predictor import (
     CLOSURE,
     FORMAT,
     LipPredictor,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.shared.errors import UserError
 from kouxing.training.lips.recipe import DELAYS_S, train_lips
 from tests.lip_clips import clip_name_for, write_training_clip

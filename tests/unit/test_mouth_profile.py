@@ -14,8 +14,8 @@ from kouxing.services.mouth_profiles.learning import (
     observe,
 )
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_measures
-from kouxing.services.recognizer.lip_predictor import LIP_FAPS
-from kouxing.services.recognizer.mouth_profile import (
+from kouxing.services.recognizer.lips.lip_predictor import LIP_FAPS
+from kouxing.services.recognizer.lips.mouth_profile import (
     MouthProfile,
     parse_mouth_profile,
     read_mouth_profile,

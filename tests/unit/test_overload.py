@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.audio_queue import AudioQueue
+from kouxing.services.recognizer.sessions.audio_queue import AudioQueue
 from kouxing.shared.service.overload import CATCH_UP_S, LIGHT_FOR_S, MAX_LATE_FOR_S, SkipPolicy
 
 MAX_LAG_S = 0.2

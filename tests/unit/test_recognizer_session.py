@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lip_predictor import LipPredictor, load_lip_predictor
-from kouxing.services.recognizer.mouth_profile import MouthProfile
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import (
+from kouxing.services.recognizer.lips.lip_predictor import LipPredictor, load_lip_predictor
+from kouxing.services.recognizer.lips.mouth_profile import MouthProfile
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.sessions.session import (
     MAX_LEAD_S,
     MAX_MEDIA_TIME,
     MOVE_GRACE_S,

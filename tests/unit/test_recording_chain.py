@@ -5,9 +5,9 @@ import numpy as np
 from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_text
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.offline.alignment import align_text
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes

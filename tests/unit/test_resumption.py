@@ -9,9 +9,14 @@ from kouxing_client.messages import Message, Speech
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.live_decoder import StreamOutput
-from kouxing.services.recognizer.resumption import GRID_S, WARM_UP_S, ReplayWindow, ResumeFilter
+from kouxing.services.recognizer.live.live_decoder import StreamOutput
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.services.recognizer.sessions.resumption import (
+    GRID_S,
+    WARM_UP_S,
+    ReplayWindow,
+    ResumeFilter,
+)
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.phones.events import (
     Phone,

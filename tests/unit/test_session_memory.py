@@ -8,9 +8,9 @@ import pytest
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.live.stream import SpeechStream
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.monitoring.metrics import memory_mb, trim_heap
 from tests.system import DEMO

@@ -3,7 +3,7 @@
 import numpy as np
 from kouxing_client.messages import Sound
 
-from kouxing.services.recognizer.sound_packets import SoundPackets
+from kouxing.services.recognizer.sessions.sound_packets import SoundPackets
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.phones.events import Waveform
 from kouxing.shared.wire.speech import AudioState, Progress

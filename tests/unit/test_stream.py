@@ -11,12 +11,12 @@ from kouxing_client.messages import Message
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lip_predictor import load_lip_predictor
-from kouxing.services.recognizer.live_decoder import StreamOutput
-from kouxing.services.recognizer.offline_recognition import recognize_recording
-from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.live.live_decoder import StreamOutput
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.live.stream import MAX_JITTER
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.recognizer.search import frame_search, path_records
-from kouxing.services.recognizer.stream import MAX_JITTER
 from kouxing.shared.phones.events import (
     AudioSkipped,
     EndOfSound,

@@ -6,7 +6,7 @@ from typing import cast
 import pytest
 from kouxing_client.messages import Message, Phone, Speech
 
-from kouxing.services.recognizer.synthesizer_link import (
+from kouxing.services.recognizer.sessions.synthesizer_link import (
     KEPT_SAMPLES,
     MAX_BACKLOG,
     MAX_OVERDUE_S,

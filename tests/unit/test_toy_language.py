@@ -13,8 +13,8 @@ import pytest
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_text, drop_pauses
-from kouxing.services.recognizer.offline_recognition import recognize_recording
+from kouxing.services.recognizer.offline.alignment import align_text, drop_pauses
+from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio.audio_file import read_audio

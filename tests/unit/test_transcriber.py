@@ -8,7 +8,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from kouxing.services.recognizer.transcriber import Transcriber
+from kouxing.services.recognizer.offline.transcriber import Transcriber
 from kouxing.shared.errors import UserError
 
 SOUND = 0.1 * np.random.default_rng(0).standard_normal(16_000).astype(np.float32)

@@ -11,8 +11,8 @@ import torch
 from kouxing.services.recognizer.acoustic import load
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.live_decoder import StreamOutput
-from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.live.live_decoder import StreamOutput
+from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.shared import fast_record
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone

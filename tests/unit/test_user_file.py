@@ -19,7 +19,7 @@ from kouxing.services.driver.head.feature_points_file import read_points
 from kouxing.services.driver.head.mesh_file import read_mesh
 from kouxing.services.driver.render.scene import load_head
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.mouth_profile import read_mouth_profile
+from kouxing.services.recognizer.lips.mouth_profile import read_mouth_profile
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.shared.audio.audio_file import (
     check_video,

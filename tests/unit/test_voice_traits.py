@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
+from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
-from kouxing.services.recognizer.voice_traits import (
+from kouxing.services.recognizer.live.voice_traits import (
     NUM_TRAITS,
     VoiceReadout,
     VoiceTraits,

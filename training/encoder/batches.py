@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
-from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind
+from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.audio.pcm import as_floats

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.encoder import FORMAT, VoiceKind
+from kouxing.services.recognizer.acoustic.encoder import FORMAT, VoiceKind
 from kouxing.training.encoder.network import (
     MEAN_PITCH,
     NUM_FEATURES,

@@ -38,7 +38,7 @@ from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.parallel import process_in_order
 from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
-from kouxing.services.recognizer.lip_predictor import NUM_LIP_FAPS
+from kouxing.services.recognizer.lips.lip_predictor import NUM_LIP_FAPS
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.files.output_file import open_output
 from kouxing.shared.phones.events import Phone

@@ -34,9 +34,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, log_softmax
 
-from kouxing.services.recognizer.encoder import LIP_DELAYS_S, VoiceKind
+from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS
+from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS
 from kouxing.training.encoder.targets import (
     EFFORT,
     LEVEL,

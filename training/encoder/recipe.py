@@ -29,8 +29,8 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, read_corpus
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.encoder import VoiceKind
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.encoder import VoiceKind
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError

@@ -32,7 +32,7 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
-from kouxing.services.recognizer.encoder import VoiceKind
+from kouxing.services.recognizer.acoustic.encoder import VoiceKind
 from kouxing.shared.audio.pcm import as_floats, as_integers
 from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError

@@ -32,8 +32,8 @@ from kouxing.corpora.speech_corpus import (
 )
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.alignment import align_syllables, drop_pauses
 from kouxing.services.recognizer.front_end.slices import measure_slices
+from kouxing.services.recognizer.offline.alignment import align_syllables, drop_pauses
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
 from kouxing.services.synthesizer.lips.ferguson.contour import load_lip_points
 from kouxing.services.synthesizer.lips.ferguson.key_frames import build_anchors

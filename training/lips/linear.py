@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from kouxing.services.recognizer.lip_predictor import CLOSURE, NUM_LIP_FAPS
+from kouxing.services.recognizer.lips.lip_predictor import CLOSURE, NUM_LIP_FAPS
 from kouxing.training.lips.positions import SpeechStretch, features_of
 
 Floats = NDArray[np.float32]

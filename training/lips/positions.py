@@ -19,7 +19,7 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import cache_folder, load_or_compute
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.mouth_profiles.lip_inputs import record_lip_inputs
-from kouxing.services.recognizer.encoder import ENCODER_PATH
+from kouxing.services.recognizer.acoustic.encoder import ENCODER_PATH
 from kouxing.training.networks.augmentation import augment_samples, scale_level
 
 Array = NDArray[np.float64]

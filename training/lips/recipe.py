@@ -25,9 +25,9 @@ from kouxing.corpora.lip_clips import (
     training_clips,
 )
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.encoder import LIP_DELAYS_S
-from kouxing.services.recognizer.lip_predictor import (
+from kouxing.services.recognizer.lips.lip_predictor import (
     CLOSURE,
     LIP_FAPS,
     NUM_LIP_FAPS,

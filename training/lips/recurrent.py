@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from kouxing.services.recognizer.lip_predictor import NUM_LIP_FAPS, NUM_OUTPUTS
+from kouxing.services.recognizer.lips.lip_predictor import NUM_LIP_FAPS, NUM_OUTPUTS
 
 Floats = NDArray[np.float32]
 

@@ -1,4 +1,4 @@
-// The lip predictor; services/recognizer/lip_predictor.py has the formulas.
+// The lip predictor; services/recognizer/lips/lip_predictor.py has the formulas.
 
 import { sigmoid } from "./math.js";
 import { ProductMemory, alignedBytes } from "./products.js";

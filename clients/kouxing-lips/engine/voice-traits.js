@@ -1,4 +1,4 @@
-// Feeling, laughter and breath in a voice; services/recognizer/voice_traits.py has the formulas.
+// Feeling, laughter and breath in a voice; services/recognizer/live/voice_traits.py has the formulas.
 
 import { clamp } from "./math.js";
 

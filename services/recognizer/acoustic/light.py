@@ -31,9 +31,9 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     ScoreRequest,
     Topology,
 )
+from kouxing.services.recognizer.acoustic.encoder import PHONES_LAG_FRAMES, load_encoder
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.encoder import PHONES_LAG_FRAMES, load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 

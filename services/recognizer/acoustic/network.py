@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
+from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.onnx_session import create_inference_session
 
 MAX_POSITIONS = 1500  # rows of the table of positions
 FRAMES_PER_POSITION = 2  # feature frames from one encoder frame to the next

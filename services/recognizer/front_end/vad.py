@@ -14,11 +14,11 @@ e        evidence                                                      1
     e(n) = max(0, e(n - 1) + p(n) - d)
 
 It ends when the voice has been improbable for half a second. A pre-roll restores the audio before
-the detection of speech (see :mod:`kouxing.services.recognizer.speech_segmenter`).
+the detection of speech (see :mod:`kouxing.services.recognizer.live.speech_segmenter`).
 """
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
-from kouxing.services.recognizer.encoder import VoiceKind
+from kouxing.services.recognizer.acoustic.encoder import VoiceKind
 
 _NO_EVIDENCE, _ENOUGH = 0.75, 0.12
 _IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such frames do

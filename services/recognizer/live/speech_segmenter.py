@@ -14,13 +14,13 @@ from typing import TypeAlias
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats, FrontEnd
+from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, load_encoder
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.encoder import EncoderOutput, load_encoder
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
-from kouxing.services.recognizer.lip_frames import LipFrameStream
-from kouxing.services.recognizer.voice_traits import VoiceTraits, load_voice_readout
+from kouxing.services.recognizer.lips.lip_frames import LipFrameStream
+from kouxing.services.recognizer.live.voice_traits import VoiceTraits, load_voice_readout
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import LipPositions
 

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
+from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.lips.lip_frames import LipFrameModel
+from kouxing.services.recognizer.live.live_decoder import StreamOutput
+from kouxing.services.recognizer.live.speech_scorer import run_encoder, score_speech
+from kouxing.services.recognizer.live.stream import SpeechStream
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import run_encoder, score_speech
-from kouxing.services.recognizer.stream import SpeechStream
 
 _WARM_UP_S = 0.2
 

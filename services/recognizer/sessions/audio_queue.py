@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Iterator
 
-from kouxing.services.recognizer.resumption import Chunk
+from kouxing.services.recognizer.sessions.resumption import Chunk
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.service.overload import SkipPolicy
 

@@ -16,10 +16,14 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     ScoreRequest,
 )
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
-from kouxing.services.recognizer.encoder import EncoderOutput, EncoderStream, process_positions
+from kouxing.services.recognizer.acoustic.encoder import (
+    EncoderOutput,
+    EncoderStream,
+    process_positions,
+)
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lip_frames import LipFrameStream
-from kouxing.services.recognizer.speech_segmenter import (
+from kouxing.services.recognizer.lips.lip_frames import LipFrameStream
+from kouxing.services.recognizer.live.speech_segmenter import (
     EncoderInput,
     SpeechEnd,
     SpeechFrames,

@@ -39,7 +39,7 @@ from kouxing.services.recognizer.acoustic.network import (
 )
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
-ENCODER_PATH = Path(__file__).parent / "models" / "encoder.npz"
+ENCODER_PATH = Path(__file__).parents[1] / "models" / "encoder.npz"
 FORMAT = "encoder 1"
 
 PHONES_LAG_FRAMES = 5

@@ -4,9 +4,9 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import RecognizerSession
-from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.live.stream import SpeechStream
+from kouxing.services.recognizer.sessions.session import RecognizerSession
 
 MAX_SESSIONS = 4  # decoded together; all results are sent at the end
 MAX_WAIT_S = 0.02  # limit for waiting for more sessions, to save processor time

@@ -3,7 +3,7 @@
 import logging
 import time
 
-from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.sessions.session import RecognizerSession
 from kouxing.shared.errors import Rejected
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.service.message_loop import MessageLoop

@@ -14,10 +14,10 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, F
 from kouxing.services.recognizer.front_end.features import frame_at
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.front_end.slices import SliceMeter
-from kouxing.services.recognizer.lip_frames import LipFrameModel, choose_delay
-from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
+from kouxing.services.recognizer.lips.lip_frames import LipFrameModel, choose_delay
+from kouxing.services.recognizer.live.live_decoder import LiveDecoder, StreamOutput
+from kouxing.services.recognizer.live.speech_scorer import SpeechScorer
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import SpeechScorer
 from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (

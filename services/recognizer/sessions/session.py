@@ -7,12 +7,12 @@ from typing import TypeVar
 
 from kouxing_client.messages import Message, Phone, Speech
 
-from kouxing.services.recognizer.audio_queue import AudioQueue
-from kouxing.services.recognizer.lip_frames import LipFrameModel
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, ResumeFilter
-from kouxing.services.recognizer.sound_packets import SoundPackets
-from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
+from kouxing.services.recognizer.lips.lip_frames import LipFrameModel
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.sessions.audio_queue import AudioQueue
+from kouxing.services.recognizer.sessions.resumption import Chunk, ReplayWindow, ResumeFilter
+from kouxing.services.recognizer.sessions.sound_packets import SoundPackets
+from kouxing.services.recognizer.sessions.synthesizer_link import SynthesizerLink
 from kouxing.shared.audio.encoding_check import EncodingCheck
 from kouxing.shared.audio.pcm import decode_pcm
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds

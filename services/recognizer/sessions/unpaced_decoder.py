@@ -4,9 +4,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 
-from kouxing.services.recognizer.live_batch_decoder import MAX_BATCH_S, LiveBatchDecoder
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.sessions.live_batch_decoder import MAX_BATCH_S, LiveBatchDecoder
+from kouxing.services.recognizer.sessions.session import RecognizerSession
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.service.message_loop import MessageLoop
 

@@ -39,16 +39,16 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
+from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_component
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from kouxing.services.recognizer.encoder import load_encoder
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.services.recognizer.mouth_profile import MouthProfile, parse_mouth_profile
+from kouxing.services.recognizer.lips.mouth_profile import MouthProfile, parse_mouth_profile
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions
 
-LIP_PREDICTOR_PATH = Path(__file__).parent / "models" / "lips.npz"
+LIP_PREDICTOR_PATH = Path(__file__).parents[1] / "models" / "lips.npz"
 FORMAT = "lips 4"
 # FAPs that a camera tracks. The left and the right FAP of a pair have the same value.
 LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)

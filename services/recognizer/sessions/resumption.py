@@ -13,7 +13,7 @@ from kouxing_client.audio import MAX_KEPT
 from kouxing_client.messages import Message
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.live.live_decoder import StreamOutput
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (

@@ -4,10 +4,14 @@ import time
 from collections.abc import Callable, Sequence, Sized
 
 from kouxing.services.recognizer.acoustic.blocks import BlockRunner
-from kouxing.services.recognizer.hop_controller import MAX_HOP, HopController, ProcessorTime
-from kouxing.services.recognizer.network_thread import NetworkThread
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.session import RecognizerSession
+from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.services.recognizer.sessions.hop_controller import (
+    MAX_HOP,
+    HopController,
+    ProcessorTime,
+)
+from kouxing.services.recognizer.sessions.network_thread import NetworkThread
+from kouxing.services.recognizer.sessions.session import RecognizerSession
 from kouxing.shared.monitoring.metrics import LoadMeter
 
 MAX_BATCH_S = 0.3  # audio of all sessions that is decoded together

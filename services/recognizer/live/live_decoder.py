@@ -23,13 +23,13 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     empty_scores,
 )
 from kouxing.services.recognizer.front_end.features import HOP_S, frame_time_s
-from kouxing.services.recognizer.search.decoder import Decoder, PathSegment
-from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
-from kouxing.services.recognizer.speech_scorer import (
+from kouxing.services.recognizer.live.speech_scorer import (
     FrameScores,
     ScoreEvent,
 )
-from kouxing.services.recognizer.speech_segmenter import SpeechEnd, SpeechStart
+from kouxing.services.recognizer.live.speech_segmenter import SpeechEnd, SpeechStart
+from kouxing.services.recognizer.search.decoder import Decoder, PathSegment
+from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
 

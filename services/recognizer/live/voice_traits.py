@@ -28,10 +28,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
+from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_component
-from kouxing.services.recognizer.encoder import EncoderOutput, VoiceKind, load_encoder
 
-TRAITS_PATH = Path(__file__).parent / "models" / "traits.npz"
+TRAITS_PATH = Path(__file__).parents[1] / "models" / "traits.npz"
 FORMAT = "traits 1"
 NUM_TRAITS = 4  # arousal, valence, laughter, breath
 MIN_VOICE = 0.5  # smallest probability of a voice at which arousal and valence count

@@ -22,7 +22,7 @@ from kouxing.services.recognizer.front_end.features import (
     count_frames,
     frame_time_s,
 )
-from kouxing.services.recognizer.offline_recognition import WithProgress
+from kouxing.services.recognizer.offline.offline_recognition import WithProgress
 from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
     build_utterance_graph,

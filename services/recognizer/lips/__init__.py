@@ -1,0 +1,1 @@
+"""Predicts lip positions from the features of the audio encoder."""

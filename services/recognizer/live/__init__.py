@@ -1,0 +1,1 @@
+"""Recognizes live audio: from samples to phones, lip positions and speech events."""

@@ -1,0 +1,1 @@
+"""Recognizes, transcribes and aligns recordings."""

@@ -1,0 +1,1 @@
+"""The sessions of the service: their audio and results, and decoding in batches."""
