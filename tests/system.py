@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.services.cli.service_process import ServiceProcess
+from kouxing.services.cli.launch.service_process import ServiceProcess
 from kouxing.services.service_kinds import KINDS, free_port_environment, kind_of
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.settings.config import variable_name

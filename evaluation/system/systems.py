@@ -15,7 +15,7 @@ from rich.console import Console
 
 from kouxing.evaluation.system.network import Network
 from kouxing.evaluation.system.wait import wait_until
-from kouxing.services.cli.supervisor import Supervisor
+from kouxing.services.cli.launch.supervisor import Supervisor
 from kouxing.services.service_kinds import (
     KINDS,
     extra_worker_environments,

@@ -14,12 +14,15 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup, TyperOption
 
-from kouxing.services.cli import clients, cluster, configuration, offline, run
+from kouxing.services.cli import configuration
 from kouxing.services.cli.export import app as export_app
 from kouxing.services.cli.heads import app as head_app
 from kouxing.services.cli.heads import ensure_page_heads
 from kouxing.services.cli.keys import app as keys_app
+from kouxing.services.cli.launch import cluster, run
 from kouxing.services.cli.options import Assignments, ConfigFile, Panel
+from kouxing.services.cli.recordings import commands as recordings
+from kouxing.services.cli.system import clients
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
@@ -137,7 +140,7 @@ _COMMANDS: Mapping[Panel, Sequence[Callable[..., None]]] = {
         run.run, clients.speak, clients.listen, clients.send, clients.express, clients.devices,
         clients.status, clients.doctor, configuration.config, cluster.cluster,
     ),
-    Panel.RECORDINGS: (offline.render, offline.lips, offline.phones, offline.align),
+    Panel.RECORDINGS: (recordings.render, recordings.lips, recordings.phones, recordings.align),
 }  # fmt: skip
 for panel, commands in _COMMANDS.items():
     for command in commands:

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import FaceMotion, animate
-from kouxing.services.cli.cue_files import format_cues
-from kouxing.services.cli.spoken_text import MAX_TEXT_BYTES
+from kouxing.services.cli.recordings.animation import FaceMotion, animate
+from kouxing.services.cli.recordings.cue_files import format_cues
+from kouxing.services.cli.texts.spoken_text import MAX_TEXT_BYTES
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError

@@ -262,9 +262,10 @@ command_line.main()
 
 LOADING = """
 import sys
-from kouxing.services.cli import main, offline
+from kouxing.services.cli import main
+from kouxing.services.cli.recordings import commands
 SLOW = {"av", "numba", "onnxruntime", "scipy"}
-offline.show_loading = lambda: sys.exit(f"loading {sorted(SLOW & sys.modules.keys())}")
+commands.show_loading = lambda: sys.exit(f"loading {sorted(SLOW & sys.modules.keys())}")
 main.main()
 """
 

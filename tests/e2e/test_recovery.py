@@ -9,7 +9,7 @@ import pytest
 from kouxing_client import Client
 from rich.console import Console
 
-from kouxing.services.cli.supervisor import Supervisor
+from kouxing.services.cli.launch.supervisor import Supervisor
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.errors import UserError
 from tests.browser import Browser

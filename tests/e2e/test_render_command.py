@@ -11,9 +11,9 @@ from PIL import Image
 
 from kouxing.services.cli import heads as page_heads
 from kouxing.services.cli.heads import import_mesh
-from kouxing.services.cli.offline import render as render_files
+from kouxing.services.cli.launch.run import head_environment
 from kouxing.services.cli.options import CurveFormat
-from kouxing.services.cli.run import head_environment
+from kouxing.services.cli.recordings.commands import render as render_files
 from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.glb_head import read_glb

@@ -8,7 +8,7 @@ from unittest import mock
 
 import pytest
 
-from kouxing.services.cli.run import assigned_environment
+from kouxing.services.cli.launch.run import assigned_environment
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.service_kinds import (
     KINDS,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import typer
 
-from kouxing.services.cli.offline import align
+from kouxing.services.cli.recordings.commands import align
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline.alignment import (
     align_syllables,

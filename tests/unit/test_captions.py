@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import FaceMotion, animate, slow_down
-from kouxing.services.cli.captions import make_captions, write_syllables
 from kouxing.services.cli.options import CaptionKind
+from kouxing.services.cli.recordings.animation import FaceMotion, animate, slow_down
+from kouxing.services.cli.recordings.captions import make_captions, write_syllables
 from kouxing.services.driver.render.captions import Caption, CaptionDrawer, band_height_px
 from kouxing.services.driver.video.time_stretch import stretch_time
 from kouxing.shared import fonts

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from kouxing.services.cli.service_process import POLL_S, SilenceMeter
+from kouxing.services.cli.launch.service_process import POLL_S, SilenceMeter
 from kouxing.services.control.fault_log import FaultLog
 from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import ClockOffset, StallDetector

@@ -105,7 +105,7 @@ def test_a_start_imports_nothing_slow_that_it_does_not_need(start: str, slow: st
 
 def test_reports_how_to_install_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "kouxing.services.cli.ray_workers", raising=False)
+    monkeypatch.delitem(sys.modules, "kouxing.services.cli.launch.ray_workers", raising=False)
     ended = CliRunner().invoke(command_line.app, ["cluster"])
     assert isinstance(ended.exception, UserError)
     assert "pip install 'kouxing[cluster]'" in str(ended.exception)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from kouxing.services.cli.supervisor import Supervisor, _console_text
+from kouxing.services.cli.launch.supervisor import Supervisor, _console_text
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS, FrameStream
-from kouxing.services.cli.curve_reader import read_table
 from kouxing.services.cli.options import CurveFormat, ExportOptions
+from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, FrameStream
+from kouxing.services.cli.recordings.curve_reader import read_table
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT

@@ -5,7 +5,7 @@ from unittest import mock
 import pytest
 from kouxing_client import ServiceState
 
-from kouxing.services.cli import doctor
+from kouxing.services.cli.system import doctor
 from kouxing.shared.network.bus import Bus
 
 ELSEWHERE = {

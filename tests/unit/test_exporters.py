@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import FaceMotion
-from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS, FrameRow, FrameStream
-from kouxing.services.cli.exporters import open_exporter
-from kouxing.services.cli.follow import follow
 from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
+from kouxing.services.cli.recordings.animation import FaceMotion
+from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, FrameRow, FrameStream
+from kouxing.services.cli.recordings.exporters import open_exporter
+from kouxing.services.cli.system.follow import follow
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap

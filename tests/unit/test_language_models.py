@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.cli.mouth_drawing import draw_mouth
 from kouxing.services.cli.options import WidthSource
+from kouxing.services.cli.recordings.mouth_drawing import draw_mouth
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language, restrict_phones
 from kouxing.services.recognizer.acoustic.load import load_model

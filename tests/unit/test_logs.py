@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from kouxing.services.cli.log_file import LogFile
+from kouxing.services.cli.launch.log_file import LogFile
 from kouxing.services.process import run_service
 from kouxing.shared.monitoring.logs import LOG, configure
 

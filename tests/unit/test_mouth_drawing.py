@@ -8,9 +8,9 @@ import av
 import numpy as np
 import pytest
 
-from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, NUM_POINTS, draw_mouth
-from kouxing.services.cli.offline import lips
 from kouxing.services.cli.options import TimingMethod, WidthSource
+from kouxing.services.cli.recordings.commands import lips
+from kouxing.services.cli.recordings.mouth_drawing import CSV_COLUMNS, NUM_POINTS, draw_mouth
 from kouxing.services.driver import picture
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
 from kouxing.services.synthesizer.lips.ferguson.drawing import LabeledMouth, draw_strip

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.cli import rhubarb
-from kouxing.services.cli.cue_files import format_cues
+from kouxing.services.cli.recordings.cue_files import format_cues
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS

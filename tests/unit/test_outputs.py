@@ -13,12 +13,12 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import plot_heads
-from kouxing.services.cli.animation import FaceMotion
-from kouxing.services.cli.batch import pair_outputs, process_all
-from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS, FrameStream
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
-from kouxing.services.cli.running_system import lock_output_folder
+from kouxing.services.cli.recordings.animation import FaceMotion
+from kouxing.services.cli.recordings.batch import pair_outputs, process_all
+from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, FrameStream
+from kouxing.services.cli.system.running_system import lock_output_folder
 from kouxing.services.driver.video.film import TimedFaps
 from kouxing.services.driver.video.video_writer import PictureSequence, check_name
 from kouxing.shared.command.terminal import check_output, write_text

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from kouxing_client import NotConnected
 
-from kouxing.services.cli.clients import find_control_address
-from kouxing.services.cli.running_system import (
+from kouxing.services.cli.system.clients import find_control_address
+from kouxing.services.cli.system.running_system import (
     announce_system,
     find_control,
     lock_output_folder,

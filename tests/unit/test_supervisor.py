@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from kouxing.services.cli import supervisor
+from kouxing.services.cli.launch import supervisor
 from kouxing.shared.errors import UserError
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.cli.spoken_text import read_spoken_text, read_transcript
-from kouxing.services.cli.text_formats import decode_text, extract_text
+from kouxing.services.cli.texts.spoken_text import read_spoken_text, read_transcript
+from kouxing.services.cli.texts.text_formats import decode_text, extract_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
 from tests.languages import MANDARIN

@@ -12,9 +12,9 @@ from kouxing.corpora.commands import _read as read_speech
 from kouxing.corpora.lip_clips import read_clip
 from kouxing.corpora.speech_corpus import RowErrors, read_corpus
 from kouxing.evaluation.mos.study import load_study
-from kouxing.services.cli.animation import read_motion
 from kouxing.services.cli.configuration import config
-from kouxing.services.cli.spoken_text import read_spoken_text, read_transcript
+from kouxing.services.cli.recordings.animation import read_motion
+from kouxing.services.cli.texts.spoken_text import read_spoken_text, read_transcript
 from kouxing.services.driver.head.feature_points_file import read_points
 from kouxing.services.driver.head.mesh_file import read_mesh
 from kouxing.services.driver.render.scene import load_head

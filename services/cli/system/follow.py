@@ -9,15 +9,15 @@ from typing import TypeVar
 import numpy as np
 from kouxing_client import Client, FapFrame, Phone, Refused, Results, Session
 
-from kouxing.services.cli.curve_exporters import (
+from kouxing.services.cli.options import SPEECH_FORMATS, CurveFormat, ExportOptions, ListenFormat
+from kouxing.services.cli.recordings.curve_exporters import (
     CURVE_EXPORTERS,
     CurveExporter,
     FrameRow,
     FrameStream,
     json_line,
 )
-from kouxing.services.cli.options import SPEECH_FORMATS, CurveFormat, ExportOptions, ListenFormat
-from kouxing.services.cli.streaming import missed_warning
+from kouxing.services.cli.system.streaming import missed_warning
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.command.terminal import CONSOLE, plural, print_message
 from kouxing.shared.errors import UserError

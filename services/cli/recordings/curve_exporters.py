@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from kouxing.services.cli.cue_files import CUE_FORMATS, CUE_KINDS, format_cues
 from kouxing.services.cli.options import CurveFormat, ExportOptions
+from kouxing.services.cli.recordings.cue_files import CUE_FORMATS, CUE_KINDS, format_cues
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -33,7 +33,7 @@ from kouxing.shared.files.output_file import open_output, write_error
 from kouxing.shared.phones.events import Phone
 
 if TYPE_CHECKING:
-    from kouxing.services.cli.animation import FaceMotion
+    from kouxing.services.cli.recordings.animation import FaceMotion
 
 Values = NDArray[np.float32]
 FrameRow = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)

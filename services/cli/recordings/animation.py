@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from kouxing.services.cli.captions import check_characters, write_syllables
-from kouxing.services.cli.curve_reader import TABLE_SUFFIXES, read_table
 from kouxing.services.cli.options import CaptionKind
-from kouxing.services.cli.spoken_text import read_transcript, report_mismatch
+from kouxing.services.cli.recordings.captions import check_characters, write_syllables
+from kouxing.services.cli.recordings.curve_reader import TABLE_SUFFIXES, read_table
+from kouxing.services.cli.texts.spoken_text import read_transcript, report_mismatch
 from kouxing.services.driver.video import film
 from kouxing.services.driver.video.time_stretch import stretch_time
 from kouxing.services.live_pipeline import LivePipeline

@@ -20,7 +20,7 @@ from kouxing.services.cli.options import (
     PhoneAlphabet,
     reject_options,
 )
-from kouxing.services.cli.running_system import RunningSystem, find_control, other_systems
+from kouxing.services.cli.system.running_system import RunningSystem, find_control, other_systems
 from kouxing.services.service_kinds import read_settings
 from kouxing.shared.command.terminal import (
     CONSOLE,
@@ -99,7 +99,7 @@ def speak(
 
     The exit status is 1 if --record was given and no video was written.
     """
-    from kouxing.services.cli.streaming import stream
+    from kouxing.services.cli.system.streaming import stream
     from kouxing.services.recognizer.lips.mouth_profile import read_mouth_profile
     from kouxing.shared.audio.audio_file import open_audio
     from kouxing.shared.audio.media_file import RawFormat
@@ -192,7 +192,7 @@ def listen(
     Blendshapes are printed as JSON lines. With --as rhubarb, a line is printed whenever the mouth
     shape changes. Syllables and phones are printed once they are final.
     """
-    from kouxing.services.cli.follow import follow
+    from kouxing.services.cli.system.follow import follow
 
     if form is not ListenFormat.PHONES:
         reject_options("applies to phones; add --as phones", alphabet=alphabet)
@@ -218,7 +218,7 @@ def send(
     control: Control = "",
 ) -> None:
     """Animate avatars in other programs, over VMC, Live Link Face, OSC or VTube Studio."""
-    from kouxing.services.cli.send import send_to
+    from kouxing.services.cli.system.send import send_to
     from kouxing.services.senders.protocols import parse_target
     from kouxing.services.synthesizer.config import SynthesizerConfig
 
@@ -333,7 +333,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
 
 def doctor(control: Control = "") -> None:
     """Check keys, addresses, clocks and versions from this machine, and print remedies."""
-    from kouxing.services.cli.doctor import run_checks
+    from kouxing.services.cli.system.doctor import run_checks
 
     num_checks = num_failed = 0
     for finding in run_checks(control):

@@ -17,8 +17,8 @@ from typing import IO
 from kouxing_client import KouxingError
 from rich.console import Console
 
-from kouxing.services.cli.log_file import LogFile
-from kouxing.services.cli.service_process import HANG_S, POLL_S, ServiceProcess
+from kouxing.services.cli.launch.log_file import LogFile
+from kouxing.services.cli.launch.service_process import HANG_S, POLL_S, ServiceProcess
 from kouxing.services.service_kinds import KINDS, WORKERS, kind_of
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import USER_ERROR, UserError, prefix_name

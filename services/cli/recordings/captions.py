@@ -18,7 +18,7 @@ from kouxing.shared.phones.syllable_captions import group_syllables
 from kouxing.shared.phones.transcript import SpokenSyllable, TimedSyllable, Transcript
 
 if TYPE_CHECKING:
-    from kouxing.services.cli.animation import FaceMotion
+    from kouxing.services.cli.recordings.animation import FaceMotion
 
 
 def write_syllables(

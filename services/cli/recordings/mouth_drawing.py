@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.cli.captions import write_syllables
 from kouxing.services.cli.options import TimingMethod, WidthSource
-from kouxing.services.cli.spoken_text import print_mismatch, read_transcript, report_mismatch
+from kouxing.services.cli.recordings.captions import write_syllables
+from kouxing.services.cli.texts.spoken_text import print_mismatch, read_transcript, report_mismatch
 from kouxing.services.driver.video.video_writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language

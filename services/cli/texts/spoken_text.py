@@ -4,7 +4,7 @@ import os
 import re
 from pathlib import Path
 
-from kouxing.services.cli.text_formats import SpokenText, decode_text, extract_text
+from kouxing.services.cli.texts.text_formats import SpokenText, decode_text, extract_text
 from kouxing.services.recognizer.offline.alignment import MIN_FIT, Alignment
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError

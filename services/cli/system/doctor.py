@@ -10,8 +10,8 @@ from kouxing_client import ServiceState
 from kouxing_client.keys import Key
 from kouxing_client.reach import reach_error
 
-from kouxing.services.cli.clients import find_system
-from kouxing.services.cli.running_system import running_systems
+from kouxing.services.cli.system.clients import find_system
+from kouxing.services.cli.system.running_system import running_systems
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.command.terminal import plural

@@ -21,7 +21,7 @@ from kouxing.services.cli.options import (
     HeadName,
     reject_options,
 )
-from kouxing.services.cli.running_system import (
+from kouxing.services.cli.system.running_system import (
     announce_system,
     lock_output_folder,
     lock_startup,
@@ -79,7 +79,7 @@ def run(
     assignments: Assignments = None,
 ) -> None:
     """Run all services on this machine, and restart any that crashes or hangs."""
-    from kouxing.services.cli.supervisor import Supervisor
+    from kouxing.services.cli.launch.supervisor import Supervisor
 
     if play is None:
         reject_options("needs --play FILE", stop_after=stop_after, track=track)
@@ -250,7 +250,7 @@ def _open_sample(path: Path, track: int | None, video: Path) -> AudioSource:
 
 
 def _play_sample(sample: AudioSource, control: str) -> None:
-    from kouxing.services.cli.streaming import stream
+    from kouxing.services.cli.system.streaming import stream
 
     summary = stream(sample, control, CONSOLE, session=_SAMPLE_SESSION, record=True)
     print_message(

@@ -17,7 +17,7 @@ from typing import Self
 
 import ray
 
-from kouxing.services.cli.service_process import POLL_S, ServiceProcess
+from kouxing.services.cli.launch.service_process import POLL_S, ServiceProcess
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.errors import UserError
 from kouxing.shared.service.base import DRAIN_TIMEOUT_S

@@ -8,10 +8,10 @@ from typing import ClassVar, Protocol
 
 from rich.progress import Progress
 
-from kouxing.services.cli.animation import FaceMotion, slow_down
-from kouxing.services.cli.captions import make_captions
-from kouxing.services.cli.curve_exporters import CURVE_EXPORTERS
 from kouxing.services.cli.options import ExportOptions
+from kouxing.services.cli.recordings.animation import FaceMotion, slow_down
+from kouxing.services.cli.recordings.captions import make_captions
+from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS
 from kouxing.services.driver.config import check_even, parse_size
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.captions import band_height_px

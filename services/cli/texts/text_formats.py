@@ -12,7 +12,7 @@ from collections.abc import Callable
 from itertools import groupby, pairwise
 from typing import NamedTuple
 
-from kouxing.services.cli.text_columns import remove_columns
+from kouxing.services.cli.texts.text_columns import remove_columns
 from kouxing.shared.audio.sound_formats import audio_file_kind
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import parse_json

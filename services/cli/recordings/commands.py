@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.cli.batch import pair_outputs, process_all
 from kouxing.services.cli.options import (
     ACOUSTIC_MODEL,
     AudioTrack,
@@ -23,6 +22,7 @@ from kouxing.services.cli.options import (
     WidthSource,
     reject_options,
 )
+from kouxing.services.cli.recordings.batch import pair_outputs, process_all
 from kouxing.services.driver.config import Framing
 from kouxing.shared.command.terminal import (
     Force,
@@ -163,7 +163,7 @@ def render(
     mouth follows the text, and the exit status is 1.
     """
     with show_loading():
-        from kouxing.services.cli.exporters import existing_output, is_output
+        from kouxing.services.cli.recordings.exporters import existing_output, is_output
 
     if live and text is not None:
         raise UserError("a live stream has no text in advance; use either --live or --text")
@@ -189,8 +189,8 @@ def render(
     wrong_texts: list[Path] = []
 
     def render_file(source: Path, target: Path) -> None:
-        from kouxing.services.cli.animation import animate, has_motion, read_motion
-        from kouxing.services.cli.exporters import open_exporter
+        from kouxing.services.cli.recordings.animation import animate, has_motion, read_motion
+        from kouxing.services.cli.recordings.exporters import open_exporter
 
         if has_motion(source):
             reject_options(
@@ -297,7 +297,7 @@ def align(
     The exit status is 1 if the text does not fit the audio.
     """
     with show_loading():
-        from kouxing.services.cli.spoken_text import read_transcript, report_mismatch
+        from kouxing.services.cli.texts.spoken_text import read_transcript, report_mismatch
         from kouxing.services.mono_audio import read_mono_16k
         from kouxing.services.recognizer.acoustic.languages import load_model_for_language
         from kouxing.services.recognizer.offline.alignment import (
@@ -362,7 +362,7 @@ def lips(
 ) -> None:
     """Draw the mouth in two dimensions, for cartoons, teaching and papers."""
     with show_loading():
-        from kouxing.services.cli.mouth_drawing import draw_mouth
+        from kouxing.services.cli.recordings.mouth_drawing import draw_mouth
 
     *text, output = text_and_output
     if len(text) > 1:

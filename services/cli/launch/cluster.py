@@ -25,7 +25,7 @@ def cluster(
     """Scale the workers on a Ray cluster to the given numbers, then list them."""
     settings = read_settings(config, parse_assignments(assignments or []))
     try:
-        from kouxing.services.cli.ray_workers import RayWorkers
+        from kouxing.services.cli.launch.ray_workers import RayWorkers
     except ModuleNotFoundError:
         command = install_command("kouxing[cluster]")
         raise UserError(

@@ -1,0 +1,1 @@
+"""Starts services and supervises their processes."""

@@ -1,0 +1,1 @@
+"""The commands for recordings: files in, files out."""

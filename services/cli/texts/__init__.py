@@ -1,0 +1,1 @@
+"""Reads the spoken text of a recording."""
