@@ -17,11 +17,11 @@ from aiohttp import web
 
 from kouxing.evaluation.mos.store import Answer, AnswerStore
 from kouxing.evaluation.mos.study import LANGUAGES, SCALES, Study, places_of_judge
-from kouxing.services.gateway import web_application
-from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.gateway.page_endpoint import make_page_endpoint
-from kouxing.services.gateway.web_server import WebServer, bind_port
+from kouxing.services.gateway.web import web_application
+from kouxing.services.gateway.web.access import AccessPolicy
+from kouxing.services.gateway.web.page_endpoint import make_page_endpoint
+from kouxing.services.gateway.web.web_server import WebServer, bind_port
 from kouxing.shared.files.user_file import parse_json
 
 FOLDER = Path(__file__).parent / "page"

@@ -11,7 +11,7 @@ from dataclasses import asdict
 import numpy as np
 from aiohttp import web
 
-from kouxing.services.gateway import browser_messages
+from kouxing.services.gateway.messages import browser_messages
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.sender_pool import SenderPool
 from kouxing.services.senders.target import Target, parse_delay_s

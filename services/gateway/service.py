@@ -16,19 +16,20 @@ from dataclasses import dataclass
 from aiohttp import web
 from kouxing_client.messages import EndOfFaps, FapFrame, Message, Phone, Sound, Speech
 
-from kouxing.services.gateway import browser_messages, web_application
-from kouxing.services.gateway.audio_sessions import AudioClient
+from kouxing.services.gateway.audio.audio_sessions import AudioClient
+from kouxing.services.gateway.audio.microphone_handler import MicrophoneHandler
+from kouxing.services.gateway.audio.sample_sentence import SampleSentence
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.gateway.microphone_handler import MicrophoneHandler
-from kouxing.services.gateway.mouth_learner import MouthLearner
-from kouxing.services.gateway.page_endpoint import make_page_endpoint
-from kouxing.services.gateway.sample_sentence import SampleSentence
+from kouxing.services.gateway.messages import browser_messages
 from kouxing.services.gateway.senders_api import SendersApi
-from kouxing.services.gateway.sound_upload import SoundUploadHandler
-from kouxing.services.gateway.viewer_handler import ViewerHandler
-from kouxing.services.gateway.viewer_queue import MessageKind
-from kouxing.services.gateway.web_server import WebServer, bind_port
-from kouxing.services.gateway.whip_handler import WhipHandler
+from kouxing.services.gateway.uploads.mouth_learner import MouthLearner
+from kouxing.services.gateway.uploads.sound_upload import SoundUploadHandler
+from kouxing.services.gateway.viewers.viewer_handler import ViewerHandler
+from kouxing.services.gateway.viewers.viewer_queue import MessageKind
+from kouxing.services.gateway.web import web_application
+from kouxing.services.gateway.web.page_endpoint import make_page_endpoint
+from kouxing.services.gateway.web.web_server import WebServer, bind_port
+from kouxing.services.gateway.webrtc.whip_handler import WhipHandler
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError

@@ -13,9 +13,9 @@ PAGE_TEXTS = PAGE / "gateway-texts.js"
 SOURCES = (
     *("shared/audio/audio_file.py", "shared/audio/media_file.py", "shared/audio/sound_formats.py"),
     *("shared/audio/phase_cancellation.py", "shared/audio/wav_parts.py"),
-    "services/gateway/sound_upload.py",
-    *("services/gateway/upload_handler.py", "services/gateway/mouth_learner.py"),
-    "services/gateway/viewer_handler.py",
+    "services/gateway/uploads/sound_upload.py",
+    *("services/gateway/uploads/upload_handler.py", "services/gateway/uploads/mouth_learner.py"),
+    "services/gateway/viewers/viewer_handler.py",
     *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),
     *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),
     *("services/senders/connection.py", "services/senders/protocols.py"),

@@ -23,8 +23,8 @@ from aiortc.contrib.media import MediaPlayer
 from aiortc.rtcdtlstransport import RTCDtlsTransport
 from av import AudioFrame
 
-from kouxing.services.gateway.browser_messages import FAP_TYPE, SHAPES_TYPE
-from kouxing.services.gateway.webrtc import WebRtcPeer
+from kouxing.services.gateway.messages.browser_messages import FAP_TYPE, SHAPES_TYPE
+from kouxing.services.gateway.webrtc.connection import WebRtcPeer
 from kouxing.shared.face.shapes import ARKIT
 from kouxing.shared.phones.inventory import load_inventory
 from tests.e2e.streaming import stream_audio

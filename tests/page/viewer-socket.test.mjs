@@ -22,7 +22,7 @@ class FakeWebSocket {
   }
 }
 
-/** Return a binary message as services/gateway/browser_messages.py packs it: <B3xId and the payload. */
+/** Return a binary message as services/gateway/messages/browser_messages.py packs it: <B3xId and the payload. */
 function binary(kind, mediaTime, payload) {
   const data = new ArrayBuffer(16 + payload.byteLength);
   const header = new DataView(data);

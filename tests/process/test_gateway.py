@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from pythonosc.osc_bundle import OscBundle
 
-from kouxing.services.gateway.browser_messages import (
+from kouxing.services.gateway.audio.microphone_handler import MAX_MESSAGE_BYTES
+from kouxing.services.gateway.messages.browser_messages import (
     FAP_TYPE,
     REST_SHAPES_TYPE,
     REST_TYPE,
     SHAPES_TYPE,
 )
-from kouxing.services.gateway.microphone_handler import MAX_MESSAGE_BYTES
 from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.wire.face import SetFace

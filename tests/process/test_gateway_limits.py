@@ -17,13 +17,16 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from aiohttp.typedefs import Handler
 
-from kouxing.services.gateway import microphone_handler, viewer_handler, web_server, whip_handler
+from kouxing.services.gateway.audio import microphone_handler
+from kouxing.services.gateway.audio.microphone_handler import MicrophoneHandler
 from kouxing.services.gateway.config import ADDRESS_SHARE
-from kouxing.services.gateway.microphone_handler import MicrophoneHandler
-from kouxing.services.gateway.viewer_handler import ViewerHandler
-from kouxing.services.gateway.web_application import OpenWebSockets
-from kouxing.services.gateway.web_server import WebServer
-from kouxing.services.gateway.whip_handler import NO_WEBRTC, WhipHandler
+from kouxing.services.gateway.viewers import viewer_handler
+from kouxing.services.gateway.viewers.viewer_handler import ViewerHandler
+from kouxing.services.gateway.web import web_server
+from kouxing.services.gateway.web.web_application import OpenWebSockets
+from kouxing.services.gateway.web.web_server import WebServer
+from kouxing.services.gateway.webrtc import whip_handler
+from kouxing.services.gateway.webrtc.whip_handler import NO_WEBRTC, WhipHandler
 from kouxing.shared.monitoring.metrics import Metrics
 from tests.process.web_clients import async_test
 from tests.system import LIMIT_S
@@ -343,7 +346,7 @@ async def test_one_address_gets_only_its_share_of_webrtc_clients(
 @async_test
 async def test_whip_without_aiortc_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "aiortc", None)
-    monkeypatch.delitem(sys.modules, "kouxing.services.gateway.webrtc", raising=False)
+    monkeypatch.delitem(sys.modules, "kouxing.services.gateway.webrtc.connection", raising=False)
     clients = WhipHandler(1.0, UNUSED, UNUSED, ["127.0.0.1"])
     async with whip_offer(clients) as offer:
         assert await offer() == (501, NO_WEBRTC)

@@ -21,7 +21,7 @@ from tests.process.web_clients import (
 from tests.system import LIMIT_S, Gateway, free_port
 
 LONG_TIMEOUT = """
-from kouxing.services.gateway import audio_sessions
+from kouxing.services.gateway.audio import audio_sessions
 from kouxing.services.process import serve
 audio_sessions.LAST_FRAME_TIMEOUT_S = 600
 serve("gateway", None, [])

@@ -16,12 +16,12 @@ import pytest
 import soundfile
 from aiohttp import web
 
-from kouxing.services.gateway import sound_upload
-from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.mouth_learner import MAX_BYTES, MouthLearner
-from kouxing.services.gateway.sound_upload import REMARKS_HEADER, SoundUploadHandler
-from kouxing.services.gateway.upload_handler import UploadHandler
-from kouxing.services.gateway.web_application import make_application
+from kouxing.services.gateway.uploads import sound_upload
+from kouxing.services.gateway.uploads.mouth_learner import MAX_BYTES, MouthLearner
+from kouxing.services.gateway.uploads.sound_upload import REMARKS_HEADER, SoundUploadHandler
+from kouxing.services.gateway.uploads.upload_handler import UploadHandler
+from kouxing.services.gateway.web.access import AccessPolicy
+from kouxing.services.gateway.web.web_application import make_application
 from tests.process.web_clients import async_test
 
 REVERSE = """

@@ -13,7 +13,7 @@ import aiohttp
 from kouxing_client.field_types import MASK_BYTES
 from kouxing_client.messages import FapFrame, Phone, Sound, Speech
 
-from kouxing.services.gateway.browser_messages import REST_TYPE
+from kouxing.services.gateway.messages.browser_messages import REST_TYPE
 from kouxing.shared.face.faps import NUM_FAPS
 from tests.fake_control import EPOCH, FakeControl
 from tests.system import LIMIT_S, wait_until

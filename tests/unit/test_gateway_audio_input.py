@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from kouxing.services.gateway.audio_input import MAX_QUEUED_BYTES, AudioInput
-from kouxing.services.gateway.limits import RealTimeLimit
-from kouxing.services.gateway.pcm_format import PcmFormat, check_text
+from kouxing.services.gateway.audio.audio_input import MAX_QUEUED_BYTES, AudioInput
+from kouxing.services.gateway.messages.pcm_format import PcmFormat, check_text
+from kouxing.services.gateway.web.limits import RealTimeLimit
 from kouxing.shared.errors import UserError
 from tests.fake_time import run
 

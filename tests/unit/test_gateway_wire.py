@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kouxing.services.gateway import browser_messages
-from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.browser_messages import parse_face_settings
-from kouxing.services.gateway.pcm_format import PcmFormat
-from kouxing.services.gateway.sample_sentence import SampleSentence
-from kouxing.services.gateway.shape_messages import make_avatar_encoder
-from kouxing.services.gateway.viewer_handler import PAUSE_S, Viewer, ViewerHandler
-from kouxing.services.gateway.viewer_queue import (
+from kouxing.services.gateway.audio.sample_sentence import SampleSentence
+from kouxing.services.gateway.messages import browser_messages
+from kouxing.services.gateway.messages.browser_messages import parse_face_settings
+from kouxing.services.gateway.messages.pcm_format import PcmFormat
+from kouxing.services.gateway.messages.shape_messages import make_avatar_encoder
+from kouxing.services.gateway.viewers.viewer_handler import PAUSE_S, Viewer, ViewerHandler
+from kouxing.services.gateway.viewers.viewer_queue import (
     MAX_QUEUED,
     NUM_FRAMES_KEPT,
     MessageKind,
     ViewerQueue,
 )
-from kouxing.services.gateway.web_application import OpenWebSockets, make_application
+from kouxing.services.gateway.web.access import AccessPolicy
+from kouxing.services.gateway.web.web_application import OpenWebSockets, make_application
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES

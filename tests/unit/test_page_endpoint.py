@@ -3,7 +3,7 @@
 import pytest
 
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.gateway.page_endpoint import make_page_endpoint
+from kouxing.services.gateway.web.page_endpoint import make_page_endpoint
 
 ANYWHERE = "0.0.0.0"  # noqa: S104
 

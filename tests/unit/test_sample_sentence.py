@@ -5,8 +5,8 @@ import wave
 from collections.abc import AsyncIterator
 from typing import cast
 
-from kouxing.services.gateway.audio_sessions import AudioClient
-from kouxing.services.gateway.sample_sentence import SAMPLE_FILE, SampleSentence
+from kouxing.services.gateway.audio.audio_sessions import AudioClient
+from kouxing.services.gateway.audio.sample_sentence import SAMPLE_FILE, SampleSentence
 from tests.fake_time import run
 
 

@@ -9,11 +9,11 @@ from typing import Any, cast
 import pytest
 from kouxing_client import KouxingError, Refused
 
-from kouxing.services.gateway.audio_sessions import AudioClient
-from kouxing.services.gateway.sample_sentence import SampleSentence
-from kouxing.services.gateway.viewer_handler import ViewerHandler
-from kouxing.services.gateway.web_application import OpenWebSockets
-from kouxing.services.gateway.whip_handler import MAX_COMMANDS, WhipHandler, _Client
+from kouxing.services.gateway.audio.audio_sessions import AudioClient
+from kouxing.services.gateway.audio.sample_sentence import SampleSentence
+from kouxing.services.gateway.viewers.viewer_handler import ViewerHandler
+from kouxing.services.gateway.web.web_application import OpenWebSockets
+from kouxing.services.gateway.webrtc.whip_handler import MAX_COMMANDS, WhipHandler, _Client
 from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
 from tests.fake_time import run

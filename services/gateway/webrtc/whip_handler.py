@@ -18,20 +18,20 @@ from typing import TYPE_CHECKING
 from aiohttp import web
 from kouxing_client import KouxingError, Refused
 
-from kouxing.services.gateway import browser_messages
-from kouxing.services.gateway.audio_sessions import AudioClient, AudioSession, error_text
-from kouxing.services.gateway.browser_messages import CHANNEL_COMMANDS
-from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
-from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
-from kouxing.services.gateway.viewer_handler import ViewerHandler
-from kouxing.services.gateway.viewer_queue import MessageKind
+from kouxing.services.gateway.audio.audio_sessions import AudioClient, AudioSession, error_text
+from kouxing.services.gateway.messages import browser_messages
+from kouxing.services.gateway.messages.browser_messages import CHANNEL_COMMANDS
+from kouxing.services.gateway.messages.shape_messages import ShapeEncoder, parse_shape_query
+from kouxing.services.gateway.viewers.viewer_handler import ViewerHandler
+from kouxing.services.gateway.viewers.viewer_queue import MessageKind
+from kouxing.services.gateway.web.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
 from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.logs import LOG
 
 if TYPE_CHECKING:
     from aiortc import RTCDataChannel
 
-    from kouxing.services.gateway.webrtc import WebRtcPeer
+    from kouxing.services.gateway.webrtc.connection import WebRtcPeer
 
 MAX_CLIENTS = 16
 SDP = "application/sdp"
@@ -133,7 +133,7 @@ class WhipHandler:
         await asyncio.gather(*(peer.close() for peer in peers), return_exceptions=True)
 
     async def _make_peer(self, client: _Client) -> WebRtcPeer:
-        name = "kouxing.services.gateway.webrtc"
+        name = "kouxing.services.gateway.webrtc.connection"
         try:
             webrtc = await asyncio.to_thread(importlib.import_module, name)
         except ModuleNotFoundError:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from kouxing_client import KouxingError
 
-from kouxing.services.gateway.audio_sessions import AudioClient, error_text
+from kouxing.services.gateway.audio.audio_sessions import AudioClient, error_text
 from kouxing.shared.audio.audio_file import open_audio
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError

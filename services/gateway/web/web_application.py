@@ -11,8 +11,8 @@ from pathlib import Path
 from aiohttp import WSCloseCode, WSMsgType, web
 
 import kouxing.shared.face
-from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.limits import ConnectionQuota
+from kouxing.services.gateway.web.access import AccessPolicy
+from kouxing.services.gateway.web.limits import ConnectionQuota
 from kouxing.services.heads import HEAD_NAMES, page_file, page_heads_folder
 from kouxing.services.lip_models import lip_models
 from kouxing.shared.errors import UserError
@@ -20,7 +20,7 @@ from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.phones.inventory import language_titles
 
-PAGE_FOLDER = Path(__file__).parent / "page"
+PAGE_FOLDER = Path(__file__).parents[1] / "page"
 LIGHT_SHADER = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
 PING_S = 20.0  # interval of pings that detect vanished browsers
 MAX_MESSAGE_BYTES = 128 * 1024  # limit for a WebSocket message without audio

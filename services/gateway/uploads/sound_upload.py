@@ -12,9 +12,13 @@ from urllib.parse import quote
 
 from aiohttp import web
 
-from kouxing.services.gateway import sound_decoder
-from kouxing.services.gateway.upload_handler import UPLOAD_LIMIT_S, UploadHandler, upload_error
-from kouxing.services.gateway.web_application import discard_body
+from kouxing.services.gateway.uploads import sound_decoder
+from kouxing.services.gateway.uploads.upload_handler import (
+    UPLOAD_LIMIT_S,
+    UploadHandler,
+    upload_error,
+)
+from kouxing.services.gateway.web.web_application import discard_body
 from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.monitoring.logs import LOG
 

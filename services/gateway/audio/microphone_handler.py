@@ -5,12 +5,12 @@ import contextlib
 from aiohttp import WSCloseCode, WSMsgType, web
 from kouxing_client import KouxingError
 
-from kouxing.services.gateway import browser_messages
-from kouxing.services.gateway.audio_input import AudioInput
-from kouxing.services.gateway.audio_sessions import AudioClient, AudioSession, error_text
-from kouxing.services.gateway.limits import ConnectionQuota
-from kouxing.services.gateway.pcm_format import PcmFormat, WrongFormat
-from kouxing.services.gateway.web_application import OpenWebSockets
+from kouxing.services.gateway.audio.audio_input import AudioInput
+from kouxing.services.gateway.audio.audio_sessions import AudioClient, AudioSession, error_text
+from kouxing.services.gateway.messages import browser_messages
+from kouxing.services.gateway.messages.pcm_format import PcmFormat, WrongFormat
+from kouxing.services.gateway.web.limits import ConnectionQuota
+from kouxing.services.gateway.web.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.logs import LOG
 

@@ -9,17 +9,17 @@ from dataclasses import dataclass, field
 
 from aiohttp import WSMsgType, web
 
-from kouxing.services.gateway import browser_messages
-from kouxing.services.gateway.browser_messages import VIEWER_COMMANDS, ViewerCommand
-from kouxing.services.gateway.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
-from kouxing.services.gateway.sample_sentence import SampleSentence
-from kouxing.services.gateway.shape_messages import (
+from kouxing.services.gateway.audio.sample_sentence import SampleSentence
+from kouxing.services.gateway.messages import browser_messages
+from kouxing.services.gateway.messages.browser_messages import VIEWER_COMMANDS, ViewerCommand
+from kouxing.services.gateway.messages.shape_messages import (
     ShapeEncoder,
     make_avatar_encoder,
     parse_shape_query,
 )
-from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
-from kouxing.services.gateway.web_application import OpenWebSockets
+from kouxing.services.gateway.viewers.viewer_queue import MessageKind, ViewerQueue
+from kouxing.services.gateway.web.limits import COMMAND_S, ConnectionQuota, RealTimeLimit
+from kouxing.services.gateway.web.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.fast_record import replace

@@ -14,7 +14,7 @@ from kouxing_client.field_types import SessionName, whole_text
 from kouxing_client.options import MAX_RATE_HZ
 from msgspec import Meta, Struct
 
-from kouxing.services.gateway.pcm_format import (
+from kouxing.services.gateway.messages.pcm_format import (
     MAX_OBJECT_BYTES,
     PcmFormat,
     WrongFormat,

@@ -10,7 +10,7 @@ from typing import BinaryIO, ClassVar
 
 from aiohttp import web
 
-from kouxing.services.gateway.web_application import discard_body
+from kouxing.services.gateway.web.web_application import discard_body
 from kouxing.shared.errors import UserError
 
 UPLOAD_LIMIT_S = 60.0

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 from aiohttp import web
 
-from kouxing.services.gateway import browser_messages
-from kouxing.services.gateway.browser_messages import FORMATS
+from kouxing.services.gateway.messages import browser_messages
+from kouxing.services.gateway.messages.browser_messages import FORMATS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shape_names import choose_set, find_shapes
 from kouxing.shared.face.shapes import SHAPE_SETS

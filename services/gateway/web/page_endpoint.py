@@ -6,9 +6,9 @@ import ssl
 from dataclasses import dataclass
 from urllib.parse import quote
 
-from kouxing.services.gateway.access import AccessPolicy
-from kouxing.services.gateway.certificate import load_tls_context
 from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.gateway.web.access import AccessPolicy
+from kouxing.services.gateway.web.certificate import load_tls_context
 from kouxing.shared.settings.endpoints import WILDCARDS, is_address, is_loopback
 
 

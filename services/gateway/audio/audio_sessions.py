@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from kouxing_client import AsyncClient, AsyncSession, KouxingError, Refused
 from kouxing_client.keys import Key
 
-from kouxing.services.gateway import browser_messages
+from kouxing.services.gateway.messages import browser_messages
 from kouxing.shared.errors import UserError
 
 LAST_FRAME_TIMEOUT_S = 1.5  # maximum wait for the last frame after the end of the audio

@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator
 from aiohttp import WSMessage, WSMsgType, web
 from kouxing_client import KouxingError
 
-from kouxing.services.gateway.audio_sessions import AudioSession
-from kouxing.services.gateway.limits import COMMAND_S, RealTimeLimit
-from kouxing.services.gateway.pcm_format import HEADER_BYTES, PcmFormat
+from kouxing.services.gateway.audio.audio_sessions import AudioSession
+from kouxing.services.gateway.messages.pcm_format import HEADER_BYTES, PcmFormat
+from kouxing.services.gateway.web.limits import COMMAND_S, RealTimeLimit
 from kouxing.shared.audio.encoding_check import EncodingCheck
 
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats

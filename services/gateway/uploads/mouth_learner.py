@@ -9,8 +9,12 @@ from collections.abc import Sequence
 
 from aiohttp import web
 
-from kouxing.services.gateway.upload_handler import UPLOAD_LIMIT_S, UploadHandler, upload_error
-from kouxing.services.gateway.web_application import discard_body
+from kouxing.services.gateway.uploads.upload_handler import (
+    UPLOAD_LIMIT_S,
+    UploadHandler,
+    upload_error,
+)
+from kouxing.services.gateway.web.web_application import discard_body
 from kouxing.services.mouth_profiles import learning_process
 from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.monitoring.logs import LOG

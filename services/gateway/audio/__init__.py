@@ -1,0 +1,1 @@
+"""Streams audio from browsers and the sample sentence into sessions."""

@@ -1,0 +1,1 @@
+"""The messages between browsers and the gateway; ``proto/GATEWAY.md`` specifies them."""

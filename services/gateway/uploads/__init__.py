@@ -1,0 +1,1 @@
+"""Receives and decodes uploaded recordings."""

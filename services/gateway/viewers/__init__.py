@@ -1,0 +1,1 @@
+"""Shows sessions to browsers."""

@@ -1,0 +1,1 @@
+"""The HTTP server: files of the page, access, certificate and limits."""

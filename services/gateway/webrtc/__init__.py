@@ -1,0 +1,1 @@
+"""WebRTC clients: their audio, and the frames of their sessions."""
