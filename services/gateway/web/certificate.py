@@ -14,6 +14,7 @@ from cryptography.x509.oid import NameOID
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import write_private
 from kouxing.shared.files.user_file import open_file
+from kouxing.shared.monitoring.logs import LOG
 
 _MAX_BYTES = 1 << 20
 _VALID_DAYS = 397  # browsers reject certificates that are valid for longer
@@ -26,10 +27,12 @@ def load_tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     ``UserError`` if the file cannot be read or written, or does not contain a certificate and its
     key.
     """
+    now = datetime.datetime.now(datetime.UTC)
     try:
         if not certificate.exists():
-            write_private(certificate, _create_self_signed(hosts))
-        open_file(certificate, _MAX_BYTES).close()  # OpenSSL would block on a FIFO
+            write_private(certificate, create_self_signed(hosts, now))
+        with open_file(certificate, _MAX_BYTES) as file:  # OpenSSL would block on a FIFO
+            pem = file.read()
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         context.load_cert_chain(certificate)
     except (OSError, ssl.SSLError) as error:
@@ -37,13 +40,28 @@ def load_tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
             f"gateway.https: {certificate}: {error.strerror or error}; use a PEM file with "
             "a certificate and its private key, or the path of a file to create"
         ) from None
+    if problem := find_validity_problem(pem, now):
+        LOG.warning("gateway.https: %s %s", certificate, problem)
     return context
 
 
-def _create_self_signed(hosts: Iterable[str]) -> bytes:
+def find_validity_problem(pem: bytes, now: datetime.datetime) -> str:
+    """Return why browsers reject a certificate at this time; empty if it is valid."""
+    certificate = x509.load_pem_x509_certificate(pem)
+    start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    if start <= now <= end:
+        return ""
+    return (
+        f"is valid from {start:%Y-%m-%d} to {end:%Y-%m-%d}, but the clock of this machine says"
+        f" {now:%Y-%m-%d}, so browsers reject it; correct the clock or replace the file (if it"
+        " does not exist, the gateway creates it at the next start)"
+    )
+
+
+def create_self_signed(hosts: Iterable[str], now: datetime.datetime) -> bytes:
+    """Return a private key and a certificate that is valid from a day before ``now``, as PEM."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "kouxing")])
-    now = datetime.datetime.now(datetime.UTC)
     names = [_general_name(host) for host in dict.fromkeys(hosts)]
     certificate = (
         x509.CertificateBuilder()
