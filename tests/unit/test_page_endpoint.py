@@ -1,9 +1,15 @@
 """The address of the page."""
 
 import pytest
+from kouxing_client.field_types import MAX_ENDPOINT
+from kouxing_client.messages import Message
 
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.web.page_endpoint import make_page_endpoint
+from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
+from kouxing.shared.wire.codec import decode, encode
+from tests.samples import SAMPLES
 
 ANYWHERE = "0.0.0.0"  # noqa: S104
 
@@ -16,3 +22,15 @@ def test_the_page_is_at_the_address_that_reaches_control(monkeypatch: pytest.Mon
     for control, address in (("10.0.0.1", "10.0.0.4"), ("127.0.0.1", "192.0.2.4")):
         config = GatewayConfig(host=ANYWHERE, https="proxy", control=f"tcp://{control}:5550")
         assert make_page_endpoint(config, 8080).url.startswith(f"http://{address}:8080/#token=")
+
+
+def test_the_url_fits_into_a_message() -> None:
+    def heartbeat(token: str) -> Message:
+        url = make_page_endpoint(GatewayConfig(token=token), 8080).url
+        return replace(SAMPLES["heartbeat"], endpoints={"page": url})
+
+    longest = (MAX_ENDPOINT - len("http://127.0.0.1:8080/#token=")) * "t"
+    assert decode(encode(heartbeat(longest))) == heartbeat(longest)
+    for token in (longest + "t", 30 * "口"):  # each has 9 characters in a URL
+        with pytest.raises(UserError, match=r"gateway\.token: .* use a shorter token"):
+            heartbeat(token)

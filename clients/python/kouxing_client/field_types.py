@@ -8,6 +8,7 @@ NUM_FAPS = 68
 MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the first byte
 MAX_SHAPES = 256  # per set
 MAX_TEXT = 2000  # characters
+MAX_ENDPOINT = 256  # characters
 MAX_AUDIO_BYTES = 64 * 1024  # in one message
 SESSION_NAME = "[A-Za-z0-9_-]{0,64}"  # empty: no session
 NO_LINE_BREAK = r"(?!\n)"  # "$" alone also matches before a final line break
@@ -32,7 +33,7 @@ FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FA
 FapMask = Annotated[bytes, Meta(min_length=MASK_BYTES, max_length=MASK_BYTES)]
 ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
 ShapeMap = Annotated[dict[Name, ShapeWeights], Meta(max_length=16)]
-Endpoint = Annotated[str, Meta(max_length=256)]
+Endpoint = Annotated[str, Meta(max_length=MAX_ENDPOINT)]
 EndpointMap = Annotated[dict[Name, Endpoint], Meta(max_length=16)]
 MetricMap = Annotated[dict[Name, float], Meta(max_length=64)]
 Role = Annotated[str, whole_text("(control|worker|observer)")]

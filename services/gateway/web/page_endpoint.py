@@ -6,9 +6,12 @@ import ssl
 from dataclasses import dataclass
 from urllib.parse import quote
 
+from kouxing_client.field_types import MAX_ENDPOINT
+
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.web.access import AccessPolicy
 from kouxing.services.gateway.web.certificate import load_tls_context
+from kouxing.shared.errors import UserError
 from kouxing.shared.settings.endpoints import WILDCARDS, is_address, is_loopback
 
 
@@ -26,7 +29,8 @@ class PageEndpoint:
 def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     """Return the endpoint that a configuration describes, on a port that is already bound.
 
-    Raises ``UserError`` if the certificate can neither be read nor created.
+    Raises ``UserError`` if the certificate can neither be read nor created, or the URL is too long
+    for the messages in which the gateway reports it.
     """
     host = config.advertise or (config.advertised_host if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
@@ -47,4 +51,10 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
         trusted_origins=config.trusted_origins,
         proxy_schemes=("https",) if config.is_behind_proxy else (),
     )
-    return PageEndpoint(f"{'https' if tls else 'http'}://{address}/{fragment}", tls, access)
+    url = f"{'https' if tls else 'http'}://{address}/{fragment}"
+    if len(url) > MAX_ENDPOINT:
+        raise UserError(
+            f"gateway.token: the page's URL would have {len(url)} characters, more than"
+            f" {MAX_ENDPOINT}; use a shorter token"
+        )
+    return PageEndpoint(url, tls, access)
