@@ -106,6 +106,26 @@ static double next_sound_s(const Rest *rest) {
   return INFINITY;
 }
 
+static void update_background(Rest *rest, double level) {
+  const double level_db = fmax(level, REST_MIN_BACKGROUND_DB);
+  if (isnan(rest->background_db)) rest->background_db = level_db;
+  const double difference = level_db - rest->background_db;
+  rest->background_db += difference > REST_ONSET_DB ? REST_BACKGROUND_RISE_DB : REST_BACKGROUND_RATE * difference;
+}
+
+/* Return whether an onset before the first voice activity closes the lips. */
+static bool closes_for_onset(Rest *rest, double time_s) {
+  if (rest->has_spoken || isnan(rest->background_db)) return false;
+  if (time_s > rest->onset_until_s) {
+    const double onset_db = rest->background_db + REST_ONSET_DB, end_s = time_s + REST_ONSET_LEAD_S;
+    for (int i = 0; i < rest->num_levels; i++) {
+      const Level *level = &rest->levels[i];
+      if (level->time_s <= end_s && level->level_db > onset_db) rest->onset_until_s = time_s + REST_ONSET_S;
+    }
+  }
+  return time_s <= rest->onset_until_s;
+}
+
 static double ajar_amount(const Rest *rest) {
   const double u = fmin(rest->elapsed_s / rest->duration_s, 1.0);
   return rest->goal + remaining(rest->start, rest->velocity, u, rest->duration_s);
@@ -132,10 +152,12 @@ static void follow_voice(Rest *rest, double time_s) {
       rest->stays_shut = false;
     }
     rest->is_voice = change.is_active;
+    rest->has_spoken |= change.is_active;
   }
   rest->num_changes -= number;
   memmove(rest->changes, rest->changes + number, rest->num_changes * sizeof(SpeechChange));
   for (number = 0; number < rest->num_levels && rest->levels[number].time_s <= time_s; number++) {
+    update_background(rest, rest->levels[number].level_db);
     if (is_sound(rest, rest->levels[number].level_db)) {
       rest->sound_s = rest->levels[number].time_s;
       rest->stays_shut = false;
@@ -149,7 +171,7 @@ static void follow_voice(Rest *rest, double time_s) {
 static double doubt_at(Rest *rest, double time_s, double closure) {
   const double next_s = next_sound_s(rest);
   const bool is_silent = rest->is_voice && rest->known_s > time_s + REST_LAST_SOUND_S && next_s > rest->known_s;
-  const bool is_onset = REST_YIELD_S < next_s - time_s && next_s - time_s <= REST_ONSET_S;
+  const bool is_onset = REST_YIELD_S < next_s - time_s && next_s - time_s <= REST_LIKELY_BEFORE_S;
   if (closure >= (is_onset ? REST_LIKELY : REST_CERTAIN)) {
     if (is_silent || is_onset) rest->stays_shut = true;
     return 0.0;
@@ -166,6 +188,7 @@ static double ajar_amount_at(Rest *rest, double time_s) {
   }
   if (starts_soon) set_goal(rest, 1.0, REST_PART_S);
   else if (rest->stays_shut || next_s <= time_s + REST_YIELD_S) set_goal(rest, 0.0, REST_YIELD_S);
+  else if (time_s < rest->start_s + REST_START_S || closes_for_onset(rest, time_s)) set_goal(rest, 0.0, REST_ONSET_CLOSE_S);
   else if (time_s > rest->sound_s + REST_HOLD_S) set_goal(rest, 0.0, REST_CLOSE_S);
   else if (!rest->is_voice || fmin(next_s, rest->known_s) >= rest->sound_s + REST_MIN_PAUSE_S) set_goal(rest, 1.0, REST_PART_S);
   rest->elapsed_s += fmax(time_s - rest->time_s, 0.0);
@@ -380,9 +403,10 @@ void face_visemes(Face *face, double time_s, float *weights) {
 
 void face_init(Face *face) {
   memset(face, 0, sizeof *face);
-  face->rest.loudest_db = face->rest.known_s = face->rest.sound_s = -INFINITY;
+  face->rest.loudest_db = face->rest.known_s = face->rest.sound_s = face->rest.onset_until_s = -INFINITY;
   face->rest.time_s = INFINITY;
-  face->rest.stays_shut = true;
+  face->rest.start_s = INFINITY;
+  face->rest.background_db = NAN;
   face->rest.duration_s = 1.0;
 }
 
@@ -401,4 +425,5 @@ void face_add_level(Face *face, double time_s, double level_db) {
   if (rest->num_levels < MAX_LEVELS) rest->levels[rest->num_levels++] = (Level){time_s, level_db};
   rest->loudest_db = fmax(level_db, rest->loudest_db - REST_FADE_DB);
   rest->known_s = time_s;
+  if (isinf(rest->start_s)) rest->start_s = rest->sound_s = time_s;
 }

@@ -91,8 +91,9 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "resample": (resample, "SAMPLE_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA"),
     "rest": (
         resting_lips,
-        "HOLD_S LEAD_S PART_S CLOSE_S CERTAIN _YIELD_S _END_S _MIN_PAUSE_S _RANGE_DB _FADE_DB "
-        "_LAST_SOUND_S _ONSET_S _LIKELY _DOUBT AJAR",
+        "HOLD_S START_S LEAD_S PART_S CLOSE_S CERTAIN _YIELD_S _END_S _MIN_PAUSE_S _RANGE_DB "
+        "_FADE_DB _LAST_SOUND_S _LIKELY_BEFORE_S _LIKELY _DOUBT _ONSET_DB _ONSET_LEAD_S "
+        "_ONSET_CLOSE_S _ONSET_S _MIN_BACKGROUND_DB _BACKGROUND_RATE _BACKGROUND_RISE_DB AJAR",
     ),
     "segmenter": (
         speech_segmenter,

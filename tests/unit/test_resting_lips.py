@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.learned.resting_lips import (
     AJAR,
     CERTAIN,
+    CLOSE_S,
+    HOLD_S,
     LEAD_S,
     PART_S,
     RestingLips,
@@ -99,15 +101,35 @@ def test_a_closing_phone_closes_the_lips_in_a_pause() -> None:
 
 
 def test_lips_part_before_a_sound_as_early_as_it_is_known() -> None:
-    amounts = ajar_amounts(lambda t: LOUD_DB if t > 1.3 else QUIET_DB, 1.3, 0.3, voice=(1.1,))
-    assert not amounts[: round((1.1 - LEAD_S) / FRAME_S)].any()
-    assert at(amounts, 1.1 - LEAD_S + PART_S + 0.02) == 1.0
-    assert at(amounts, 1.2) == 1.0
+    amounts = ajar_amounts(lambda t: LOUD_DB if t > 2.3 else QUIET_DB, 2.3, 0.3, voice=(2.1,))
+    assert at(amounts, 2.1 - LEAD_S - FRAME_S) == 0.0
+    assert at(amounts, 2.1 - LEAD_S + PART_S + 0.02) == 1.0
+    assert at(amounts, 2.2) == 1.0
 
 
 @pytest.mark.parametrize("level_db", [QUIET_DB, LOUD_DB])
-def test_lips_stay_closed_without_voice(level_db: float) -> None:
-    assert not ajar_amounts(lambda _: level_db, 2.0, voice=()).any()
+def test_without_voice_lips_part_at_the_start_and_then_stay_closed(level_db: float) -> None:
+    amounts = ajar_amounts(lambda _: level_db, 2.0, voice=())
+    assert at(amounts, 0.04) == 0.0
+    assert at(amounts, 0.24) == 1.0
+    assert at(amounts, HOLD_S - FRAME_S) == 1.0
+    assert not amounts[round((HOLD_S + CLOSE_S + 2 * FRAME_S) / FRAME_S) :].any()
+
+
+@pytest.mark.parametrize("rise_db", [9.0, 11.0])
+def test_an_onset_before_voice_activity_closes_the_lips(rise_db: float) -> None:
+    amounts = ajar_amounts(lambda t: -40.0 + rise_db * (t >= 0.6), 0.8, voice=())
+    assert at(amounts, 0.52) == 1.0
+    assert (at(amounts, 0.6) == 0.0) == (rise_db == 11.0)
+
+
+def test_an_onset_after_voice_activity_does_not_close_the_lips() -> None:
+    def level_at(time_s: float) -> float:
+        return LOUD_DB if time_s <= SOUND_S or time_s >= 1.5 else QUIET_DB
+
+    amounts = ajar_amounts(level_at, 1.8, voice=(0.0, 1.2))
+    assert at(amounts, 1.5) == 1.0
+    assert at(amounts, 1.6) == 1.0
 
 
 def test_a_bang_does_not_freeze_the_mouth() -> None:

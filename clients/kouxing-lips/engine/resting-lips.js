@@ -8,11 +8,15 @@ export class RestingLips {
   #levels = []; // levels of future frames: [time s, dB]
   #changes = []; // changes in future frames
   #isVoice = false;
+  #hasSpoken = false;
   #hasEnded = false;
   #loudestDb = -Infinity;
+  #backgroundDb = null;
+  #onsetUntilS = -Infinity;
+  #startS = Infinity;
   #knownS = -Infinity;
   #soundS = -Infinity;
-  #staysShut = true;
+  #staysShut = false;
   #isClosedByPhone = false;
   #timeS = Infinity;
   #goal = 0;
@@ -28,6 +32,7 @@ export class RestingLips {
       this.#levels.push([event.timeS, event.levelDb]);
       this.#loudestDb = Math.max(event.levelDb, this.#loudestDb - this.#constants.FADE_DB);
       this.#knownS = event.timeS;
+      if (this.#startS === Infinity) this.#startS = this.#soundS = event.timeS;
     } else if (event.type === "speech") this.#changes.push(event);
     else if (event.type === "end") this.#hasEnded = true;
   }
@@ -38,9 +43,11 @@ export class RestingLips {
       const change = this.#changes.shift();
       if (change.active && !this.#isVoice) [this.#soundS, this.#staysShut] = [change.timeS, false];
       this.#isVoice = change.active;
+      this.#hasSpoken ||= change.active;
     }
     while (this.#levels[0]?.[0] <= timeS) {
       const [levelS, levelDb] = this.#levels.shift();
+      this.#updateBackground(levelDb);
       if (this.#isSound(levelDb)) [this.#soundS, this.#staysShut] = [levelS, false];
     }
   }
@@ -52,7 +59,7 @@ export class RestingLips {
     if (this.#isClosedByPhone) return 0;
     const nextS = this.#nextSoundS();
     const isSilent = this.#isVoice && this.#knownS > timeS + c.LAST_SOUND_S && nextS > this.#knownS;
-    const isOnset = c.YIELD_S < nextS - timeS && nextS - timeS <= c.ONSET_S;
+    const isOnset = c.YIELD_S < nextS - timeS && nextS - timeS <= c.LIKELY_BEFORE_S;
     if (closure >= (isOnset ? c.LIKELY : c.CERTAIN)) {
       this.#staysShut ||= isSilent || isOnset;
       return 0;
@@ -68,11 +75,32 @@ export class RestingLips {
     if (this.#hasEnded) this.#setGoal(0, c.END_S);
     else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#setGoal(1, c.PART_S);
     else if (this.#isClosedByPhone || this.#staysShut || nextS <= timeS + c.YIELD_S) this.#setGoal(0, c.YIELD_S);
+    else if (timeS < this.#startS + c.START_S || this.#closesForOnset(timeS)) this.#setGoal(0, c.ONSET_CLOSE_S);
     else if (timeS > this.#soundS + c.HOLD_S) this.#setGoal(0, c.CLOSE_S);
     else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#setGoal(1, c.PART_S);
     this.#elapsedS += Math.max(timeS - this.#timeS, 0);
     this.#timeS = timeS;
     return this.#amount();
+  }
+
+  /** Return whether an onset before the first voice activity closes the lips. */
+  #closesForOnset(timeS) {
+    const c = this.#constants;
+    if (this.#hasSpoken || this.#backgroundDb === null) return false;
+    if (timeS > this.#onsetUntilS) {
+      const onsetDb = this.#backgroundDb + c.ONSET_DB;
+      const endS = timeS + c.ONSET_LEAD_S;
+      if (this.#levels.some(([levelS, db]) => levelS <= endS && db > onsetDb)) this.#onsetUntilS = timeS + c.ONSET_S;
+    }
+    return timeS <= this.#onsetUntilS;
+  }
+
+  #updateBackground(level) {
+    const c = this.#constants;
+    const levelDb = Math.max(level, c.MIN_BACKGROUND_DB);
+    this.#backgroundDb ??= levelDb;
+    const difference = levelDb - this.#backgroundDb;
+    this.#backgroundDb += difference > c.ONSET_DB ? c.BACKGROUND_RISE_DB : c.BACKGROUND_RATE * difference;
   }
 
   #isSound(levelDb) {

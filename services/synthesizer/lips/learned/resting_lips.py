@@ -11,14 +11,19 @@ s       0 for the predicted mouth, 1 for a slightly open mouth   1
 ======  =======================================================  ====
 
     goal of s = 1  from the start of a pause for at most HOLD_S,
+                   from START_S after the start of the audio for at most HOLD_S,
                    and from LEAD_S before voice activity to its first sound
-                0  otherwise
+                0  otherwise, and at an onset before the first voice activity
 
 ``s`` follows cubics, so the mouth moves smoothly. A sound is a level at most
 ``_RANGE_DB`` below the loudest recent one. Silence longer than ``_MIN_PAUSE_S`` is a pause,
 because the closure of a stop is shorter. In a pause, lips close for a phone, and for a likely
 closure shortly before a sound. If the lip predictor is nearly certain of a closure, they stay
-closed until the next sound. All times are media times.
+closed until the next sound.
+
+The first voice activity is detected too late to close the lips for an initial b, p or m. So lips
+that are ajar before it also close at an *onset*: a level more than ``_ONSET_DB`` above the
+background. All times are media times.
 """
 
 import math
@@ -31,7 +36,8 @@ from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, SpeechChange
 
-HOLD_S = 0.85  # lips stay ajar until this time after the last sound
+HOLD_S = 0.85  # lips stay ajar until this time after the last sound, or the start of the audio
+START_S = 0.06  # lips stay closed for this time after the start of the audio
 LEAD_S = 0.36  # lips open this long before voice activity, if known
 PART_S, CLOSE_S = 0.15, 0.4  # time to open the mouth slightly, and to close it if the pause lasts
 CERTAIN = 0.98  # probability from which the lip predictor closes lips in a pause
@@ -42,8 +48,14 @@ _MIN_PAUSE_S = 0.12
 _RANGE_DB = 25.0
 _FADE_DB = 0.2  # decay of the loudest level per level, so that a bang counts only briefly
 _LAST_SOUND_S = 0.03  # silence until this long after a lip frame makes its closure doubtful
-_ONSET_S, _LIKELY = 0.15, 0.8  # time before a sound, and the probability that counts then
+_LIKELY_BEFORE_S, _LIKELY = 0.15, 0.8  # time before a sound, and the probability that counts then
 _DOUBT = 3.0  # log odds
+_ONSET_DB = 10.0  # an onset's minimum level above the background
+_ONSET_LEAD_S, _ONSET_CLOSE_S = 0.065, 0.05  # lips start to close before an onset; closing time
+_ONSET_S = 0.15  # time from the start of this closing for which the goal stays 0
+_MIN_BACKGROUND_DB = -75.0  # quieter audio counts as this level
+# change of the background per level: fraction of the difference, and during an onset
+_BACKGROUND_RATE, _BACKGROUND_RISE_DB = 0.1, 2.0
 
 _AJAR_FAPS = {
     fap: units
@@ -65,11 +77,14 @@ class RestingLips:
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()  # levels of future frames: time s, dB
         self._speech_changes: deque[SpeechChange] = deque()  # changes in future frames
-        self._is_voice = self._has_ended = False
+        self._is_voice = self._has_spoken = self._has_ended = False
         self._loudest_db = -math.inf
+        self._background_db: float | None = None
+        self._onset_until_s = -math.inf  # the last onset closes the lips until this time
+        self._start_s = math.inf  # start of the audio
         self._known_s = -math.inf  # the levels are known up to here
-        self._sound_s = -math.inf  # end of the last sound, or start of the voice activity
-        self._stays_shut = True  # lips stay closed until the next sound
+        self._sound_s = -math.inf  # last sound, start of voice activity or start of the audio
+        self._stays_shut = False  # whether the lips stay closed until the next sound
         self._is_phone = False  # whether a phone closes the lips
         self._time_s = math.inf  # time of the last frame
         self._goal = 0.0
@@ -82,6 +97,8 @@ class RestingLips:
                 self._levels.append((event.time_s, event.level_db))
                 self._loudest_db = max(event.level_db, self._loudest_db - _FADE_DB)
                 self._known_s = event.time_s
+                if self._start_s == math.inf:
+                    self._start_s = self._sound_s = event.time_s
             case SpeechChange():
                 self._speech_changes.append(event)
             case EndOfSound():
@@ -100,8 +117,10 @@ class RestingLips:
             if change.active and not self._is_voice:
                 self._sound_s, self._stays_shut = change.time_s, False
             self._is_voice = change.active
+            self._has_spoken |= change.active
         while self._levels and self._levels[0][0] <= time_s:
             level_s, level_db = self._levels.popleft()
+            self._update_background(level_db)
             if self._is_sound(level_db):
                 self._sound_s, self._stays_shut = level_s, False
 
@@ -115,7 +134,7 @@ class RestingLips:
             return 0.0
         ends_s, next_s = time_s + _LAST_SOUND_S, self._next_sound_s()
         is_silent = self._is_voice and self._known_s > ends_s and next_s > self._known_s
-        is_onset = _YIELD_S < next_s - time_s <= _ONSET_S
+        is_onset = _YIELD_S < next_s - time_s <= _LIKELY_BEFORE_S
         if closure >= (_LIKELY if is_onset else CERTAIN):
             self._stays_shut |= is_silent or is_onset
             return 0.0
@@ -133,6 +152,8 @@ class RestingLips:
             self._set_goal(1.0, PART_S)
         elif self._is_phone or self._stays_shut or next_s <= time_s + _YIELD_S:
             self._set_goal(0.0, _YIELD_S)
+        elif time_s < self._start_s + START_S or self._closes_for_onset(time_s):
+            self._set_goal(0.0, _ONSET_CLOSE_S)
         elif time_s > self._sound_s + HOLD_S:
             self._set_goal(0.0, CLOSE_S)
         elif not self._is_voice or min(next_s, self._known_s) >= self._sound_s + _MIN_PAUSE_S:
@@ -146,6 +167,25 @@ class RestingLips:
         self._set_goal(0.0, _RELAX_S)
         self._elapsed_s += step_s
         return self._amount()
+
+    def _closes_for_onset(self, time_s: float) -> bool:
+        """Return whether an onset before the first voice activity closes the lips."""
+        if self._has_spoken or self._background_db is None:
+            return False
+        if time_s > self._onset_until_s:
+            onset_db = self._background_db + _ONSET_DB
+            end_s = time_s + _ONSET_LEAD_S
+            if any(level_s <= end_s and db > onset_db for level_s, db in self._levels):
+                self._onset_until_s = time_s + _ONSET_S
+        return time_s <= self._onset_until_s
+
+    def _update_background(self, level_db: float) -> None:
+        level_db = max(level_db, _MIN_BACKGROUND_DB)
+        if self._background_db is None:
+            self._background_db = level_db
+        difference = level_db - self._background_db
+        is_onset = difference > _ONSET_DB
+        self._background_db += _BACKGROUND_RISE_DB if is_onset else _BACKGROUND_RATE * difference
 
     def _is_sound(self, level_db: float) -> bool:
         return self._is_voice and level_db >= self._loudest_db - _RANGE_DB
