@@ -117,7 +117,8 @@ class BaseSession:
     def info(self) -> Fields:
         """The fields of ``session-opened`` with the current epoch and endpoints.
 
-        Another program's session has only ``session``, ``epoch``, ``facts`` and the endpoints.
+        Another program's session has only ``session``, ``session_id``, ``epoch``, ``facts`` and the
+        endpoints.
         """
         return {**self._core.endpoints, "epoch": self._core.epoch}
 
