@@ -4,6 +4,10 @@ import numpy as np
 import pytest
 
 from kouxing.shared.monitoring.metrics import WINDOW, LoadMeter, Metrics, percentile
+from kouxing.shared.wire.codec import decode, encode
+from kouxing.shared.wire.control import EventName, Heartbeat
+from kouxing.shared.wire.kinds import MESSAGES
+from kouxing.shared.wire.session import ErrorCode
 
 
 def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
@@ -21,6 +25,23 @@ def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
     metrics.count("frames", 25)
     assert metrics.snapshot(10.5)["frames_per_s"] == 50.0
     assert metrics.snapshot(11.0)["frames_per_s"] == 0.0
+
+
+def test_a_heartbeat_with_every_counter_is_readable() -> None:
+    metrics = Metrics()
+    names_by_prefix = {"in": MESSAGES, "out": MESSAGES, "dropped": ErrorCode, "event": EventName}
+    for prefix, names in {**names_by_prefix, "refused": ErrorCode}.items():
+        for name in names:
+            metrics.count(f"{prefix}_{name}")
+    heartbeat = Heartbeat(
+        service="control",
+        instance="a",
+        role="control",
+        state="ready",
+        sent_ns=0,
+        metrics=metrics.snapshot(0.0),
+    )
+    assert decode(encode(heartbeat)) == heartbeat
 
 
 def busy_load(until_s: float, work_s: float) -> LoadMeter:

@@ -35,7 +35,7 @@ ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
 ShapeMap = Annotated[dict[Name, ShapeWeights], Meta(max_length=16)]
 Endpoint = Annotated[str, Meta(max_length=MAX_ENDPOINT)]
 EndpointMap = Annotated[dict[Name, Endpoint], Meta(max_length=16)]
-MetricMap = Annotated[dict[Name, float], Meta(max_length=64)]
+MetricMap = Annotated[dict[Name, float], Meta(max_length=512)]  # control can have 80
 Role = Annotated[str, whole_text("(control|worker|observer)")]
 ServiceStatus = Annotated[str, whole_text("(ready|draining)")]
 SessionStatus = Annotated[str, whole_text("(starting|open)")]
