@@ -105,10 +105,10 @@ def find_sound_start(begin: bytes) -> int | None:
 
 def unprobed_format(begin: bytes) -> str | None:
     """Return FFmpeg's name of a format that FFmpeg does not recognize by its first bytes."""
-    names = [name for name, (offset, mark) in _UNPROBED.items() if begin.startswith(mark, offset)]
     if begin.startswith(b"\x9c") and is_sound(begin):
-        names = ["sbc"]
-    return names[0] if names else None
+        return "sbc"
+    names = (name for name, (offset, mark) in _UNPROBED.items() if begin.startswith(mark, offset))
+    return next(names, None)
 
 
 def needs_more(begin: bytes) -> bool:

@@ -186,7 +186,7 @@ def animate(
 
 
 @lru_cache(maxsize=1)
-def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, LipPredictor | None]:
+def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, LipPredictor]:
     """Load the models once for all files of a command."""
     model = load_model_for_language(language)
     return model, _load_lip_predictor(mouth)
