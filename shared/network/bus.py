@@ -7,21 +7,20 @@ key. The endpoint of a bound socket with a key includes the public key: ``tcp://
 
 import errno
 import secrets
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from enum import Enum
 from typing import Self
 
 import zmq
 from kouxing_client.field_types import MAX_AUDIO_BYTES
 from kouxing_client.keys import Key
-from kouxing_client.messages import Message
 from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
 from zmq.utils.monitor import recv_monitor_message
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.network.connection_limits import ConnectionLimiter
 from kouxing.shared.network.socket_limits import KIB, SocketLimits
-from kouxing.shared.network.sockets import Socket
+from kouxing.shared.network.sockets import OnSubscribe, Socket
 from kouxing.shared.network.waker import Waker
 from kouxing.shared.network.zap import Zap, answer_handshakes
 from kouxing.shared.settings.endpoints import split_endpoint
@@ -88,7 +87,7 @@ class Bus:
         self,
         endpoint: str,
         key: str,
-        on_subscribe: Callable[[str], Sequence[Message]] = lambda session: (),
+        on_subscribe: OnSubscribe | None = None,
     ) -> Socket:
         """Bind a socket that many peers subscribe to.
 
@@ -169,7 +168,7 @@ class Bus:
         endpoint: str,
         key: str,
         limits: SocketLimits,
-        on_subscribe: Callable[[str], Sequence[Message]] = lambda session: (),
+        on_subscribe: OnSubscribe | None = None,
     ) -> Socket:
         split_endpoint(endpoint, key)
         raw = self._open(kind, limits.num_answers)

@@ -37,6 +37,7 @@ MAX_PARTS = 4
 MAX_DROPPED = 20_000  # parts of one message that are dropped before the next socket
 MAX_SUBSCRIPTIONS = 4096  # subscriptions; with more, every message is encoded
 MAX_BATCH = 200  # messages from one socket before the next socket
+OnSubscribe = Callable[[str], Sequence[Message]]  # a session to the messages to publish again
 T = TypeVar("T", int, str)
 _MORE, _READABLE = zmq.DONTWAIT | zmq.SNDMORE, int(zmq.POLLIN)
 
@@ -60,7 +61,7 @@ class Socket:
         *,
         routes: bool = False,
         publishes: bool = False,
-        on_subscribe: Callable[[str], Sequence[Message]] = lambda session: (),
+        on_subscribe: OnSubscribe | None = None,
         endpoint_name: str | None = None,
     ) -> None:
         self.raw = raw
@@ -272,7 +273,7 @@ class Socket:
         prefix = f"{Joined.kind}/".encode()
         session = subscription.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
         if subscription.startswith(prefix) and is_name(session):
-            repeated = self._on_subscribe(session)
+            repeated = self._on_subscribe(session) if self._on_subscribe else ()
             self.send(
                 Joined(
                     session=session,
