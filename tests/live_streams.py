@@ -48,7 +48,7 @@ class LiveStream:
     def decode(self) -> list[StreamOutput]:
         """Return the results of the audio so far."""
         self._recognizer.decode_streams([self.stream])
-        assert not self._recognizer.is_ready(self.stream)
+        assert not any(scorer.has_speech for scorer in self.stream.scorers)
         return self._recognizer.get_result(self.stream)
 
 

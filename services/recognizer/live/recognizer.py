@@ -1,7 +1,6 @@
 """The recognizer: live audio in, phones, lip positions and speech events out.
 
-The five verbs come from sherpa-onnx: create_stream, accept_waveform, is_ready, decode_streams
-and get_result.
+The verbs come from sherpa-onnx: create_stream, accept_waveform, decode_streams and get_result.
 """
 
 from collections.abc import Sequence
@@ -68,10 +67,6 @@ class Recognizer:
             face_delay_s=face_delay_s,
             speech_time=speech_time,
         )
-
-    def is_ready(self, stream: SpeechStream) -> bool:
-        """Return whether a stream has audio to score."""
-        return any(scorer.is_ready for scorer in stream.scorers)
 
     def run_encoder(self, streams: Sequence[SpeechStream]) -> None:
         """Find the speech in the audio that the streams have accepted, in batches."""

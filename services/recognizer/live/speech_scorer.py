@@ -199,11 +199,6 @@ class SpeechScorer:
             self._detected = self._queue
 
     @property
-    def is_ready(self) -> bool:
-        """Whether there is audio to score."""
-        return self.has_speech or bool(self._encoder_queue)
-
-    @property
     def has_speech(self) -> bool:
         """Whether there is speech to score, or its end."""
         return bool(self._queue)
