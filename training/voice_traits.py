@@ -7,7 +7,7 @@ augmented (:mod:`kouxing.training.networks.augmentation`).
 symbol   meaning                                                       shape
 ======== ============================================================= ===============
 X        standardized states: means over the voice of a recording, or  (rows, width)
-         single positions
+         single encoder frames
 T        arousal and valence of the emotion, or 1 in laughter or in    (rows, 2)
          breath
 a        ridge, relative to the mean square of a state
@@ -32,7 +32,7 @@ from kouxing.corpora.emotions import FEELINGS, read_emotions, speakers_of
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.sounds import read_sounds
 from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, VoiceKind, load_encoder
-from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.live.voice_traits import MIN_VOICE, VoiceReadout
 from kouxing.shared.audio.pcm import as_floats
@@ -45,10 +45,10 @@ Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
 _FEELING_RIDGE, _SOUND_RIDGE = 1.0, 1e-4
-_SOUND_WEIGHT = 5.0  # weight of a position in laughter or breath
+_SOUND_WEIGHT = 5.0  # weight of an encoder frame in laughter or breath
 _TRAITS = ("laughter", "breath")
-_OTHER_STEP = 4  # positions without laughter or breath of which one is used
-_MIN_VOICED = 10  # positions
+_OTHER_STEP = 4  # encoder frames without laughter or breath of which one is used
+_MIN_VOICED = 10  # encoder frames
 _MIN_DEVIATION = 1e-3
 
 
@@ -63,21 +63,21 @@ def train_traits(
     speech = read_emotions(recordings, any_license=any_license)
     labeled = [recording for recording in speech if recording.emotion]
     means, targets, speaker_names = [], [], []  # one entry per recording with an emotion
-    rows, labels = [], []  # positions
+    rows, labels = [], []  # encoder frames
     for recording in track(speech, description="speech"):
-        for positions in _encoder_outputs(read_audio(recording.path), rng):
-            states = np.stack([position.state for position in positions])
+        for outputs in _encoder_outputs(read_audio(recording.path), rng):
+            states = np.stack([output.state for output in outputs])
             rows.append(states[::_OTHER_STEP])
             labels.append(np.zeros((len(rows[-1]), len(_TRAITS)), np.float32))
             if recording.emotion:
-                means.append(_mean_state(positions, states))
+                means.append(_mean_state(outputs, states))
                 targets.append(FEELINGS[recording.emotion])
                 speaker_names.append(recording.speaker)
     for sound in track(read_sounds(sounds, any_license=any_license), description="sounds"):
         if not sound.is_held_out:
             is_trait = [sound.kind == trait for trait in _TRAITS]
-            for positions in _encoder_outputs(as_floats(sound.samples), rng):
-                states = np.stack([position.state for position in positions])
+            for outputs in _encoder_outputs(as_floats(sound.samples), rng):
+                states = np.stack([output.state for output in outputs])
                 rows.append(states if any(is_trait) else states[::_OTHER_STEP])
                 labels.append(np.tile(np.array(is_trait, np.float32), (len(rows[-1]), 1)))
     voice, feelings, speakers = np.stack(means), np.array(targets), np.array(speaker_names)
@@ -109,18 +109,20 @@ def train_traits(
 
 
 def _encoder_outputs(samples: Floats, rng: np.random.Generator) -> Iterator[list[EncoderOutput]]:
-    """Yield the encoder's positions for samples, unchanged and augmented."""
+    """Yield the encoder's outputs for samples, unchanged and augmented."""
     for sound in (samples, scale_level(disturb(samples, rng), rng)):
         frames = WhisperMel().accept_waveform(sound)
         encoder = load_encoder().create_stream()
         yield [
-            encoder.process_position(frames[start : start + FRAMES_PER_POSITION])
-            for start in range(0, len(frames) - FRAMES_PER_POSITION + 1, FRAMES_PER_POSITION)
+            encoder.process_encoder_frame(frames[start : start + FRAMES_PER_ENCODER_FRAME])
+            for start in range(
+                0, len(frames) - FRAMES_PER_ENCODER_FRAME + 1, FRAMES_PER_ENCODER_FRAME
+            )
         ]
 
 
-def _mean_state(positions: Sequence[EncoderOutput], states: Floats) -> Floats:
-    voice = np.stack([position.voice for position in positions])
+def _mean_state(outputs: Sequence[EncoderOutput], states: Floats) -> Floats:
+    voice = np.stack([output.voice for output in outputs])
     is_voiced = voice[:, VoiceKind.SPEECH] + voice[:, VoiceKind.SUNG] > MIN_VOICE
     if is_voiced.sum() >= _MIN_VOICED:
         states = states[is_voiced]

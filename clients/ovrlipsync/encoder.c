@@ -122,7 +122,7 @@ static void add_product(double *out, const double *vector, const float *matrix, 
 static int chosen_delay(void) {
   int chosen = 0;
   for (int i = 0; i < LIPS_DELAYS_SIZE_0; i++) {
-    if (LIPS_DELAYS[i] + LIP_FRAMES_POSITION_LAG_S <= DELAY_S + 1e-6) chosen = i;
+    if (LIPS_DELAYS[i] + LIP_FRAMES_ENCODER_FRAME_LAG_S <= DELAY_S + 1e-6) chosen = i;
   }
   return chosen;
 }

@@ -8,7 +8,7 @@
 
 #define PI 3.14159265358979323846
 
-enum { FRAMES = SEGMENTER_FRAMES_PER_POSITION, MAX_RECENT = SEGMENTER_MAX_RECENT };
+enum { FRAMES = SEGMENTER_FRAMES_PER_ENCODER_FRAME, MAX_RECENT = SEGMENTER_MAX_RECENT };
 
 /* Resampling to 16 kHz; front_end/resample.py has the formula. */
 typedef struct {
@@ -138,20 +138,20 @@ static void start_speech(Lips *lips) {
   memset(&lips->predictor, 0, sizeof lips->predictor);
   int newest = lips->num_frames - 1 - FRAMES * (lips->num_recent - 1);
   for (int i = 0; i < lips->num_recent; i++, newest += FRAMES) {
-    if (newest >= first + SEGMENTER_SEEN_AFTER_FRAMES) predict(lips, lips->recent[i], newest);
+    if (newest >= first + SEGMENTER_RIGHT_CONTEXT_FRAMES) predict(lips, lips->recent[i], newest);
   }
   lips->num_recent = 0;
 }
 
 /* Detect speech; speech_segmenter.py and vad.py have the rules. */
-static void process_position(Lips *lips) {
+static void process_encoder_frame(Lips *lips) {
   const double probability = lips->encoder.voice;
   if (!lips->is_speaking) {
     if (lips->num_recent == MAX_RECENT) memmove(lips->recent[0], lips->recent[1], --lips->num_recent * sizeof lips->recent[0]);
     memcpy(lips->recent[lips->num_recent++], lips->encoder.features, sizeof lips->recent[0]);
   }
   lips->num_improbable = probability >= VAD_IMPROBABLE ? 0 : lips->num_improbable + 1;
-  if (lips->is_speech) lips->is_speech = lips->num_improbable < VAD_STOP_POSITIONS;
+  if (lips->is_speech) lips->is_speech = lips->num_improbable < VAD_STOP_ENCODER_FRAMES;
   else {
     lips->evidence = fmax(0.0, lips->evidence + probability - VAD_NO_EVIDENCE);
     lips->is_speech = lips->evidence >= VAD_ENOUGH;
@@ -174,7 +174,7 @@ static void analyze_slice(Lips *lips) {
     lips->num_mel_frames = 0;
     lips->num_frames += FRAMES;
     encoder_process(&lips->encoder);
-    process_position(lips);
+    process_encoder_frame(lips);
   }
 }
 

@@ -18,7 +18,7 @@ from kouxing.services.recognizer.acoustic.load import MODELS_FOLDER, load_model
 from kouxing.shared.face.faps import NUM_FAPS
 
 _MATRIX_SIZE, _MEASURE_S = 512, 0.5
-_POSITIONS_PER_S = 50
+_ENCODER_FRAMES_PER_S = 50
 _INT8_SPEED_UP = 4
 _BLOCKS, _ENCODER = "block network", "audio encoder"
 _OPERATIONS = 2  # per weight and encoder frame
@@ -49,8 +49,8 @@ def measure() -> Sizes:
     sizes = blocks.runner.sizes
     encoder_bytes = len(np.load(ENCODER_PATH, allow_pickle=False)["network"])
     weighted_positions = {  # weights are bytes; encoder frames per second of speech
-        _BLOCKS: len(blocks.network) * sizes.length * _POSITIONS_PER_S / sizes.block,
-        _ENCODER: encoder_bytes * _POSITIONS_PER_S,
+        _BLOCKS: len(blocks.network) * sizes.length * _ENCODER_FRAMES_PER_S / sizes.block,
+        _ENCODER: encoder_bytes * _ENCODER_FRAMES_PER_S,
     }
     return Sizes(
         model_bytes={

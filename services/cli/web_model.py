@@ -43,13 +43,16 @@ from kouxing.shared.face import expression_motion, shapes
 from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
-FORMAT = "kouxing-lips 4"
+FORMAT = "kouxing-lips 5"
 
 _ALIGNMENT_BYTES = 8
 # the constants that kouxing-lips and ovrlipsync use, by module
 _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "animator": (face_animator, "REST_S _VOICE_LEAD_S _SPEECH_LEAD_S _ROUNDING _MOUTH"),
-    "blocks": (blocks, "FRAMES_PER_POSITION MAX_POSITIONS FLOOR_BANDS _PADDING _SEEN_AFTER"),
+    "blocks": (
+        blocks,
+        "FRAMES_PER_ENCODER_FRAME MAX_POSITIONS FLOOR_BANDS _PADDING _RIGHT_CONTEXT_FRAMES",
+    ),
     "clock": (clock, "MEDIA_RATE_HZ"),
     "closures": (
         closure_rule,
@@ -78,11 +81,11 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "_CLOSED_FRACTION _EPSILON _UNTRACKED _JITTER_SQUARED",
     ),
     "lips": (lip_predictor, "CLOSURE NUM_OUTPUTS _COLUMNS _ONES _OTHERS"),
-    "lipFrames": (lip_frames, "POSITION_LAG_S"),
+    "lipFrames": (lip_frames, "ENCODER_FRAME_LAG_S"),
     "liveDecoder": (live_decoder, "_DEFAULT_CONFIDENCE"),
     "mel": (whisper_mel, "HOP_SAMPLES WINDOW_SAMPLES NUM_MELS FLOOR_BANDS _FLOOR _HANN _EDGES"),
     "modelFile": (model_file, "_LOG_STEP"),
-    "network": (network, "MAX_POSITIONS FRAMES_PER_POSITION _LONGEST_WAVE"),
+    "network": (network, "MAX_POSITIONS FRAMES_PER_ENCODER_FRAME _LONGEST_WAVE"),
     "nonverbal": (
         nonverbal,
         "_HOLD_S _LEAD_S _LAUGH_EASE_S _LOUDNESS_DB _FORGET_DB_S _BREATH _SMILING _LOUD_NOTE",
@@ -97,7 +100,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     ),
     "segmenter": (
         speech_segmenter,
-        "FRAMES_PER_POSITION HOP_S WINDOW_S _FIRST_FRAME_PARITY _SEEN_AFTER_FRAMES "
+        "FRAMES_PER_ENCODER_FRAME HOP_S WINDOW_S _FIRST_FRAME_PARITY _RIGHT_CONTEXT_FRAMES "
         "_PRE_ROLL_FRAMES _MAX_RECENT",
     ),
     "shapes": (shapes, "NUM_FAPS _PATIENCE _ROUNDING"),
@@ -105,10 +108,10 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
     "track": (lip_track, "HOLD_S CLOSE_S _OPEN_S MAX_GAP_S"),
     "traits": (
         voice_traits,
-        "NUM_TRAITS MIN_VOICE _MEAN_POSITIONS _PRIOR_FEELING _PRIOR_POSITIONS _MAX_POSITIONS "
-        "_DIGITS _EVIDENCE_FRACTION _START _STOP _MIN_LAUGHTER _LAUGH_POSITIONS",
+        "NUM_TRAITS MIN_VOICE _FEELING_MEMORY _FEELING_PRIOR_WEIGHT _VOICE_PRIOR_WEIGHT "
+        "_VOICE_MEMORY _DIGITS _EVIDENCE_FRACTION _START _STOP _MIN_LAUGHTER _LAUGH_ENCODER_FRAMES",
     ),
-    "vad": (vad, "_NO_EVIDENCE _ENOUGH _IMPROBABLE _STOP_POSITIONS"),
+    "vad": (vad, "_NO_EVIDENCE _ENOUGH _IMPROBABLE _STOP_ENCODER_FRAMES"),
 }
 
 

@@ -30,7 +30,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.mouth_profiles.lip_inputs import POSITION_S, record_lip_inputs
+from kouxing.services.mouth_profiles.lip_inputs import ENCODER_FRAME_S, record_lip_inputs
 from kouxing.services.mouth_profiles.lip_tracks import (
     MEASURES,
     correlate_curves,
@@ -109,19 +109,19 @@ class ProfileGain:
 
 def observe(lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
     """Run the lip predictor over a recording. The result is empty if there is no speech."""
-    positions = record_lip_inputs(filmed.samples)
+    inputs = record_lip_inputs(filmed.samples)
     stream = lip_predictor.create_stream(lip_predictor.delays_s)
     predicted = np.zeros(
-        (len(positions.known_s), len(lip_predictor.delays_s), NUM_LIP_FAPS), np.float32
+        (len(inputs.known_s), len(lip_predictor.delays_s), NUM_LIP_FAPS), np.float32
     )
     hidden = np.zeros((len(predicted), len(stream.inner)), np.float32)
-    starts = {*positions.starts}
-    for position, features in enumerate(positions.features):
-        if position in starts:
+    starts = {*inputs.starts}
+    for number, features in enumerate(inputs.features):
+        if number in starts:
             stream.reset()
-        predicted[position] = stream.step(features.astype(np.float32))[:, :NUM_LIP_FAPS]
-        hidden[position] = stream.inner
-    known_s = np.array(positions.known_s)
+        predicted[number] = stream.step(features.astype(np.float32))[:, :NUM_LIP_FAPS]
+        hidden[number] = stream.inner
+    known_s = np.array(inputs.known_s)
     time_s = known_s[:, None] - np.array(lip_predictor.delays_s)
     frame_s = filmed.frame_s - _camera_lag_s(filmed, time_s[:, -1], predicted[:, -1])
     tracks = [interpolate_track(frame_s, track, time_s) for track in filmed.lip_track.T]
@@ -132,7 +132,7 @@ def observe(lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
 
 def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> float:
     """Estimate how much later than the audio the images arrive; 0 if there is too little speech."""
-    if len(time_s) * POSITION_S < MIN_SPEECH_S:
+    if len(time_s) * ENCODER_FRAME_S < MIN_SPEECH_S:
         return 0.0
     tracked, opening = (lip_measures(track)[:, :1] for track in (filmed.lip_track, predicted))
     figures = np.zeros(len(_LAGS_S))
@@ -149,7 +149,7 @@ def fit_profile(observations: Observations) -> MouthProfile:
     Raises ``UserError`` if there is too little speech with tracked lips.
     """
     usable = observations[_is_known(observations)]
-    speech_s = len(usable) * POSITION_S
+    speech_s = len(usable) * ENCODER_FRAME_S
     if speech_s < MIN_SPEECH_S:
         raise UserError(
             f"only {speech_s:.0f} s of speech show the lips; film "
@@ -180,7 +180,7 @@ def measure_gain(lip_predictor: LipPredictor, observations: Observations) -> Pro
     versions = (held_out.tracked, held_out.predicted, apply_profile(profile, held_out))
     tracked, before, after = (lip_measures(faps[:, delay]) for faps in versions)
     return ProfileGain(
-        speech_s=len(held_out) * POSITION_S,
+        speech_s=len(held_out) * ENCODER_FRAME_S,
         delay_s=delay_s,
         before=correlate_curves([(before, tracked)]),
         after=correlate_curves([(after, tracked)]),
@@ -278,7 +278,7 @@ def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     observations = Observations.join([observe(lip_predictor, filmed) for filmed in recordings])
     return LearnedProfile(
         content=fit_profile(observations).to_bytes(lip_predictor.digest),
-        speech_s=len(observations) * POSITION_S,
+        speech_s=len(observations) * ENCODER_FRAME_S,
         gain=measure_gain(lip_predictor, observations),
     )
 

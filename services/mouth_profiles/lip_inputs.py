@@ -6,7 +6,7 @@ Voice activity detection runs as in the live recognizer.
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
@@ -16,7 +16,7 @@ from kouxing.shared.phones.events import LipPositions
 
 Floats = NDArray[np.float32]
 
-POSITION_S = FRAMES_PER_POSITION * HOP_S
+ENCODER_FRAME_S = FRAMES_PER_ENCODER_FRAME * HOP_S
 
 
 class LipInputs:
@@ -27,7 +27,7 @@ class LipInputs:
         self.known_s: list[float] = []  # media time up to which the audio is known
         self.features: list[NDArray[np.float16]] = []  # (features,) of each encoder frame
 
-    def process_position(
+    def process_encoder_frame(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
         """Store the features of an encoder frame."""
@@ -42,8 +42,8 @@ class LipInputs:
 
 def record_lip_inputs(samples: Floats) -> LipInputs:
     """Run the audio encoder over a recording, 16 kHz mono, (n,)."""
-    positions = LipInputs()
-    segmenter = SpeechSegmenter(WhisperMel(), positions)
+    inputs = LipInputs()
+    segmenter = SpeechSegmenter(WhisperMel(), inputs)
     for _ in segmenter.accept_waveform(to_16_khz(samples, SAMPLE_RATE_HZ)):
         pass  # only the encoder frames are needed
-    return positions
+    return inputs

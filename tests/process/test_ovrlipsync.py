@@ -174,7 +174,7 @@ def laughter_of(samples: Frames) -> list[float]:
     encoder, readout = load_encoder().create_stream(), load_voice_readout()
     evidence, values = 0.0, []
     for pair in bands[: len(bands) // 2 * 2].reshape(-1, 2, bands.shape[1]):
-        outputs = encoder.process_position(pair).state @ readout.weights + readout.bias
+        outputs = encoder.process_encoder_frame(pair).state @ readout.weights + readout.bias
         evidence += EVIDENCE_FRACTION * (float(outputs[2]) - evidence)
         values.append(evidence)
     return values

@@ -19,7 +19,7 @@ from kouxing.training.encoder.export import export_onnx
 from kouxing.training.encoder.network import NUM_FEATURES, AudioEncoder
 from kouxing.training.encoder.recipe import train_encoder
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, TargetColumns
-from kouxing.training.encoder.teachers import POSITION_SAMPLES
+from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
 from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import EncoderShape
@@ -44,12 +44,12 @@ def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def piece(samples: np.ndarray, voice: VoiceKind = VoiceKind.SPEECH) -> Piece:
     """Make a piece whose pitch and lips are the number of the position."""
-    num_positions = len(samples) // POSITION_SAMPLES
+    num_positions = len(samples) // ENCODER_FRAME_SAMPLES
     rows = np.zeros((num_positions, COLUMNS.lips.start + NUM_OUTPUTS), np.float16)
     rows[:, PITCH], rows[:, VOICE] = np.arange(num_positions), voice
     rows[:, COLUMNS.lips] = np.arange(num_positions)[:, None]
     rows[:, COLUMNS.phones] = 1 / NUM_PHONES
-    return Piece(as_integers(samples[: POSITION_SAMPLES * num_positions]), rows, 1.0)
+    return Piece(as_integers(samples[: ENCODER_FRAME_SAMPLES * num_positions]), rows, 1.0)
 
 
 def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +87,7 @@ def test_trains_resumes_and_writes_a_model(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
-    monkeypatch.setattr(batches, "NUM_POSITIONS", 30)
+    monkeypatch.setattr(batches, "NUM_ENCODER_FRAMES", 30)
     monkeypatch.setattr(targets, "CHUNK_SIZE", 2)
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
     monkeypatch.setattr(lip_teacher, "NUM_EPOCHS", 1)

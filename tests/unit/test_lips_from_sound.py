@@ -54,8 +54,8 @@ def test_a_step_matches_the_formulas() -> None:
 
 def test_each_delay_has_separate_outputs_and_times() -> None:
     frames, features = np.ones((2, 80), np.float32), np.ones(NUM_FEATURES - 160, np.float32)
-    pair = MODEL.create_stream([-0.005, 0.155]).process_position(1.0, frames, features)
-    single = MODEL.create_stream([0.155]).process_position(1.0, frames, features)
+    pair = MODEL.create_stream([-0.005, 0.155]).process_encoder_frame(1.0, frames, features)
+    single = MODEL.create_stream([0.155]).process_encoder_frame(1.0, frames, features)
     assert [(lip.time_s, lip.delay_s) for lip in pair] == [(1.005, -0.005), (0.845, 0.155)]
     np.testing.assert_allclose(pair[1].faps, single[0].faps, rtol=1e-5)
     outputs = MODEL.create_stream([0.155]).step(join_features(frames, features))

@@ -17,13 +17,13 @@ from kouxing.services.recognizer.live.voice_traits import (
 from kouxing.shared.errors import UserError
 from kouxing.training.model_files import save_voice_readout, write_archive
 
-PER_S = 50  # positions
+PER_S = 50  # encoder frames
 
 
 def speech(voices: list[tuple[VoiceKind, float, int]]) -> np.ndarray:
-    """Return whether there is speech after each position.
+    """Return whether there is speech after each encoder frame.
 
-    A voice has a probability for a number of positions; the rest is no voice.
+    A voice has a probability for a number of encoder frames; the rest is no voice.
     """
     detector = VoiceActivityDetector()
     seen = []
@@ -64,15 +64,15 @@ READOUT = VoiceReadout(
 
 
 def traits_of(*parts: tuple[float, VoiceKind, Sequence[float]]) -> list[VoiceTraits]:
-    """Return the traits after each position of parts: duration in s, kind of voice, state."""
+    """Return the traits after each encoder frame of parts: duration in s, kind of voice, state."""
     stream = READOUT.create_stream()
     none = np.zeros(0, np.float32)
     seen = []
     for duration_s, kind, state in parts:
         voice = np.eye(len(VoiceKind), dtype=np.float32)[kind]
-        position = EncoderOutput(none, none, none, voice, np.array(state, np.float32))
+        output = EncoderOutput(none, none, none, voice, np.array(state, np.float32))
         for _ in range(round(duration_s * PER_S)):
-            stream.process_position(position)
+            stream.process_encoder_frame(output)
             seen.append(stream.newest)
     return seen
 

@@ -34,9 +34,9 @@ from kouxing.training.seed import SEED
 
 BATCH_S = 32
 BATCHES_PER_STEP = 8
-_POSITIONS_PER_S = 50
+_ENCODER_FRAMES_PER_S = 50
 _LENGTHS = (80, 120, 160, 200)  # positions of an excerpt
-_BEYOND = 25  # additional positions that only the teacher sees
+_TEACHER_CONTEXT = 25  # additional positions that only the teacher sees
 # lengths of a block and its right context, positions: live, then offline
 _BLOCKS = ((2, 14), (3, 12), (4, 12), (5, 10), (10, 10), (20, 10), (40, 10))
 _BLOCK_PROBS = (0.25, 0.1, 0.1, 0.15, 0.1, 0.2, 0.1)
@@ -89,9 +89,9 @@ def draw_block_batch(batch_source: BatchSource, number: int) -> BlockBatch:
     start = 0 if rng.random() < _FIRST_ROW_PROB else int(rng.integers(_MAX_START))
     rng = np.random.default_rng([SEED, 1, number])
     probs = np.cumsum(sampling_probs(batch_source.recordings))
-    num_frames = 2 * (length + _BEYOND) + 1
+    num_frames = 2 * (length + _TEACHER_CONTEXT) + 1
     disturbed, clean, states, target_probs = [], [], [], []
-    for _ in range(_POSITIONS_PER_S * BATCH_S // length):
+    for _ in range(_ENCODER_FRAMES_PER_S * BATCH_S // length):
         both, targets = _draw_excerpt(batch_source, probs, num_frames, rng)
         bands = both[:, :NUM_MELS]
         clean.append(np.maximum(bands, bands.max() - FLOOR_BANDS).T)

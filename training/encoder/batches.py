@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
+from kouxing.services.mouth_profiles.lip_inputs import ENCODER_FRAME_S
 from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.encoder.network import NUM_INPUTS
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, Samples, TargetColumns
-from kouxing.training.encoder.teachers import POSITION_SAMPLES
+from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
 from kouxing.training.networks.augmentation import (
     Sound,
     add_sounds,
@@ -33,9 +33,9 @@ Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
 Batch = tuple[Halves, Halves]  # inputs, (batch, positions, 160); targets
 
-NUM_POSITIONS = 250  # length of an excerpt, 5 s
+NUM_ENCODER_FRAMES = 250  # length of an excerpt, 5 s
 NUM_EXCERPTS = 28
-BATCH_S = NUM_EXCERPTS * NUM_POSITIONS * POSITION_SAMPLES / SAMPLE_RATE_HZ
+BATCH_S = NUM_EXCERPTS * NUM_ENCODER_FRAMES * ENCODER_FRAME_SAMPLES / SAMPLE_RATE_HZ
 _MAX_SPEED = 1.3
 _MAX_PIECE = 400  # positions of one recording in an excerpt
 _PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
@@ -91,14 +91,14 @@ def _excerpt(
             snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
             sound = _add_background(sound, batch_source, rng, snr_db, with_voices=True)
         sound = disturb(sound, rng)
-    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_POSITIONS]
-    source = speed * np.arange(NUM_POSITIONS) + (speed - 1) * _MIDDLE
+    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_ENCODER_FRAMES]
+    source = speed * np.arange(NUM_ENCODER_FRAMES) + (speed - 1) * _MIDDLE
     chosen = _rows(targets, source)
     chosen[:, PITCH] += np.float32(np.log2(speed))
     lips = batch_source.columns.lips
     delayed = [
-        _rows(targets[:, lips], speed * (np.arange(NUM_POSITIONS) + known) - 1)
-        for known in (_KNOWN - delay_s / POSITION_S for delay_s in LIP_DELAYS_S)
+        _rows(targets[:, lips], speed * (np.arange(NUM_ENCODER_FRAMES) + known) - 1)
+        for known in (_KNOWN - delay_s / ENCODER_FRAME_S for delay_s in LIP_DELAYS_S)
     ]
     return inputs, np.concatenate([chosen[:, : lips.start], *delayed], axis=1)
 
@@ -116,12 +116,14 @@ def _speech(
     """Join recordings and pauses that are long enough for an excerpt at any speed."""
     sounds: list[Floats] = []
     rows: list[Floats] = []
-    missing = int(NUM_POSITIONS * _MAX_SPEED)
+    missing = int(NUM_ENCODER_FRAMES * _MAX_SPEED)
     while missing > 0:
         piece = batch_source.draw(rng, probs)
         size = min(len(piece.targets), _MAX_PIECE, missing)
         start = int(rng.integers(len(piece.targets) - size + 1))
-        sound = as_floats(piece.samples[POSITION_SAMPLES * start :][: POSITION_SAMPLES * size])
+        sound = as_floats(
+            piece.samples[ENCODER_FRAME_SAMPLES * start :][: ENCODER_FRAME_SAMPLES * size]
+        )
         gain = 10 ** (rng.normal(0.0, _LEVEL_DB) / 20) / (np.sqrt(np.mean(sound**2)) + _TINY)
         sounds.append(np.float32(gain) * sound)
         rows.append(piece.targets[start : start + size].astype(np.float32))
@@ -131,9 +133,9 @@ def _speech(
             pause = np.full((size, rows[0].shape[1]), np.nan, np.float32)
             pause[:, VOICE] = VoiceKind.NONE
             rows.append(pause)
-            sounds.append(np.zeros(POSITION_SAMPLES * size, np.float32))
+            sounds.append(np.zeros(ENCODER_FRAME_SAMPLES * size, np.float32))
             missing -= size
-    spare = np.zeros(2 * POSITION_SAMPLES, np.float32)  # for the last positions' windows
+    spare = np.zeros(2 * ENCODER_FRAME_SAMPLES, np.float32)  # for the last positions' windows
     return np.concatenate([*sounds, spare]), np.concatenate(rows)
 
 

@@ -36,7 +36,7 @@ from scipy.special import expit
 
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.parallel import process_in_order
-from kouxing.services.mouth_profiles.lip_inputs import POSITION_S
+from kouxing.services.mouth_profiles.lip_inputs import ENCODER_FRAME_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
 from kouxing.services.recognizer.lips.lip_predictor import NUM_LIP_FAPS
 from kouxing.shared.audio.pcm import as_integers
@@ -155,7 +155,7 @@ def train_lip_teacher(
     closed_at = closed_below(clips)
     targets = []
     for clip, clip_features in zip(clips, features, strict=True):
-        time_s = POSITION_S * np.arange(1.0, 1 + len(clip_features.whisper))
+        time_s = ENCODER_FRAME_S * np.arange(1.0, 1 + len(clip_features.whisper))
         known = phones.get(clip.name)
         targets.append(targets_at(clip, known, closed_at[clip.speaker], time_s, [0.0]))
     units = measure_scale(targets)

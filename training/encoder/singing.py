@@ -21,8 +21,8 @@ Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
 _FRAME_S = 0.005
-_FRAMES_PER_POSITION = 4
-_FRAME_OF_POSITION = 3.5  # middle of position 0, frames
+_PITCH_FRAMES_PER_ENCODER_FRAME = 4
+_MIDDLE_FRAME = 3.5  # middle of encoder frame 0, pitch frames
 _MIN_VOICED = 20  # frames
 _MIN_STRETCH, _MAX_STRETCH = 1.3, 3.0  # for voiced frames
 _MIN_HOLD_S, _MAX_HOLD_S, _HOLD_PROB = 1.0, 4.0, 0.5
@@ -61,8 +61,11 @@ def sing(samples: Floats, num_positions: int, rng: np.random.Generator) -> SungV
         new_pitch_hz = np.where(voiced[frames], _melody(new_pitch_hz, rng), 0.0)
     sung = pyworld.synthesize(new_pitch_hz, envelope[frames], aperiodicity[frames], SAMPLE_RATE_HZ)
     sung /= max(1.0, np.abs(sung).max())
-    middle = _FRAMES_PER_POSITION * np.arange(len(frames) // _FRAMES_PER_POSITION) + 3
-    source = (frames[middle] - _FRAME_OF_POSITION) / _FRAMES_PER_POSITION
+    middle = (
+        _PITCH_FRAMES_PER_ENCODER_FRAME * np.arange(len(frames) // _PITCH_FRAMES_PER_ENCODER_FRAME)
+        + 3
+    )
+    source = (frames[middle] - _MIDDLE_FRAME) / _PITCH_FRAMES_PER_ENCODER_FRAME
     with np.errstate(divide="ignore"):
         pitch = np.log2(new_pitch_hz[middle])
     return SungVoice(

@@ -38,7 +38,7 @@ from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder.lip_teacher import LipTeacher, TeacherFeatures
 from kouxing.training.encoder.singing import sing
-from kouxing.training.encoder.teachers import POSITION_SAMPLES, TeacherOutputs, Teachers
+from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES, TeacherOutputs, Teachers
 from kouxing.training.seed import SEED
 
 Floats = NDArray[np.float32]
@@ -184,7 +184,7 @@ class TargetStore:
         samples, targets = (
             np.load(self._file(chunk, name), mmap_mode="r") for name in ("samples", "targets")
         )
-        parts = np.split(samples, POSITION_SAMPLES * bounds), np.split(targets, bounds)
+        parts = np.split(samples, ENCODER_FRAME_SAMPLES * bounds), np.split(targets, bounds)
         return [Piece(*fields) for fields in zip(*parts, weights.tolist(), strict=True)]
 
     def _compute(self, chunk: int) -> list[tuple[str, str]]:
@@ -226,7 +226,7 @@ class TargetStore:
             lips = (lips - self._basis["lips_mean"]) / self._basis["lips_deviation"]
             rows: list[NDArray[np.floating]] = [*scalars, outputs.phones, whisper, lips]
             targets = np.column_stack(rows).astype(np.float16)
-            trimmed = samples[: POSITION_SAMPLES * len(targets)]
+            trimmed = samples[: ENCODER_FRAME_SAMPLES * len(targets)]
             pieces.append(Piece(trimmed, targets, recording.weight))
         return pieces
 
@@ -258,12 +258,12 @@ def _components_of(centered: Floats) -> Floats:
 def _sung_copy(piece: Piece, rng: np.random.Generator) -> list[Piece]:
     """Create a sung copy of the start of a recording; an empty list if it has no voice."""
     speech = as_floats(piece.samples[:_MAX_SUNG_SAMPLES])
-    sung = sing(speech, len(speech) // POSITION_SAMPLES, rng)
+    sung = sing(speech, len(speech) // ENCODER_FRAME_SAMPLES, rng)
     if sung is None:
         return []
     targets = np.array(piece.targets[sung.source])
     targets[:, PITCH] = sung.pitch
     targets[sung.is_sung & (targets[:, VOICE] == VoiceKind.SPEECH), VOICE] = VoiceKind.SUNG
-    num_positions = min(len(targets), len(sung.samples) // POSITION_SAMPLES)
-    samples = as_integers(sung.samples[: POSITION_SAMPLES * num_positions])
+    num_positions = min(len(targets), len(sung.samples) // ENCODER_FRAME_SAMPLES)
+    samples = as_integers(sung.samples[: ENCODER_FRAME_SAMPLES * num_positions])
     return [Piece(samples, targets[:num_positions], piece.weight)]

@@ -41,9 +41,9 @@ from kouxing.training.networks.whisper import init_encoder
 
 Floats = NDArray[np.float32]
 
-POSITION_SAMPLES = 320
+ENCODER_FRAME_SAMPLES = 320
 _WHISPER_LAYERS = (1, 3, 5)  # layers of Whisper's encoder, counted from 0
-_BLOCK_POSITIONS = 50  # for the block network; longer blocks than live cost less
+_BLOCK_LENGTH = 50  # for the block network; longer blocks than live cost less
 _LOW_BANDS, _HIGH_BANDS = slice(1, 27), slice(27, 69)  # below 1 kHz, and 1 to 5 kHz
 _LOUD_PERCENTILE = 95
 _TINY_POWER = 1e-7
@@ -93,9 +93,9 @@ class Teachers:
     def _phones(self, frames: Tensor) -> Floats:
         """Compute the phones' posteriors: (1, frames, 80) to (positions, phones)."""
         num_positions = (frames.shape[1] - 1) // 2
-        missing = -num_positions % _BLOCK_POSITIONS  # few sizes: layouts are cached
+        missing = -num_positions % _BLOCK_LENGTH  # few sizes: layouts are cached
         padded = pad(frames, (0, 0, 0, 2 * missing), mode="replicate")
-        layout = block_layout(num_positions + missing, _BLOCK_POSITIONS, device=DEVICE)
+        layout = block_layout(num_positions + missing, _BLOCK_LENGTH, device=DEVICE)
         with mixed_precision():
             features = self._blocks(padded.to(DEVICE), layout)
         states = self._readout.read(features.float(), layout)[0, :num_positions].exp().mean(dim=1)
@@ -105,8 +105,8 @@ class Teachers:
 def track_pitch(samples: NDArray[np.int16], num_positions: int) -> Floats:
     """Track the pitch; log2 of Hz, NaN without voice, (positions,)."""
     tracker, floats = PitchTracker(), as_floats(samples)
-    starts = POSITION_SAMPLES * np.arange(num_positions)
-    pitch = [tracker.track(floats[start : start + POSITION_SAMPLES]) for start in starts]
+    starts = ENCODER_FRAME_SAMPLES * np.arange(num_positions)
+    pitch = [tracker.track(floats[start : start + ENCODER_FRAME_SAMPLES]) for start in starts]
     with np.errstate(divide="ignore"):
         logarithm = np.log2(np.array(pitch, np.float32))
     return np.where(np.isfinite(logarithm), logarithm, np.float32(np.nan))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, cache_names
 from kouxing.services.recognizer.acoustic.network import (
-    FRAMES_PER_POSITION,
+    FRAMES_PER_ENCODER_FRAME,
     open_onnx_session,
     position_table,
 )
@@ -44,15 +44,15 @@ class FeatureEncoder:
         The rows of positions that a block lacks are undefined.
         """
         shape, num_sessions = self._shape, len(recordings)
-        num_positions = [-(-len(frames) // FRAMES_PER_POSITION) for frames in recordings]
+        num_positions = [-(-len(frames) // FRAMES_PER_ENCODER_FRAME) for frames in recordings]
         num_blocks = -(-max(num_positions) // BLOCK_LENGTH)
         padded = [_padded(frames, num_blocks) for frames in recordings]
         size = shape.width // shape.heads
         rings = np.zeros((2 * shape.layers, num_sessions, shape.heads, PAST, size), np.float16)
         blocks = []
         for start in range(0, num_blocks * BLOCK_LENGTH, BLOCK_LENGTH):
-            first = FRAMES_PER_POSITION * start
-            window = slice(first, first + FRAMES_PER_POSITION * LENGTH + 3)
+            first = FRAMES_PER_ENCODER_FRAME * start
+            window = slice(first, first + FRAMES_PER_ENCODER_FRAME * LENGTH + 3)
             positions = self._positions[start : start + LENGTH]
             features, new = self._session.run(
                 ["features", "new"],
@@ -76,7 +76,9 @@ class FeatureEncoder:
 
 def _padded(frames: NDArray[np.float32], num_blocks: int) -> NDArray[np.float32]:
     """Floor the bands as the recognizer does, and repeat the last frame."""
-    num_frames = PADDING_FRAMES + FRAMES_PER_POSITION * (num_blocks * BLOCK_LENGTH + LENGTH) + 3
+    num_frames = (
+        PADDING_FRAMES + FRAMES_PER_ENCODER_FRAME * (num_blocks * BLOCK_LENGTH + LENGTH) + 3
+    )
     padded = np.zeros((num_frames, NUM_MELS), np.float32)
     loudest = np.maximum.accumulate(frames.max(axis=1))
     end = PADDING_FRAMES + len(frames)

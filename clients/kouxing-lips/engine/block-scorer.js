@@ -48,26 +48,26 @@ export class BlockScorer {
   }
 
   /** Process the last feature frames of some encoder frames; return the new settled and the provisional scores. */
-  accept(positions, numFrames) {
+  accept(encoderFrames, numFrames) {
     const size = this.#numMels;
-    const frames = positions.flatMap(({ features }) => [features.slice(0, size), features.slice(size, 2 * size)]);
+    const frames = encoderFrames.flatMap(({ features }) => [features.slice(0, size), features.slice(size, 2 * size)]);
     for (const frame of frames.slice(-numFrames)) {
       this.#numFrames++;
       this.#highestBand = frame.reduce((highest, band) => Math.max(highest, band), this.#highestBand);
       const floor = Math.fround(this.#highestBand - this.#constants.floorBands);
       this.#frames.push(frame.map((band) => Math.max(band, floor)));
     }
-    while (this.#numPositions >= this.#numNeeded) this.#run();
+    while (this.#numEncoderFrames >= this.#numNeeded) this.#run();
     return { settled: this.#takeSettled(), provisional: this.#provisional };
   }
 
   /** End the speech; return the scores of the remaining frames. */
   finish() {
-    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#constants;
-    const numMore = this.#numFrames ? SEEN_AFTER - ((this.#numFrames - 1) % FRAMES_PER_POSITION) : 0;
+    const { RIGHT_CONTEXT_FRAMES, FRAMES_PER_ENCODER_FRAME } = this.#constants;
+    const numMore = this.#numFrames ? RIGHT_CONTEXT_FRAMES - ((this.#numFrames - 1) % FRAMES_PER_ENCODER_FRAME) : 0;
     this.#frames.push(...Array(numMore).fill(this.#frames.at(-1)));
     this.#hasEnded = true;
-    while (this.#numPositions > 0) this.#run();
+    while (this.#numEncoderFrames > 0) this.#run();
     const numLeft = this.#numFrames - this.#numSettled;
     return this.#takeSettled().slice(0, numLeft);
   }
@@ -77,9 +77,9 @@ export class BlockScorer {
   }
 
   /** Number of complete encoder frames, from the next block's first on. */
-  get #numPositions() {
-    const { SEEN_AFTER, FRAMES_PER_POSITION } = this.#constants;
-    return Math.max(0, Math.floor((this.#frames.length - 1 - SEEN_AFTER) / FRAMES_PER_POSITION));
+  get #numEncoderFrames() {
+    const { RIGHT_CONTEXT_FRAMES, FRAMES_PER_ENCODER_FRAME } = this.#constants;
+    return Math.max(0, Math.floor((this.#frames.length - 1 - RIGHT_CONTEXT_FRAMES) / FRAMES_PER_ENCODER_FRAME));
   }
 
   #startTable() {
@@ -99,20 +99,20 @@ export class BlockScorer {
 
   /** Compute the next block and its right context. */
   #run() {
-    const { FRAMES_PER_POSITION, PADDING, MAX_POSITIONS } = this.#constants;
+    const { FRAMES_PER_ENCODER_FRAME, PADDING, MAX_POSITIONS } = this.#constants;
     const { block, length } = this.#sizes;
-    const numComplete = this.#numPositions;
-    let numPositions = Math.min(numComplete, this.#numNeeded);
+    const numComplete = this.#numEncoderFrames;
+    let numEncoderFrames = Math.min(numComplete, this.#numNeeded);
     const maxPositions = Math.min(length, MAX_POSITIONS - this.#row);
-    if (numPositions < maxPositions) {
+    if (numEncoderFrames < maxPositions) {
       // one run replaces several runs that settle nothing
-      const numMore = Math.min(numComplete, maxPositions) - numPositions;
-      numPositions += Math.floor(numMore / block) * block;
+      const numMore = Math.min(numComplete, maxPositions) - numEncoderFrames;
+      numEncoderFrames += Math.floor(numMore / block) * block;
     }
-    const isLast = this.#row + numPositions === MAX_POSITIONS || (this.#hasEnded && numPositions === numComplete);
-    const numKept = isLast ? 0 : Math.max(0, numPositions + block - length);
-    const numSettled = FRAMES_PER_POSITION * (isLast ? numPositions : numKept);
-    const rows = this.#scores(this.#frames.slice(0, FRAMES_PER_POSITION * numPositions + PADDING + 1), numPositions);
+    const isLast = this.#row + numEncoderFrames === MAX_POSITIONS || (this.#hasEnded && numEncoderFrames === numComplete);
+    const numKept = isLast ? 0 : Math.max(0, numEncoderFrames + block - length);
+    const numSettled = FRAMES_PER_ENCODER_FRAME * (isLast ? numEncoderFrames : numKept);
+    const rows = this.#scores(this.#frames.slice(0, FRAMES_PER_ENCODER_FRAME * numEncoderFrames + PADDING + 1), numEncoderFrames);
     this.#settled.push(...rows.slice(0, numSettled));
     this.#provisional = rows.slice(numSettled);
     this.#frames.splice(0, numSettled);
@@ -121,23 +121,23 @@ export class BlockScorer {
       return;
     }
     if (numKept) this.#storeContext(numKept);
-    this.#numNeeded = Math.min(numPositions - numKept + block, MAX_POSITIONS - this.#row);
+    this.#numNeeded = Math.min(numEncoderFrames - numKept + block, MAX_POSITIONS - this.#row);
   }
 
   /** Run the network; return the scores of the states, a row for each frame. */
-  #scores(frames, numPositions) {
+  #scores(frames, numEncoderFrames) {
     const network = this.#network;
     const [input, positions] = ["frames", "positions"].map((name) => network.values(name));
     const [size, width] = [this.#numMels, network.shape("positions")[2]];
     input.fill(0);
     frames.forEach((frame, i) => input.set(frame, i * size));
     positions.set(this.#table.subarray(this.#row * width, this.#row * width + positions.length));
-    network.values("num_positions")[0] = numPositions;
+    network.values("num_positions")[0] = numEncoderFrames;
     network.values("num_cached")[0] = this.#numCached;
     network.run();
     const logPosteriors = network.values("log_posteriors");
     const numStates = this.#logPrior.length;
-    return Array.from({ length: this.#constants.FRAMES_PER_POSITION * numPositions }, (_, row) => {
+    return Array.from({ length: this.#constants.FRAMES_PER_ENCODER_FRAME * numEncoderFrames }, (_, row) => {
       const scores = logPosteriors.slice(row * numStates, (row + 1) * numStates);
       for (let i = 0; i < numStates; i++) scores[i] = this.#scale * Math.fround(scores[i] - this.#logPrior[i]);
       return scores;

@@ -23,8 +23,8 @@ export class LightScorer {
   }
 
   /** Process the last feature frames of some encoder frames; return the new { settled, provisional } scores, a row for each frame. */
-  accept(positions, numFrames) {
-    const scores = positions.map(({ row }) => this.#scoresOf(row));
+  accept(encoderFrames, numFrames) {
+    const scores = encoderFrames.map(({ row }) => this.#scoresOf(row));
     const rows = scores.flatMap((row) => [row, row]).slice(-numFrames);
     this.#last = rows.at(-1) ?? this.#last;
     const numEarly = Math.min(rows.length, this.#numEarly);

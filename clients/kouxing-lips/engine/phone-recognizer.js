@@ -64,8 +64,8 @@ export class PhoneRecognizer {
   }
 
   /** Process the last feature frames of some encoder frames; return new and changed phones. */
-  accept(positions, numFrames) {
-    const { settled, provisional } = this.#scorer.accept(positions, numFrames);
+  accept(encoderFrames, numFrames) {
+    const { settled, provisional } = this.#scorer.accept(encoderFrames, numFrames);
     return this.#decode(settled, provisional);
   }
 

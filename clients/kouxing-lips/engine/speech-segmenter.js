@@ -19,7 +19,7 @@ class VoiceActivityDetector {
   update(probability) {
     this.#numUnlikely = probability >= this.#constants.IMPROBABLE ? 0 : this.#numUnlikely + 1;
     if (this.isSpeech) {
-      this.isSpeech = this.#numUnlikely < this.#constants.STOP_POSITIONS;
+      this.isSpeech = this.#numUnlikely < this.#constants.STOP_ENCODER_FRAMES;
       return;
     }
     this.#evidence = Math.max(0, this.#evidence + probability - this.#constants.NO_EVIDENCE);
@@ -59,11 +59,11 @@ export class SpeechSegmenter {
   /** Accept samples at 16 kHz; return speech changes, phones and lip positions, in order. */
   accept(samples) {
     this.#frames.push(...this.#mel.accept(samples));
-    const { FRAMES_PER_POSITION } = this.#model.constants.segmenter;
+    const { FRAMES_PER_ENCODER_FRAME } = this.#model.constants.segmenter;
     const events = [];
-    while (this.#frames.length >= FRAMES_PER_POSITION) {
-      const frames = join(this.#frames.splice(0, FRAMES_PER_POSITION));
-      this.#numFrames += FRAMES_PER_POSITION;
+    while (this.#frames.length >= FRAMES_PER_ENCODER_FRAME) {
+      const frames = join(this.#frames.splice(0, FRAMES_PER_ENCODER_FRAME));
+      this.#numFrames += FRAMES_PER_ENCODER_FRAME;
       const { encoder } = this.#model;
       encoder.values("frames").set(frames);
       encoder.values("state").set(this.#state);
@@ -80,34 +80,34 @@ export class SpeechSegmenter {
     return this.#isSpeaking ? this.#endSpeech() : [];
   }
 
-  #process(position, voice) {
+  #process(encoderFrame, voice) {
     const { SPEECH, SUNG } = this.#model.voices;
-    const phones = this.#isSpeaking ? this.#recognize([position], this.#framesPerPosition) : [];
+    const phones = this.#isSpeaking ? this.#recognize([encoderFrame], this.#framesPerEncoderFrame) : [];
     if (!this.#isSpeaking) {
-      this.#recent.push(position);
+      this.#recent.push(encoderFrame);
       if (this.#recent.length > this.#model.constants.segmenter.MAX_RECENT) this.#recent.shift();
     }
     this.#detector.update(Math.fround(voice[SPEECH] + voice[SUNG]));
     this.#traits.accept(this.#state, voice);
     if (this.#isSpeaking && !this.#detector.isSpeech) return [...phones, ...this.#endSpeech()];
-    if (this.#isSpeaking) return [...phones, ...this.#predict(position, this.#numFrames - 1)];
+    if (this.#isSpeaking) return [...phones, ...this.#predict(encoderFrame, this.#numFrames - 1)];
     return this.#detector.isSpeech ? this.#startSpeech() : [];
   }
 
   #startSpeech() {
-    const { FRAMES_PER_POSITION, PRE_ROLL_FRAMES, FIRST_FRAME_PARITY, SEEN_AFTER_FRAMES } = this.#model.constants.segmenter;
-    const oldest = this.#numFrames - FRAMES_PER_POSITION * this.#recent.length;
+    const { FRAMES_PER_ENCODER_FRAME, PRE_ROLL_FRAMES, FIRST_FRAME_PARITY, RIGHT_CONTEXT_FRAMES } = this.#model.constants.segmenter;
+    const oldest = this.#numFrames - FRAMES_PER_ENCODER_FRAME * this.#recent.length;
     let first = Math.max(oldest, this.#numFrames - PRE_ROLL_FRAMES);
-    while (first % FRAMES_PER_POSITION !== FIRST_FRAME_PARITY) first++;
-    if (this.#numFrames - first < FRAMES_PER_POSITION) return [];
+    while (first % FRAMES_PER_ENCODER_FRAME !== FIRST_FRAME_PARITY) first++;
+    if (this.#numFrames - first < FRAMES_PER_ENCODER_FRAME) return [];
     this.#isSpeaking = true;
     this.#phones?.start(first);
     const events = [this.#speechChange(true, first), ...this.#recognize(this.#recent, this.#numFrames - first)];
     this.#lips.reset();
-    let newest = this.#numFrames - 1 - FRAMES_PER_POSITION * (this.#recent.length - 1);
-    for (const position of this.#recent) {
-      if (newest >= first + SEEN_AFTER_FRAMES) events.push(...this.#predict(position, newest));
-      newest += FRAMES_PER_POSITION;
+    let newest = this.#numFrames - 1 - FRAMES_PER_ENCODER_FRAME * (this.#recent.length - 1);
+    for (const encoderFrame of this.#recent) {
+      if (newest >= first + RIGHT_CONTEXT_FRAMES) events.push(...this.#predict(encoderFrame, newest));
+      newest += FRAMES_PER_ENCODER_FRAME;
     }
     this.#recent = [];
     return events;
@@ -119,13 +119,13 @@ export class SpeechSegmenter {
     return [...phones.map(eventOf), this.#speechChange(false, this.#numFrames)];
   }
 
-  get #framesPerPosition() {
-    return this.#model.constants.segmenter.FRAMES_PER_POSITION;
+  get #framesPerEncoderFrame() {
+    return this.#model.constants.segmenter.FRAMES_PER_ENCODER_FRAME;
   }
 
   /** Return the phones that follow from the last feature frames of some encoder frames. */
-  #recognize(positions, numFrames) {
-    return (this.#phones?.accept(positions, numFrames) ?? []).map(eventOf);
+  #recognize(encoderFrames, numFrames) {
+    return (this.#phones?.accept(encoderFrames, numFrames) ?? []).map(eventOf);
   }
 
   #speechChange(active, frame) {

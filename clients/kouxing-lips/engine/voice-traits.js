@@ -13,12 +13,12 @@ export class VoiceTraits {
   #mean;
   #numVoiced = 0;
   #evidence = [0, 0]; // evidence of laughter and of breath
-  #positionsSinceLaugh;
+  #encoderFramesSinceLaugh;
 
   constructor({ arrays, constants, voices }) {
     this.#constants = constants.traits;
     this.#voices = voices;
-    this.#positionsSinceLaugh = this.#constants.LAUGH_POSITIONS;
+    this.#encoderFramesSinceLaugh = this.#constants.LAUGH_ENCODER_FRAMES;
     this.#weights = arrays["traits.weights"];
     this.#bias = arrays["traits.bias"].values;
     this.#feeling = this.#mean = [...arrays["traits.mean"].values];
@@ -26,7 +26,7 @@ export class VoiceTraits {
 
   /** Process the next encoder frame's state and probabilities of the kinds of voice. */
   accept(state, voice) {
-    const { MIN_VOICE, PRIOR_POSITIONS, MAX_POSITIONS, PRIOR_FEELING, MEAN_POSITIONS, EVIDENCE_FRACTION } = this.#constants;
+    const { MIN_VOICE, VOICE_PRIOR_WEIGHT, VOICE_MEMORY, FEELING_PRIOR_WEIGHT, FEELING_MEMORY, EVIDENCE_FRACTION } = this.#constants;
     const { values, shape: [, numOutputs] } = this.#weights;
     const outputs = new Float64Array(this.#bias);
     for (let i = 0, at = 0; i < state.length; i++) {
@@ -36,19 +36,19 @@ export class VoiceTraits {
     const smooth = (current, gain) => current.map((value, i) => value + gain * (outputs[i] - value));
     if (voice[this.#voices.SPEECH] + voice[this.#voices.SUNG] > MIN_VOICE) {
       this.#numVoiced++;
-      this.#mean = smooth(this.#mean, 1 / Math.min(this.#numVoiced + PRIOR_POSITIONS, MAX_POSITIONS));
-      this.#feeling = smooth(this.#feeling, 1 / Math.min(this.#numVoiced + PRIOR_FEELING, MEAN_POSITIONS));
+      this.#mean = smooth(this.#mean, 1 / Math.min(this.#numVoiced + VOICE_PRIOR_WEIGHT, VOICE_MEMORY));
+      this.#feeling = smooth(this.#feeling, 1 / Math.min(this.#numVoiced + FEELING_PRIOR_WEIGHT, FEELING_MEMORY));
     }
     this.#evidence = this.#evidence.map((value, i) => value + EVIDENCE_FRACTION * (outputs[2 + i] - value));
     const [arousal, valence] = this.#feeling.map((value, i) => this.#rounded(clamp(value - this.#mean[i], -1, 1)));
     const isLaugh = voice[this.#voices.LAUGHTER] > this.#constants.MIN_LAUGHTER;
-    this.#positionsSinceLaugh = isLaugh ? 0 : this.#positionsSinceLaugh + 1;
+    this.#encoderFramesSinceLaugh = isLaugh ? 0 : this.#encoderFramesSinceLaugh + 1;
     const isDetected = (evidence, wasDetected) => evidence > (wasDetected ? this.#constants.STOP : this.#constants.START);
     this.newest = {
       arousal,
       valence,
       isLaughter:
-        isDetected(this.#evidence[0], this.newest.isLaughter) && this.#positionsSinceLaugh < this.#constants.LAUGH_POSITIONS,
+        isDetected(this.#evidence[0], this.newest.isLaughter) && this.#encoderFramesSinceLaugh < this.#constants.LAUGH_ENCODER_FRAMES,
       isBreath: isDetected(this.#evidence[1], this.newest.isBreath),
     };
   }

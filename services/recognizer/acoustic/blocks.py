@@ -56,7 +56,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, 
 from kouxing.services.recognizer.acoustic.light import LightModel, build_light_model
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import (
-    FRAMES_PER_POSITION,
+    FRAMES_PER_ENCODER_FRAME,
     MAX_POSITIONS,
     NetworkModel,
     check_outputs,
@@ -78,7 +78,7 @@ _OUTPUTS = ["log_posteriors", "new_state", "new"]
 _NUM_KEPT, _LAST_KEPT = "block", "last_of_block"
 EXTENSION_PREFIX = "universal_"  # starts the names of a second readout's input and outputs
 _PADDING = 2  # frames of zeros before a segment's first
-_SEEN_AFTER = 2  # feature frames after an encoder frame's first one on which it depends
+_RIGHT_CONTEXT_FRAMES = 2  # feature frames after an encoder frame's first one on which it depends
 _MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
 _MAX_SIZE = 4096
 _MAX_CACHE_BYTES = 3_000_000  # per session
@@ -154,7 +154,7 @@ class Block(Record, frozen=True):
 
     frames: Floats  # (2 encoder frames + 3, 80), from two before the first encoder frame's
     row: int  # row of the first encoder frame in the table of positions
-    num_positions: int
+    num_encoder_frames: int
     num_settled: int  # number of leading encoder frames whose scores are settled
     num_kept: int  # number of leading encoder frames whose keys and values are kept; 0 at the end
     past: NetworkState
@@ -195,7 +195,7 @@ class BlockRunner:
         inputs = {
             "frames": frames,
             "positions": np.array([self._positions[b.row : b.row + length] for b in blocks]),
-            "num_positions": np.array([block.num_positions for block in blocks]),
+            "num_positions": np.array([block.num_encoder_frames for block in blocks]),
             "num_cached": np.array([block.past.num_cached for block in blocks]),
             self._state: np.array([block.past.state for block in blocks]),
             _NUM_KEPT: np.array([num_kept]),
@@ -221,7 +221,7 @@ class BlockStream(AcousticStream):
     def __init__(self, model: BlockModel) -> None:
         super().__init__(model)
         self._sizes = model.runner.sizes
-        self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
+        self.look_ahead_frames = FRAMES_PER_ENCODER_FRAME * self._sizes.length
         self._hop = self._sizes.block  # H
         self._empty_scores = self.provisional
         self._rings = np.zeros(self._sizes.rings, np.float16)
@@ -252,7 +252,7 @@ class BlockStream(AcousticStream):
         """Append frames, (n, 80); None, the end of the segment, repeats the last frame."""
         if frames is None:
             self._ended = True
-            num_more = _SEEN_AFTER - (self._num_frames - 1) % FRAMES_PER_POSITION
+            num_more = _RIGHT_CONTEXT_FRAMES - (self._num_frames - 1) % FRAMES_PER_ENCODER_FRAME
             frames = np.repeat(self._frames[-1:], num_more if self._num_frames else 0, axis=0)
         elif len(frames):
             self._num_frames += len(frames)
@@ -264,38 +264,44 @@ class BlockStream(AcousticStream):
     @property
     def is_due(self) -> bool:
         """Whether the network must run."""
-        num_positions = self._num_positions
-        return num_positions >= self._num_due or (self._ended and num_positions > 0)
+        num_encoder_frames = self._num_encoder_frames
+        return num_encoder_frames >= self._num_due or (self._ended and num_encoder_frames > 0)
 
     def is_due_after(self, num_frames: int) -> bool:
         """Return whether the network must run after this number of additional frames."""
-        return self._num_positions_after(num_frames) >= self._num_due
+        return self._num_encoder_frames_after(num_frames) >= self._num_due
 
     @property
-    def _num_positions(self) -> int:
+    def _num_encoder_frames(self) -> int:
         """Number of complete encoder frames, from the next block's first on."""
-        return self._num_positions_after(0)
+        return self._num_encoder_frames_after(0)
 
-    def _num_positions_after(self, num_frames: int) -> int:
-        return max(0, (len(self._frames) + num_frames - 1 - _SEEN_AFTER) // FRAMES_PER_POSITION)
+    def _num_encoder_frames_after(self, num_frames: int) -> int:
+        return max(
+            0,
+            (len(self._frames) + num_frames - 1 - _RIGHT_CONTEXT_FRAMES)
+            // FRAMES_PER_ENCODER_FRAME,
+        )
 
     def block(self) -> Block:
         """Return the block that the network must compute next."""
-        sizes, num_complete = self._sizes, self._num_positions
-        num_positions = min(num_complete, self._num_due)
-        max_positions = min(sizes.length, MAX_POSITIONS - self._row)
-        if num_positions < max_positions:  # one run replaces several runs that settle nothing
-            num_more = min(num_complete, max_positions) - num_positions
-            num_positions += num_more // sizes.block * sizes.block
-        is_last = self._row + num_positions == MAX_POSITIONS or (
-            self._ended and num_positions == num_complete
+        sizes, num_complete = self._sizes, self._num_encoder_frames
+        num_encoder_frames = min(num_complete, self._num_due)
+        max_encoder_frames = min(sizes.length, MAX_POSITIONS - self._row)
+        if (
+            num_encoder_frames < max_encoder_frames
+        ):  # one run replaces several runs that settle nothing
+            num_more = min(num_complete, max_encoder_frames) - num_encoder_frames
+            num_encoder_frames += num_more // sizes.block * sizes.block
+        is_last = self._row + num_encoder_frames == MAX_POSITIONS or (
+            self._ended and num_encoder_frames == num_complete
         )
-        num_kept = 0 if is_last else max(0, num_positions + self._hop - sizes.length)
+        num_kept = 0 if is_last else max(0, num_encoder_frames + self._hop - sizes.length)
         return Block(
-            frames=self._frames[: FRAMES_PER_POSITION * num_positions + _PADDING + 1],
+            frames=self._frames[: FRAMES_PER_ENCODER_FRAME * num_encoder_frames + _PADDING + 1],
             row=self._row,
-            num_positions=num_positions,
-            num_settled=num_positions if is_last else num_kept,
+            num_encoder_frames=num_encoder_frames,
+            num_settled=num_encoder_frames if is_last else num_kept,
             num_kept=num_kept,
             past=self._past,
         )
@@ -303,9 +309,9 @@ class BlockStream(AcousticStream):
     def append_outputs(self, block: Block, scores: Floats, state: Floats, new: Float16) -> None:
         """Append a block's scores, new state, keys and values; shapes as in ``BlockRunner.run``."""
         past = self._sizes.past
-        end = FRAMES_PER_POSITION * block.num_settled
+        end = FRAMES_PER_ENCODER_FRAME * block.num_settled
         self._settled.append(scores[:end])
-        self.provisional = scores[end : FRAMES_PER_POSITION * block.num_positions]
+        self.provisional = scores[end : FRAMES_PER_ENCODER_FRAME * block.num_encoder_frames]
         self._frames = self._frames[end:]
         if block.num_settled > block.num_kept:
             self._start_table()
@@ -316,7 +322,7 @@ class BlockStream(AcousticStream):
             self._past.num_cached = min(self._past.num_cached + block.num_kept, past)
             self._past.state = state
             self._row += block.num_kept
-        num_due = block.num_positions - block.num_kept + self._hop
+        num_due = block.num_encoder_frames - block.num_kept + self._hop
         self._num_due = min(num_due, MAX_POSITIONS - self._row)
 
     def take_settled_scores(self) -> Floats:

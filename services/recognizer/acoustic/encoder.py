@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.model_file import load_component
 from kouxing.services.recognizer.acoustic.network import (
-    FRAMES_PER_POSITION,
+    FRAMES_PER_ENCODER_FRAME,
     check_outputs,
     open_onnx_session,
     run_onnx_session,
@@ -83,7 +83,7 @@ class AudioEncoder:
             if not (isinstance(width, int) and 1 <= width <= _MAX_WIDTH):
                 raise ValueError(f"its network has widths {widths}, not 1 to {_MAX_WIDTH}")
         values = self.run(
-            np.zeros((1, FRAMES_PER_POSITION, NUM_MELS), np.float32),
+            np.zeros((1, FRAMES_PER_ENCODER_FRAME, NUM_MELS), np.float32),
             np.zeros((1, self.state_width), np.float32),
         )
         sizes = (self.num_features, self.num_phones, len(VoiceKind), self.state_width)
@@ -110,23 +110,23 @@ class EncoderStream:
         self.encoder = encoder
         self.state = np.zeros(encoder.state_width, np.float32)
 
-    def process_position(self, frames: Floats) -> EncoderOutput:
+    def process_encoder_frame(self, frames: Floats) -> EncoderOutput:
         """Process the next encoder frame: its two feature frames, (2, 80)."""
-        return process_positions([self], [frames])[0]
+        return process_encoder_frames([self], [frames])[0]
 
 
-def process_positions(
+def process_encoder_frames(
     streams: Sequence[EncoderStream], frames: Sequence[Floats]
 ) -> list[EncoderOutput]:
     """Process the next encoder frame, (2, 80), of several streams of one encoder in one run."""
     states = np.array([stream.state for stream in streams])
     outputs = streams[0].encoder.run(np.array(frames), states)
-    positions = []
+    results = []
     for stream, mels, *rows in zip(streams, frames, *outputs, strict=True):
         features, phones, voice, state = (row.copy() for row in rows)  # a view would keep all rows
         stream.state = state
-        positions.append(EncoderOutput(mels, features, phones, voice, state))
-    return positions
+        results.append(EncoderOutput(mels, features, phones, voice, state))
+    return results
 
 
 @cache

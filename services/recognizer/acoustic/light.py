@@ -33,7 +33,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
 )
 from kouxing.services.recognizer.acoustic.encoder import PHONES_LAG_FRAMES, load_encoder
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
-from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 
@@ -53,10 +53,10 @@ class EncoderPhones:
         """Accept samples, shape (n,), 16 kHz, in [-1, 1]; return the new rows."""
         self._frames = np.concatenate([self._frames, self._mel.accept_waveform(samples)])
         rows = [self._rows[:0]]
-        while len(self._frames) >= FRAMES_PER_POSITION:
-            position = self._encoder.process_position(self._frames[:FRAMES_PER_POSITION])
-            rows.append(position.phones[np.newaxis].repeat(FRAMES_PER_POSITION, axis=0))
-            self._frames = self._frames[FRAMES_PER_POSITION:]
+        while len(self._frames) >= FRAMES_PER_ENCODER_FRAME:
+            output = self._encoder.process_encoder_frame(self._frames[:FRAMES_PER_ENCODER_FRAME])
+            rows.append(output.phones[np.newaxis].repeat(FRAMES_PER_ENCODER_FRAME, axis=0))
+            self._frames = self._frames[FRAMES_PER_ENCODER_FRAME:]
         return np.concatenate(rows)
 
 

@@ -13,7 +13,7 @@ from kouxing.services.recognizer.acoustic.onnx_session import create_inference_s
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 
 MAX_POSITIONS = 1500  # rows of the table of positions
-FRAMES_PER_POSITION = 2  # feature frames from one encoder frame to the next
+FRAMES_PER_ENCODER_FRAME = 2  # feature frames from one encoder frame to the next
 
 _LONGEST_WAVE = 10_000.0  # longest period of the sinusoids, over 2 pi
 

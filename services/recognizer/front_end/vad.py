@@ -22,7 +22,7 @@ from kouxing.services.recognizer.acoustic.encoder import VoiceKind
 
 _NO_EVIDENCE, _ENOUGH = 0.75, 0.12
 _IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such frames do
-_STOP_POSITIONS = 25  # half a second: longer than a closure or a breath between phrases
+_STOP_ENCODER_FRAMES = 25  # half a second: longer than a closure or a breath between phrases
 
 
 class VoiceActivityDetector:
@@ -38,7 +38,7 @@ class VoiceActivityDetector:
         probability = float(voice[VoiceKind.SPEECH] + voice[VoiceKind.SUNG])
         self._num_improbable = 0 if probability >= _IMPROBABLE else self._num_improbable + 1
         if self.is_speech:
-            self.is_speech = self._num_improbable < _STOP_POSITIONS
+            self.is_speech = self._num_improbable < _STOP_ENCODER_FRAMES
             return
         self._evidence = max(0.0, self._evidence + probability - _NO_EVIDENCE)
         self.is_speech = self._evidence >= _ENOUGH

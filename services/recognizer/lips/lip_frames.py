@@ -15,13 +15,13 @@ from kouxing.shared.phones.events import LipPositions
 
 # FAP frames are due every 20 ms of audio. An encoder frame ends this much earlier, because windows
 # of 25 ms in steps of 20 ms cannot end closer.
-POSITION_LAG_S = 0.005
+ENCODER_FRAME_LAG_S = 0.005
 
 
 class LipFrameStream(Protocol):
     """Predicts the lip positions of one session, segment by segment."""
 
-    def process_position(
+    def process_encoder_frame(
         self, known_s: float, frames: NDArray[np.float32], features: NDArray[np.float32]
     ) -> list[LipPositions]:
         """Return the lip positions that an encoder frame determines.
@@ -56,5 +56,5 @@ class LipFrameModel(Protocol):
 
 def choose_delay(delays_s: Sequence[float], face_delay_s: float) -> float:
     """Choose the longest delay whose lip positions are in time for a face with this delay."""
-    in_time = [delay for delay in delays_s if delay + POSITION_LAG_S <= face_delay_s + 1e-6]
+    in_time = [delay for delay in delays_s if delay + ENCODER_FRAME_LAG_S <= face_delay_s + 1e-6]
     return max(in_time, default=min(delays_s))

@@ -6,7 +6,7 @@ recurrent unit).
 ======== ============================================================ ==================
 symbol   meaning                                                      shape
 ======== ============================================================ ==================
-f        a position: its two log-mel frames, and the encoder's        (160 + encoder's,)
+f        an encoder frame: its two log-mel frames, and the encoder's        (160 + encoder's,)
          features
 x        principal components of f                                    (components,)
 u        relu(U x + b_u)                                              (units,)
@@ -41,7 +41,7 @@ import numpy as np
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_component
-from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.lips.mouth_profile import MouthProfile, parse_mouth_profile
 from kouxing.shared.errors import UserError
@@ -162,7 +162,7 @@ class LipPredictorStream:
         # [h, u] at the last encoder frame
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
-    def process_position(
+    def process_encoder_frame(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
         """Return the lip positions of an encoder frame; see ``LipFrameStream``."""
@@ -233,7 +233,7 @@ def _parse_lip_predictor(archive: Archive) -> LipPredictor:
     num_features, num_components = _read_shape(archive, "projection", 2)
     _, units = _read_shape(archive, "entry_weights", 2)
     num_lips = _read_shape(archive, "lip_weights", 3)[0]
-    if num_features != FRAMES_PER_POSITION * NUM_MELS + load_encoder().num_features:
+    if num_features != FRAMES_PER_ENCODER_FRAME * NUM_MELS + load_encoder().num_features:
         raise ValueError("it was trained with another encoder.npz; run kouxing train lips")
     if num_lips > num_features:
         raise ValueError(f"it reads {num_lips} lip values from {num_features} features")

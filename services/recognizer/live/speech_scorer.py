@@ -19,7 +19,7 @@ from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
 from kouxing.services.recognizer.acoustic.encoder import (
     EncoderOutput,
     EncoderStream,
-    process_positions,
+    process_encoder_frames,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lips.lip_frames import LipFrameStream
@@ -177,10 +177,10 @@ class SpeechScorer:
         """The stream that processes the encoder frames."""
         return self._segmenter.encoder
 
-    def add_encoder_output(self, position: EncoderInput, output: EncoderOutput) -> None:
+    def add_encoder_output(self, encoder_input: EncoderInput, output: EncoderOutput) -> None:
         """Add the output of the encoder at ``next_encoder_input``."""
         self._encoder_queue.popleft()
-        self._detected.extend(self._segmenter.process(position, output))
+        self._detected.extend(self._segmenter.process(encoder_input, output))
 
     def start_scoring(self) -> bool:
         """Hand the speech so far to another thread; return whether more audio may follow now.
@@ -258,12 +258,16 @@ class SpeechScorer:
 def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
     """Find the speech in the queued audio of several sessions, in batches."""
     while waiting := [
-        (scorer, position) for scorer in scorers if (position := scorer.next_encoder_input())
+        (scorer, encoder_input)
+        for scorer in scorers
+        if (encoder_input := scorer.next_encoder_input())
     ]:
         streams = [scorer.encoder for scorer, _ in waiting]
-        outputs = process_positions(streams, [position.mels for _, position in waiting])
-        for (scorer, position), output in zip(waiting, outputs, strict=True):
-            scorer.add_encoder_output(position, output)
+        outputs = process_encoder_frames(
+            streams, [encoder_input.mels for _, encoder_input in waiting]
+        )
+        for (scorer, encoder_input), output in zip(waiting, outputs, strict=True):
+            scorer.add_encoder_output(encoder_input, output)
 
 
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats, FrontEnd
 from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, load_encoder
-from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
@@ -26,13 +26,13 @@ from kouxing.shared.phones.events import LipPositions
 
 PRE_ROLL_S = 0.20  # audio before the detection that counts as speech: weak consonants
 _DETECTION_S = 0.06  # the encoder's look-ahead, and an encoder frame
-# Encoder frames end at odd feature frames, ``POSITION_LAG_S`` before a multiple of 20 ms. Therefore
-# speech starts at an odd frame.
+# Encoder frames end at odd feature frames, ``ENCODER_FRAME_LAG_S`` before a multiple of 20 ms.
+# Therefore speech starts at an odd frame.
 _FIRST_FRAME_PARITY = 1
-_SEEN_AFTER_FRAMES = 2  # frames after speech starts that its first lip positions need
+_RIGHT_CONTEXT_FRAMES = 2  # frames after speech starts that its first lip positions need
 _BLOCK_FRAMES = 4  # frames in a block of the network; blocks start with the speech
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + _DETECTION_S) / HOP_S)
-_MAX_RECENT = (_PRE_ROLL_FRAMES + _BLOCK_FRAMES) // FRAMES_PER_POSITION
+_MAX_RECENT = (_PRE_ROLL_FRAMES + _BLOCK_FRAMES) // FRAMES_PER_ENCODER_FRAME
 
 
 class SpeechStart(Record, frozen=True):
@@ -100,8 +100,10 @@ class SpeechSegmenter:
 
     def accept_waveform(self, samples: Floats) -> Iterator[SpeechItem]:
         """Accept samples, 16 kHz mono, shape (n,); yield the resulting items."""
-        for position in self.encoder_inputs(samples):
-            yield from self.process(position, self.encoder.process_position(position.mels))
+        for encoder_input in self.encoder_inputs(samples):
+            yield from self.process(
+                encoder_input, self.encoder.process_encoder_frame(encoder_input.mels)
+            )
 
     def encoder_inputs(self, samples: Floats) -> Iterator[EncoderInput]:
         """Accept samples, 16 kHz mono, shape (n,); yield the new encoder frames to process."""
@@ -110,10 +112,12 @@ class SpeechSegmenter:
         self._mels = np.concatenate([self._mels, mels])
         if self._features is not None:
             features = np.concatenate([self._features, features])
-        while len(self._mels) >= FRAMES_PER_POSITION:
-            yield EncoderInput(features[:FRAMES_PER_POSITION], self._mels[:FRAMES_PER_POSITION])
-            self._mels = self._mels[FRAMES_PER_POSITION:]
-            features = features[FRAMES_PER_POSITION:]
+        while len(self._mels) >= FRAMES_PER_ENCODER_FRAME:
+            yield EncoderInput(
+                features[:FRAMES_PER_ENCODER_FRAME], self._mels[:FRAMES_PER_ENCODER_FRAME]
+            )
+            self._mels = self._mels[FRAMES_PER_ENCODER_FRAME:]
+            features = features[FRAMES_PER_ENCODER_FRAME:]
         self._features = features
 
     def input_finished(self) -> Iterator[SpeechItem]:
@@ -121,16 +125,16 @@ class SpeechSegmenter:
         if self._is_speaking:
             yield self._end_speech()
 
-    def process(self, position: EncoderInput, output: EncoderOutput) -> Iterator[SpeechItem]:
+    def process(self, encoder_input: EncoderInput, output: EncoderOutput) -> Iterator[SpeechItem]:
         """Start or end speech and predict lips after an encoder frame, given its output."""
-        features = position.features
+        features = encoder_input.features
         self._num_frames += len(features)
         if self._is_speaking:
             yield _frames_of([(features, output)])
         else:
             self._recent.append((features, output))
         self._detector.update(output.voice)
-        self._traits.process_position(output)
+        self._traits.process_encoder_frame(output)
         if self._is_speaking and not self._detector.is_speech:
             yield self._end_speech()
         elif self._is_speaking:
@@ -140,7 +144,7 @@ class SpeechSegmenter:
 
     def _start_speech(self) -> Iterator[SpeechItem]:
         first = self._first_frame()
-        if self._num_frames - first < FRAMES_PER_POSITION:
+        if self._num_frames - first < FRAMES_PER_ENCODER_FRAME:
             return
         self._is_speaking = True
         self._start_frame = None
@@ -150,18 +154,18 @@ class SpeechSegmenter:
         yield SpeechFrames(frames.features[-num_frames:], frames.phones[-num_frames:])
         if self._lip_stream is not None:
             self._lip_stream.reset()
-        newest = self._num_frames - 1 - FRAMES_PER_POSITION * (len(self._recent) - 1)
-        for _, position in self._recent:
-            if newest >= first + _SEEN_AFTER_FRAMES:
-                yield from self._predict_lips(position, newest)
-            newest += FRAMES_PER_POSITION
+        newest = self._num_frames - 1 - FRAMES_PER_ENCODER_FRAME * (len(self._recent) - 1)
+        for _, output in self._recent:
+            if newest >= first + _RIGHT_CONTEXT_FRAMES:
+                yield from self._predict_lips(output, newest)
+            newest += FRAMES_PER_ENCODER_FRAME
         self._recent.clear()
 
     def _first_frame(self) -> int:
         """Return the frame at which speech starts if it is detected now."""
-        oldest = self._num_frames - FRAMES_PER_POSITION * len(self._recent)
+        oldest = self._num_frames - FRAMES_PER_ENCODER_FRAME * len(self._recent)
         first = max(oldest, self._num_frames - _PRE_ROLL_FRAMES)
-        first += (_FIRST_FRAME_PARITY - first) % FRAMES_PER_POSITION
+        first += (_FIRST_FRAME_PARITY - first) % FRAMES_PER_ENCODER_FRAME
         if self._start_frame is not None:
             first -= (first - self._start_frame) % _BLOCK_FRAMES
             first += _BLOCK_FRAMES * (first < oldest)
@@ -171,16 +175,16 @@ class SpeechSegmenter:
         self._is_speaking = False
         return SpeechEnd(self._num_frames)
 
-    def _predict_lips(self, position: EncoderOutput, newest_frame: int) -> list[LipPositions]:
+    def _predict_lips(self, output: EncoderOutput, newest_frame: int) -> list[LipPositions]:
         """Predict from an encoder frame, whose last feature frame is ``newest_frame``."""
         if self._lip_stream is None:
             return []
         known_s = newest_frame * HOP_S + WINDOW_S
-        return self._lip_stream.process_position(known_s, position.frames, position.features)
+        return self._lip_stream.process_encoder_frame(known_s, output.frames, output.features)
 
 
-def _frames_of(positions: Sequence[tuple[Floats, EncoderOutput]]) -> SpeechFrames:
+def _frames_of(recent: Sequence[tuple[Floats, EncoderOutput]]) -> SpeechFrames:
     """Return the feature frames of some encoder frames."""
-    phones = np.array([position.phones for _, position in positions])
-    features = np.concatenate([features for features, _ in positions])
-    return SpeechFrames(features, phones.repeat(FRAMES_PER_POSITION, axis=0))
+    phones = np.array([output.phones for _, output in recent])
+    features = np.concatenate([features for features, _ in recent])
+    return SpeechFrames(features, phones.repeat(FRAMES_PER_ENCODER_FRAME, axis=0))

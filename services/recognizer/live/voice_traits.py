@@ -37,13 +37,15 @@ NUM_TRAITS = 4  # arousal, valence, laughter, breath
 MIN_VOICE = 0.5  # smallest probability of a voice at which arousal and valence count
 
 _FEELING = slice(0, 2)
-_MEAN_POSITIONS, _PRIOR_FEELING = 100, 20  # memory of mean arousal and valence; weight of the prior
-_PRIOR_POSITIONS, _MAX_POSITIONS = 400, 6000  # voice: weight of the prior mean, memory of m
+_FEELING_PRIOR_WEIGHT = 20  # weight of the prior arousal and valence, encoder frames
+_FEELING_MEMORY = 100  # memory of arousal and valence, encoder frames
+_VOICE_PRIOR_WEIGHT = 400  # weight of the prior in m, encoder frames
+_VOICE_MEMORY = 6000  # memory of m, encoder frames
 _DIGITS = 2  # feelings change slowly, so that equal messages compress well
 _EVIDENCE_FRACTION = 0.1  # weight of a new encoder frame
 _START, _STOP = 0.35, 0.15  # evidence at which laughter or breath starts and stops
 _MIN_LAUGHTER = 0.3  # minimum probability of a laugh
-_LAUGH_POSITIONS = 50  # laughter ends after this many encoder frames without a laugh
+_LAUGH_ENCODER_FRAMES = 50  # laughter ends after this many encoder frames without a laugh
 
 
 class VoiceTraits(NamedTuple):
@@ -78,20 +80,18 @@ class VoiceTraitsStream:
         self._mean = self._feeling
         self._num_voiced = 0  # encoder frames with a voice
         self._evidence = [0.0] * (NUM_TRAITS - 2)  # evidence of laughter and of breath
-        self._since_laugh = _LAUGH_POSITIONS  # encoder frames since a laugh
+        self._since_laugh = _LAUGH_ENCODER_FRAMES  # encoder frames since a laugh
 
-    def process_position(self, position: EncoderOutput) -> None:
+    def process_encoder_frame(self, output: EncoderOutput) -> None:
         """Process the next encoder frame."""
         # For so few numbers, lists are faster than arrays.
-        outputs: list[float] = (
-            position.state @ self._readout.weights + self._readout.bias
-        ).tolist()
-        if position.voice[VoiceKind.SPEECH] + position.voice[VoiceKind.SUNG] > MIN_VOICE:
+        outputs: list[float] = (output.state @ self._readout.weights + self._readout.bias).tolist()
+        if output.voice[VoiceKind.SPEECH] + output.voice[VoiceKind.SUNG] > MIN_VOICE:
             self._num_voiced += 1
             feeling = outputs[_FEELING]
-            num_known = min(self._num_voiced + _PRIOR_POSITIONS, _MAX_POSITIONS)
+            num_known = min(self._num_voiced + _VOICE_PRIOR_WEIGHT, _VOICE_MEMORY)
             self._mean = [m + (f - m) / num_known for m, f in zip(self._mean, feeling, strict=True)]
-            gain = 1.0 / min(self._num_voiced + _PRIOR_FEELING, _MEAN_POSITIONS)
+            gain = 1.0 / min(self._num_voiced + _FEELING_PRIOR_WEIGHT, _FEELING_MEMORY)
             self._feeling = [
                 old + gain * (new - old) for old, new in zip(self._feeling, feeling, strict=True)
             ]
@@ -99,7 +99,7 @@ class VoiceTraitsStream:
             old + _EVIDENCE_FRACTION * (new - old)
             for old, new in zip(self._evidence, outputs[2:], strict=True)
         ]
-        is_laugh = position.voice[VoiceKind.LAUGHTER] > _MIN_LAUGHTER
+        is_laugh = output.voice[VoiceKind.LAUGHTER] > _MIN_LAUGHTER
         self._since_laugh = 0 if is_laugh else self._since_laugh + 1
         arousal, valence = (
             round(min(max(value - mean, -1.0), 1.0), _DIGITS)
@@ -110,7 +110,7 @@ class VoiceTraitsStream:
             for evidence, was_on in zip(self._evidence, self.newest[2:], strict=True)
         )
         # the encoder's state contains past laughter for many seconds of silence
-        laughter = laughter and self._since_laugh < _LAUGH_POSITIONS
+        laughter = laughter and self._since_laugh < _LAUGH_ENCODER_FRAMES
         self.newest = VoiceTraits(arousal, valence, laughter, breath)
 
 
