@@ -1,5 +1,7 @@
 """Snapshots of metrics, their page for Prometheus, and the busy load of a loop."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 
@@ -29,8 +31,14 @@ def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
 
 def test_a_heartbeat_with_every_counter_is_readable() -> None:
     metrics = Metrics()
-    names_by_prefix = {"in": MESSAGES, "out": MESSAGES, "dropped": ErrorCode, "event": EventName}
-    for prefix, names in {**names_by_prefix, "refused": ErrorCode}.items():
+    names_by_prefix: dict[str, Iterable[str]] = {
+        "in": MESSAGES,
+        "out": MESSAGES,
+        "dropped": ErrorCode,
+        "event": EventName,
+        "refused": ErrorCode,
+    }
+    for prefix, names in names_by_prefix.items():
         for name in names:
             metrics.count(f"{prefix}_{name}")
     heartbeat = Heartbeat(
