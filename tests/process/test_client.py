@@ -6,6 +6,7 @@ The other end is the product's own, so it checks what the package sends.
 import asyncio
 import os
 import socket
+import threading
 from array import array
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -25,7 +26,9 @@ from kouxing_client import (
     Shapes,
     aio,
     find_key,
+    thread,
 )
+from kouxing_client import client as blocking
 from kouxing_client.base import MAX_LIVE
 from kouxing_client.messages import EndOfFaps, Event
 
@@ -342,4 +345,27 @@ def test_a_session_closes_if_its_opening_is_cancelled(
                 await asyncio.to_thread(wait_until, lambda: control.sessions_of(CloseSession))
 
     asyncio.run(run())
+    assert control.sessions_of(CloseSession) == ["s"]
+
+
+class InterruptedFuture(Future[Any]):
+    """A future whose result the user does not wait for."""
+
+    def result(self, timeout: float | None = None) -> Any:
+        if threading.current_thread() is threading.main_thread():
+            raise KeyboardInterrupt
+        return super().result(timeout)
+
+
+def test_a_session_closes_if_its_opening_is_interrupted(
+    control: FakeControl, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(blocking, "LAST_ANSWER_S", LIMIT_S)
+    with Client(control.address, insecure=True, timeout_s=LIMIT_S) as client:
+        control.is_silent = True
+        with monkeypatch.context() as interrupted:
+            interrupted.setattr(thread, "new_future", InterruptedFuture)
+            with pytest.raises(KeyboardInterrupt):
+                client.open_session("s")
+        control.is_silent = False  # it answers the repeated request
     assert control.sessions_of(CloseSession) == ["s"]

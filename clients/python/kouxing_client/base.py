@@ -63,7 +63,7 @@ class BaseClient:
             key = read_key(key)
         key = None if insecure else key or find_key()
         self._thread = ClientThread(control, key, timeout_s, start_s)
-        self._unused: set[Future[None]] = set()  # cancelled openings, whose session may still open
+        self._unused: set[Future[None]] = set()  # sessions whose opening was interrupted
 
     @property
     def is_closed(self) -> bool:
@@ -75,7 +75,7 @@ class BaseClient:
         return self._thread.submit(lambda core: core.request(kind, session, **fields))
 
     def _close_unused(self, opened: Future[SessionCore]) -> None:
-        """Close a session as soon as it opens, because its opening was cancelled."""
+        """Close a session as soon as it opens, because its opening was interrupted."""
         closed = new_future()
         self._unused.add(closed)
         closed.add_done_callback(self._unused.discard)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import TimeoutError as FutureTimeout
+from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from kouxing_client.base import (
@@ -37,8 +38,14 @@ class Client(BaseClient):
         self.close()
 
     def close(self) -> None:
-        """Close all connections. After a minute, control closes sessions that are still open."""
-        self._thread.close()
+        """Close all connections, and sessions whose opening was interrupted, for example by Ctrl-C.
+
+        After a minute, control closes other sessions that are still open.
+        """
+        try:
+            wait(tuple(self._unused), LAST_ANSWER_S)
+        finally:
+            self._thread.close()
 
     def open_session(self, name: str = "", **options: Unpack[SessionOptions]) -> Session:
         """Open a session, to which this program can send audio.
@@ -46,8 +53,12 @@ class Client(BaseClient):
         If the name is empty, control chooses one. ``SessionOptions`` lists the keywords.
         """
         fields = open_fields(name, options)
-        core = self._thread.submit(lambda core: core.open_session(fields)).result()
-        return Session(self._thread, core, fields)
+        opened = self._thread.submit(lambda core: core.open_session(fields))
+        try:
+            return Session(self._thread, opened.result(), fields)
+        except BaseException:  # also Ctrl-C
+            self._close_unused(opened)
+            raise
 
     def follow(self, name: str = "", *, paced: bool = True) -> Session:
         """Follow a session that another program opened. An empty name selects the newest session.
