@@ -87,14 +87,16 @@ def parse_camera(option: str) -> tuple[str, int]:
 def parse_delay_s(delay_ms: str | float) -> float:
     """Return a delay in seconds.
 
-    Raises ``UserError`` if the value is not a number or is out of range.
+    Raises ``UserError`` if the value is not a number or is out of range. A value between 0 and 1 is
+    out of range, because it is surely in seconds.
     """
     try:
-        delay_s = float(delay_ms) / 1e3
+        number = float(delay_ms)
     except (ValueError, OverflowError):
-        delay_s = -1.0
-    if not 0.0 <= delay_s <= MAX_DELAY_MS / 1e3:
+        number = -1.0
+    if number != 0.0 and not 1.0 <= number <= MAX_DELAY_MS:
         raise UserError(
-            f"the delay {delay_ms!r} is not a number of milliseconds between 0 and {MAX_DELAY_MS:g}"
+            f"the delay {delay_ms!r} is not 0 or a number of milliseconds from 1 to"
+            f" {MAX_DELAY_MS:g}"
         )
-    return delay_s
+    return number / 1e3

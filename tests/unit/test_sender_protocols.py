@@ -171,11 +171,12 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
         ("vmc://?shapes=fap", "vrm or arkit"),
         ("vts://?shapes=vrm", "unknown option"),
         ("vmc://?delay=-1", "milliseconds"),
+        ("vmc://?delay=0.12", "'0.12' is not 0 or a number of milliseconds from 1 to"),
         ("osc://?prefix=kouxing", "start with '/'"),
         (f"osc://?prefix=/{'a' * 64}", "longer than 64"),
         ("vmc://?head=on&only=mouth", "leave out head=on"),
-        ("vmc://127.0.0.1:39539?camera=39539", "program's port 39539"),
-        ("livelink://localhost?camera=0.0.0.0:11111", "program's port 11111"),
+        ("vmc://127.0.0.1:39539?camera=39539", "camera=39539 is the port of the avatar"),
+        ("livelink://localhost?camera=0.0.0.0:11111", "camera=11111 is the port of the avatar"),
     ],
 )
 def test_error_of_an_invalid_address(url: str, reason: str) -> None:

@@ -125,7 +125,7 @@ const CHINESE = {
   "unknown option {name}; use {options}": "没有选项 {name}，可用 {options}",
   "{name} must be {values}": "{name} 必须是 {values}",
   "{name} is longer than {count} characters": "{name} 超过 {count} 个字符",
-  "the delay {delay} is not a number of milliseconds between 0 and {most}": "延迟 {delay} 不是 0 到 {most} 毫秒的数",
+  "the delay {delay} is not 0 or a number of milliseconds from 1 to {most}": "延迟 {delay} 既不是 0，也不是 1 到 {most} 毫秒的数",
 };
 
 // Reasons of control's errors, for texts that are not translated above
