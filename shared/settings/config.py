@@ -148,7 +148,11 @@ Endpoint = Annotated[
     str, AfterValidator(_check_endpoint), ValueHint("an endpoint, tcp://HOST:PORT")
 ]
 BoundEndpoint = Annotated[Endpoint, BindAddress.ENDPOINT]
-Host = Annotated[str, AfterValidator(_check_host), ValueHint("a host name or address")]
+Host = Annotated[
+    str,
+    AfterValidator(_check_host),
+    ValueHint("a host name of at most 190 characters, or an address"),
+]
 BoundHost = Annotated[Host, BindAddress.HOST]
 BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
 InstanceName = Annotated[str, Field(max_length=128), ValueHint("up to 128 characters"), Unique()]

@@ -92,7 +92,10 @@ def test_a_default_may_depend_on_another_key() -> None:
     [
         ("recognizer.num_stable_frames", "many", "an integer from 1 to 20"),
         ("recognizer.num_stable_frames", "2.9", "an integer from 1 to 20"),
-        ("recognizer.advertise", "tcp://here", "a host name or address"),
+        *(
+            ("recognizer.advertise", text, "a host name of at most 190 characters, or an address")
+            for text in ("tcp://here", 191 * "h")
+        ),
         ("recognizer.audio", "tcp://127.0.0.1:99999", "an endpoint, tcp://HOST:PORT"),
         ("recognizer.control", "here", "an endpoint, tcp://HOST:PORT"),
         ("recognizer.insecure", "yes", "true or false"),

@@ -3,10 +3,12 @@
 import socket
 
 import pytest
+from kouxing_client.field_types import MAX_ENDPOINT
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.settings.endpoints import local_address
+from kouxing.shared.settings.endpoints import local_address, with_key
 
+KEY_LENGTH = 40  # characters of a public key
 ROUTES = {"10.77.0.1": "10.77.0.2", "fd77::1": "fd77::2", "192.0.2.1": "10.88.0.2"}
 
 
@@ -39,3 +41,9 @@ def test_advertises_the_address_on_the_way_to_control(
     assert SynthesizerConfig(control=control).advertised_endpoint(bound) == advertised
     monkeypatch.setattr(Probe, "routes", {})
     assert local_address("10.77.0.1") == "127.0.0.1", "a host without network reaches itself"
+
+
+def test_the_longest_host_name_fits_into_a_message() -> None:
+    config = SynthesizerConfig(advertise=190 * "h")
+    endpoint = with_key(config.advertised_endpoint("tcp://0.0.0.0:55710"), KEY_LENGTH * "k")
+    assert len(endpoint) <= MAX_ENDPOINT
