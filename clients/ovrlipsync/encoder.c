@@ -122,12 +122,12 @@ static void add_product(double *out, const double *vector, const float *matrix, 
 static int chosen_delay(void) {
   int chosen = 0;
   for (int i = 0; i < LIPS_DELAYS_SIZE_0; i++) {
-    if (LIPS_DELAYS[i] + LIP_FRAMES_ENCODER_FRAME_LAG_S <= DELAY_S + 1e-6) chosen = i;
+    if (LIPS_DELAYS[i] + LIP_PREDICTION_ENCODER_FRAME_LAG_S <= DELAY_S + 1e-6) chosen = i;
   }
   return chosen;
 }
 
-LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const float *features) {
+LipPositions lip_predictor_process(LipPredictor *predictor, double known_s, const float *features) {
   enum { GATES = LIPS_STATE_BIAS_SIZE_0, ALL_OUTPUTS = LIPS_DELAYS_SIZE_0 * LIPS_NUM_OUTPUTS };
   double inputs[NUM_FEATURES], centered[NUM_FEATURES], from_input[GATES], from_state[GATES], outputs[LIPS_NUM_OUTPUTS];
   double hidden[2 * LIP_WIDTH], *state = hidden, *entered = hidden + LIP_WIDTH;
@@ -152,7 +152,7 @@ LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const fl
   copy(outputs, LIPS_OUTPUT_BIAS + first, LIPS_NUM_OUTPUTS);
   add_product(outputs, inputs, LIPS_LIP_WEIGHTS + first, NUM_FEATURES, LIPS_NUM_OUTPUTS, ALL_OUTPUTS);
   add_product(outputs, hidden, LIPS_OUTPUT_WEIGHTS + first, 2 * LIP_WIDTH, LIPS_NUM_OUTPUTS, ALL_OUTPUTS);
-  LipFrame frame = {.time_s = known_s - LIPS_DELAYS[delay], .delay_s = LIPS_DELAYS[delay]};
+  LipPositions frame = {.time_s = known_s - LIPS_DELAYS[delay], .delay_s = LIPS_DELAYS[delay]};
   for (int i = 0; i < LIPS_COLUMNS_LENGTH; i++) frame.faps[LIPS_COLUMNS[i]] = (float)outputs[i];
   for (int i = 0; i < LIPS_OTHERS_LENGTH; i++) frame.faps[LIPS_OTHERS[i]] = frame.faps[LIPS_ONES[i]];
   frame.closure = sigmoid(outputs[LIPS_CLOSURE]);

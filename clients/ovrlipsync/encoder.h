@@ -22,7 +22,7 @@ typedef struct {
   double time_s, delay_s;
   double faps[NUM_MOUTH_FAPS];
   double closure; /* probability */
-} LipFrame;
+} LipPositions;
 
 typedef struct {
   float state[LIP_WIDTH];
@@ -35,6 +35,6 @@ void log_mel(const float *window, float *bands);
 /* Process the next encoder frame, whose log-mel frames are at the start of the features. */
 void encoder_process(AudioEncoder *encoder);
 /* Return the lip positions that an encoder frame's features determine. */
-LipFrame lip_predictor_process(LipPredictor *predictor, double known_s, const float *features);
+LipPositions lip_predictor_process(LipPredictor *predictor, double known_s, const float *features);
 
 #endif

@@ -208,7 +208,7 @@ static void move_to_rest(double *faps, double amount) {
 }
 
 /* Compute the FAPs of the next lip positions, stabilized and with closures. */
-static void stabilize(Face *face, const LipFrame *frame, double *faps) {
+static void stabilize(Face *face, const LipPositions *frame, double *faps) {
   if (frame->time_s - track_end_s(&face->track) <= LEARNED_MAX_GAP_S) {
     for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
       const double change = frame->faps[i] - face->stable[i];
@@ -243,13 +243,13 @@ static void extend_track(Face *face, double time_s) {
   track_forget_before(&face->track, face->time_s);
   for (; number < face->num_queued && track_end_s(&face->track) < time_s; number++) {
     double faps[NUM_MOUTH_FAPS];
-    const LipFrame *frame = &face->queue[number];
+    const LipPositions *frame = &face->queue[number];
     stabilize(face, frame, faps);
     track_append(&face->track, frame->time_s, faps);
     face->late_s = fmax(0.0, frame->delay_s - DELAY_S);
   }
   face->num_queued -= number;
-  memmove(face->queue, face->queue + number, face->num_queued * sizeof(LipFrame));
+  memmove(face->queue, face->queue + number, face->num_queued * sizeof(LipPositions));
   face->track.hold_s = face->is_speaking ? TRACK_HOLD_S + face->late_s : 0.0;
 }
 
@@ -379,7 +379,7 @@ static void solve_weights(Face *face, const double *right, double *weights) {
 void face_visemes(Face *face, double time_s, float *weights) {
   double faps[SHAPES_NUM_FAPS] = {0}, right[NUM_SHAPES], solution[NUM_SHAPES], sum = 0.0;
   follow_voice(&face->rest, time_s);
-  if (face->has_lip_frames) follow_track(face, time_s);
+  if (face->has_lip_positions) follow_track(face, time_s);
   const double ajar = ajar_amount_at(&face->rest, time_s);
   face->time_s = time_s;
   for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
@@ -410,8 +410,8 @@ void face_init(Face *face) {
   face->rest.duration_s = 1.0;
 }
 
-void face_add_lips(Face *face, const LipFrame *frame) {
-  face->has_lip_frames = true;
+void face_add_lips(Face *face, const LipPositions *frame) {
+  face->has_lip_positions = true;
   if (face->num_queued < MAX_QUEUE) face->queue[face->num_queued++] = *frame;
 }
 

@@ -46,11 +46,11 @@ typedef struct {
 } Rest;
 
 typedef struct {
-  LipFrame queue[MAX_QUEUE]; /* frames that are not due yet */
+  LipPositions queue[MAX_QUEUE]; /* lip positions that are not due yet */
   int num_queued;
   double stable[NUM_MOUTH_FAPS]; /* the last lip positions, stabilized */
   double closing[2];             /* closure fractions of the last two lip positions */
-  bool has_lip_frames, is_speaking;
+  bool has_lip_positions, is_speaking;
   Track track;
   Mouth on_track, mouth; /* the track and the mouth at the last frame */
   Mouth difference;      /* transition to the track */
@@ -60,7 +60,7 @@ typedef struct {
 } Face;
 
 void face_init(Face *face);
-void face_add_lips(Face *face, const LipFrame *frame);
+void face_add_lips(Face *face, const LipPositions *frame);
 void face_change_speech(Face *face, double time_s, bool is_active);
 void face_add_level(Face *face, double time_s, double level_db);
 /* Write the weights of the visemes (NUM_SHAPES,) at a media time, seconds. Times must increase. */

@@ -122,7 +122,7 @@ static void change_speech(Lips *lips, bool is_active, int frame) {
 
 static void predict(Lips *lips, const float *features, int newest_frame) {
   const double known_s = newest_frame * SEGMENTER_HOP_S + SEGMENTER_WINDOW_S;
-  LipFrame frame = lip_predictor_process(&lips->predictor, known_s, features);
+  LipPositions frame = lip_predictor_process(&lips->predictor, known_s, features);
   frame.time_s = whole_samples(frame.time_s);
   frame.delay_s = whole_samples(frame.delay_s);
   if (frame.time_s >= 0.0) face_add_lips(&lips->face, &frame);

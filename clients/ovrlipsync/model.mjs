@@ -8,7 +8,7 @@ import { product } from "../kouxing-lips/engine/lip-predictor.js";
 import { loadModel } from "../kouxing-lips/engine/model.js";
 import { readGraph } from "../kouxing-lips/engine/onnx-file.js";
 
-const MODULES = "closures expressiveness learned lipFrames lips mel resample rest segmenter shapes stream track traits vad".split(" ");
+const MODULES = "closures expressiveness learned lipPrediction lips mel resample rest segmenter shapes stream track traits vad".split(" ");
 const LAYERS = "entry first.ih first.hh second.ih second.hh output".split(" ");
 const ARRAYS = /^(mel\.bands|lips\.(?!projection|entry_weights)|traits\.(weights|bias)|shapes\.oculus)/;
 const TYPES = { Float32Array: "float", Float64Array: "double", Int8Array: "int8_t" };

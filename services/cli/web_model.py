@@ -30,7 +30,7 @@ from kouxing.services.recognizer.acoustic.light import parse_light_model
 from kouxing.services.recognizer.acoustic.load import model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.front_end import resample, slices, vad, whisper_mel
-from kouxing.services.recognizer.lips import lip_frames, lip_predictor
+from kouxing.services.recognizer.lips import lip_prediction, lip_predictor
 from kouxing.services.recognizer.live import live_decoder, speech_segmenter, stream, voice_traits
 from kouxing.services.recognizer.search import frame_search
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
@@ -81,7 +81,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "_CLOSED_FRACTION _EPSILON _UNTRACKED _JITTER_SQUARED",
     ),
     "lips": (lip_predictor, "CLOSURE NUM_OUTPUTS _COLUMNS _ONES _OTHERS"),
-    "lipFrames": (lip_frames, "ENCODER_FRAME_LAG_S"),
+    "lipPrediction": (lip_prediction, "ENCODER_FRAME_LAG_S"),
     "liveDecoder": (live_decoder, "_DEFAULT_CONFIDENCE"),
     "mel": (whisper_mel, "HOP_SAMPLES WINDOW_SAMPLES NUM_MELS FLOOR_BANDS _FLOOR _HANN _EDGES"),
     "modelFile": (model_file, "_LOG_STEP"),

@@ -37,7 +37,7 @@ from kouxing.services.mouth_profiles.lip_tracks import (
     interpolate_track,
     lip_measures,
 )
-from kouxing.services.recognizer.lips.lip_frames import choose_delay
+from kouxing.services.recognizer.lips.lip_prediction import choose_delay
 from kouxing.services.recognizer.lips.lip_predictor import (
     NUM_LIP_FAPS,
     LipPredictor,

@@ -67,8 +67,8 @@ HEAD = fap_slice("head_pitch", "head_roll")
 class ConversationState(Enum):
     """Conversational state, which controls gaze and head motion."""
 
-    LISTENING = "listening"  # or silence
-    ATTENDING = "attending"  # listening to a speaker
+    SILENT = "silent"  # nobody speaks
+    LISTENING = "listening"  # another person speaks
     STARTING = "starting"  # the first second of the session's speech
     SPEAKING = "speaking"
     ENDING = "ending"  # the first moment after the session's speech
@@ -79,8 +79,8 @@ _PAUSES = (ConversationState.ENDING, ConversationState.THINKING)
 _LIVELINESS_IN_PAUSES = 0.3  # factor for the head in pauses
 # fraction of the fixations on the listener
 _ON_LISTENER = {
-    ConversationState.LISTENING: 0.8,
-    ConversationState.ATTENDING: 0.95,
+    ConversationState.SILENT: 0.8,
+    ConversationState.LISTENING: 0.95,
     ConversationState.STARTING: 0.3,
     ConversationState.SPEAKING: 0.88,
     ConversationState.ENDING: 1.0,
@@ -109,7 +109,7 @@ class IdleMotion:
         self._wave_size = size * np.array([_BREATH_SD_DEG, *_HEAD_SD_DEG])[:, None] * DEGREE
         self._liveliness = 1.0
         self._time_s = 0.0
-        self._state = ConversationState.LISTENING
+        self._state = ConversationState.SILENT
         self._blink_s = self._draw_blink(0.0)
         self._blink_slowness = 1.0  # relative to the usual duration
         self._gaze_from = self._gaze_to = np.zeros(2)
@@ -122,7 +122,7 @@ class IdleMotion:
         self,
         faps: NDArray[np.float32],
         time_s: float,
-        state: ConversationState = ConversationState.LISTENING,
+        state: ConversationState = ConversationState.SILENT,
     ) -> None:
         """Add the motion, at a time since the first frame, to FAPs (68,) in place."""
         if state is not self._state:

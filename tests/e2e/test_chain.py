@@ -109,7 +109,7 @@ def test_services_send_the_frames_of_the_chain(
     assert streamed.times == [to_samples(time_s) for time_s, _ in frames]
     np.testing.assert_array_equal(streamed.faps, np.array([faps for _, faps in frames]))
     assert streamed.faps[:, MOUTH].any()
-    assert lip_frames_of(streamed) == [
+    assert lip_positions_of(streamed) == [
         event_to_message(event) for event in pipeline.events if isinstance(event, LipPositions)
     ]
     assert streamed.lips
@@ -130,7 +130,7 @@ def test_services_send_the_frames_of_the_chain(
     ]
 
 
-def lip_frames_of(streamed: StreamedSession) -> list[speech.LipPositions]:
+def lip_positions_of(streamed: StreamedSession) -> list[speech.LipPositions]:
     """Lip positions without session, epoch and sequence."""
     return [
         speech.LipPositions(

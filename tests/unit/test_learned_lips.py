@@ -24,7 +24,7 @@ LIPS_DELAY_S = 0.085
 OPEN_MOUTH = {3: 300.0} | dict.fromkeys((4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58), -200.0)
 
 
-def lip_frame(time_s: float, opening: float = 1.0, closure: float = 0.0) -> LipPositions:
+def lip_positions(time_s: float, opening: float = 1.0, closure: float = 0.0) -> LipPositions:
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
     for fap, value in OPEN_MOUTH.items():
         faps[MOUTH_FAPS.index(fap)] = opening * value
@@ -74,21 +74,23 @@ def at(frames: Sequence[Frame], time_s: float) -> NDArray[np.float32]:
 
 
 def opening_wave(time_s: float) -> LipPositions:
-    return lip_frame(time_s, opening=0.5 - 0.5 * np.cos(2.0 * np.pi * 4.0 * time_s))
+    return lip_positions(time_s, opening=0.5 - 0.5 * np.cos(2.0 * np.pi * 4.0 * time_s))
 
 
 def closing_lips(
     closure: float, begin_s: float = 0.46, end_s: float = 0.54
 ) -> Callable[[float], LipPositions]:
     """Return open lips whose predicted closure is high for some time."""
-    return lambda time_s: lip_frame(time_s, closure=closure if begin_s < time_s < end_s else 0.01)
+    return lambda time_s: lip_positions(
+        time_s, closure=closure if begin_s < time_s < end_s else 0.01
+    )
 
 
-def no_lip_frame(_time_s: float) -> None:
+def no_lip_positions(_time_s: float) -> None:
     return None
 
 
-def test_follows_the_lip_frames() -> None:
+def test_follows_the_lip_positions() -> None:
     face = speaking_face()
     frames = [frame for frame in run(face, 0.0, 2.0, opening_wave) if frame[0] > 0.2]
     expected = [150.0 - 150.0 * np.cos(2.0 * np.pi * 4.0 * time_s) for time_s, _ in frames]
@@ -98,9 +100,9 @@ def test_follows_the_lip_frames() -> None:
 
 def test_lips_stay_ajar_after_speech_and_then_close() -> None:
     face = speaking_face()
-    frames = run(face, 0.0, 1.1, lip_frame)
+    frames = run(face, 0.0, 1.1, lip_positions)
     face.process(SpeechChange(active=False, time_s=1.0))
-    frames += run(face, 1.1, 3.0, no_lip_frame)
+    frames += run(face, 1.1, 3.0, no_lip_positions)
     opening = {time_s: -float(faps[3] + faps[4]) for time_s, faps in frames}
     assert all(120.0 <= opening[time_s] <= 400.0 for time_s in opening if 0.2 < time_s < 1.8)
     assert all(opening[time_s] <= 250.0 for time_s in opening if time_s > 1.15)
@@ -131,10 +133,10 @@ def test_a_phone_that_is_known_too_late_closes_nothing() -> None:
     assert np.abs(shown).max(axis=1).min() > 190.0
 
 
-def test_dynamic_visemes_move_the_mouth_without_lip_frames() -> None:
+def test_dynamic_visemes_move_the_mouth_without_lip_positions() -> None:
     phones = [(0.4, phone("d", 0.35, index=0)), (0.5, phone("a", 0.42, index=1))]
     learned, visemes = (
-        run(speaking_face(lips), 0.0, 0.6, no_lip_frame, phones) for lips in (None, LIPS)
+        run(speaking_face(lips), 0.0, 0.6, no_lip_positions, phones) for lips in (None, LIPS)
     )
     assert values(learned, JAW).max() > 50.0
     assert np.corrcoef(values(learned, JAW), values(visemes, JAW))[0, 1] > 0.99

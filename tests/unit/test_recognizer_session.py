@@ -215,7 +215,7 @@ def test_a_mouth_profile_that_does_not_fit_is_not_used() -> None:
     assert "the mouth profile is not used" in session.mouth_profile_error
 
 
-def test_a_session_gets_the_lip_frames_of_its_mouth_profile() -> None:
+def test_a_session_gets_the_lip_positions_of_its_mouth_profile() -> None:
     profile = MouthProfile(
         scale=np.zeros(15, np.float32),
         offset=np.full(15, 77, np.float32),

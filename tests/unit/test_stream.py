@@ -156,7 +156,7 @@ def test_a_flush_ends_the_speech_and_drops_it() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "before_s"), [(16_000, 0.5), (44_100, 0.51), (48_000, 0.537)])
-def test_lip_frames_are_known_5_ms_before_the_face_frame(rate_hz: int, before_s: float) -> None:
+def test_lip_positions_are_known_5_ms_before_the_face_frame(rate_hz: int, before_s: float) -> None:
     times_s = np.arange(round((before_s + len(SAMPLES) / RATE_HZ) * rate_hz)) / rate_hz
     samples = np.interp(times_s, before_s + np.arange(len(SAMPLES)) / RATE_HZ, SAMPLES, left=0.0)
     stream = LiveStream(model(), sample_rate_hz=rate_hz, **FACE)

@@ -15,7 +15,7 @@ export class LearnedLips {
   #queue = []; // lip positions that are not due yet
   #stable; // the last lip positions, stabilized
   #closing = [0, 0]; // closure fractions of the last two lip positions
-  #hasLipFrames = false;
+  #hasLipPositions = false;
   #isSpeaking = false;
   #track;
   #onTrack; // the track at the last frame
@@ -45,14 +45,14 @@ export class LearnedLips {
     else if (event.type === "phone") for (const phones of [this.#bilabials, this.#labiodentals]) phones.add(event.phone);
     else if (event.type === "lips") {
       this.#queue.push(event);
-      this.#hasLipFrames = true;
+      this.#hasLipPositions = true;
     }
   }
 
   /** Return the FAPs of the mouth at a media time, seconds; times increase. */
   frameAt(timeS) {
     this.#resting.followVoice(timeS);
-    if (this.#hasLipFrames) this.#followTrack(timeS);
+    if (this.#hasLipPositions) this.#followTrack(timeS);
     const ajar = this.#resting.amountAt(timeS);
     this.#timeS = timeS;
     const { AJAR } = this.#model.constants.rest;

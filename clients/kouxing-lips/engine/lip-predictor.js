@@ -22,7 +22,7 @@ export class LipPredictor {
     this.#constants = constants.lips;
     this.#numMouthFaps = mouthFaps.length;
     const delaysS = Array.from(this.#weights.delays.values, (value) => Math.round(1e6 * value) / 1e6);
-    const possibleDelaysS = delaysS.filter((delay) => delay + constants.lipFrames.ENCODER_FRAME_LAG_S <= delayS + 1e-6);
+    const possibleDelaysS = delaysS.filter((delay) => delay + constants.lipPrediction.ENCODER_FRAME_LAG_S <= delayS + 1e-6);
     this.#delayS = possibleDelaysS.at(-1) ?? delaysS[0];
     const { projection, entry_weights, input_weights, state_weights, output_bias } = this.#weights;
     const entry = product(projection, entry_weights); // no activation separates these two layers

@@ -165,7 +165,7 @@ class LipPredictorStream:
     def process_encoder_frame(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
-        """Return the lip positions of an encoder frame; see ``LipFrameStream``."""
+        """Return the lip positions of an encoder frame; see ``LipPositionStream``."""
         outputs = self.step(join_features(frames, features))
         return [
             LipPositions(

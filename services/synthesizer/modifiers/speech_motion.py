@@ -49,7 +49,9 @@ _MAX_EXCESS = 1.2  # difference in prominence of the largest and the weakest nod
 _MIN_NOD_INTERVAL_S, _MIN_BROW_INTERVAL_S = 1.0, 2.5
 _MIN_SIZE = 0.5  # size of the weakest nod, relative to the largest one
 _STARTING_S = 0.9  # duration of speech after a pause
-_ENDING_S, _THINKING_S, _LISTENING_S = 0.2, 0.9, 2.5  # duration of silence
+_ENDING_S = 0.2  # silence after which the state is ENDING
+_THINKING_S = 0.9  # silence after which it is THINKING
+_SILENT_S = 2.5  # silence after which it is SILENT
 _NOD_HOLD_S, _BROW_HOLD_S, _TILT_HOLD_S, _TURN_HOLD_S = 0.14, 0.22, 0.6, 0.7
 _VISIBLE = 1e-4  # degrees, or brow raises
 _FILTER_S, _SLOW_S = 0.08, 0.2  # time constant of each filter pole
@@ -156,10 +158,8 @@ class SpeechMotionModifier:
         if silence_s < _THINKING_S:
             return ConversationState.ENDING
         if self._is_listening:
-            return ConversationState.ATTENDING
-        return (
-            ConversationState.THINKING if silence_s < _LISTENING_S else ConversationState.LISTENING
-        )
+            return ConversationState.LISTENING
+        return ConversationState.THINKING if silence_s < _SILENT_S else ConversationState.SILENT
 
     def _side(self, now_s: float) -> float:
         """Return the direction of a movement, 1 or -1; it depends only on seed and time."""

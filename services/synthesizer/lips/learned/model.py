@@ -107,7 +107,7 @@ class LearnedStream:
         self._newest_s = -np.inf  # time of the newest lip positions
         self._stable = self._neutral  # the last lip positions, stabilized
         self._closing = (0.0, 0.0)  # closure fractions of the last two lip positions
-        self._has_lip_frames = False
+        self._has_lip_positions = False
         self._is_speaking = False
         self._flushed_until_s = -np.inf  # lip positions of earlier audio are ignored
         self._known_s = start_s  # end of the audio on which the newest lip positions depend
@@ -128,7 +128,7 @@ class LearnedStream:
         self._resting.add_event(event)
         match event:
             case LipPositions():
-                self._add_lip_frame(event)
+                self._add_lip_positions(event)
             case Phone():
                 for phones in (self._bilabials, self._labiodentals):
                     phones.add(event)
@@ -136,7 +136,7 @@ class LearnedStream:
                 self._flushed_until_s = -np.inf
                 self._is_speaking = event.active
 
-    def _add_lip_frame(self, frame: LipPositions) -> None:
+    def _add_lip_positions(self, frame: LipPositions) -> None:
         numbers = (frame.time_s, frame.delay_s, frame.closure)
         is_valid = all(map(math.isfinite, numbers)) and (np.abs(frame.faps) < _MAX_FAP).all()
         is_new = frame.time_s > self._newest_s
@@ -145,7 +145,7 @@ class LearnedStream:
         self._queue.append(frame)
         self._newest_s = frame.time_s
         self._known_s = frame.time_s + frame.delay_s
-        self._has_lip_frames = True
+        self._has_lip_positions = True
 
     def flush(self) -> None:
         """Drop the known events and return to rest within 150 ms."""
@@ -163,7 +163,7 @@ class LearnedStream:
         visemes = self._visemes.frame_at(time_s)
         self._tongue = visemes.faps
         self._resting.process_until(time_s)
-        if self._has_lip_frames:
+        if self._has_lip_positions:
             self._update_mouth(time_s)
         else:
             step_s = max(time_s - self._time_s, 1e-3)

@@ -47,7 +47,7 @@ _RELAX_S = 0.12  # closing time while no audio arrives
 _MIN_PAUSE_S = 0.12
 _RANGE_DB = 25.0
 _FADE_DB = 0.2  # decay of the loudest level per level, so that a bang counts only briefly
-_LAST_SOUND_S = 0.03  # silence until this long after a lip frame makes its closure doubtful
+_LAST_SOUND_S = 0.03  # silence until this long after lip positions makes their closure doubtful
 _LIKELY_BEFORE_S, _LIKELY = 0.15, 0.8  # time before a sound, and the probability that counts then
 _DOUBT = 3.0  # log odds
 _ONSET_DB = 10.0  # an onset's minimum level above the background
@@ -125,7 +125,7 @@ class RestingLips:
                 self._sound_s, self._stays_shut = level_s, False
 
     def silence_penalty_at(self, time_s: float, closure: float, phones: float) -> float:
-        """Return the log odds that silence subtracts from a closure at a lip frame's time.
+        """Return the log odds that silence subtracts from a closure at the time of lip positions.
 
         ``closure`` is the predicted probability, and ``phones`` are the log odds that phones add.
         """

@@ -18,7 +18,7 @@ from kouxing.shared.phones.events import LipPositions
 ENCODER_FRAME_LAG_S = 0.005
 
 
-class LipFrameStream(Protocol):
+class LipPositionStream(Protocol):
     """Predicts the lip positions of one session, segment by segment."""
 
     def process_encoder_frame(
@@ -40,14 +40,14 @@ class LipFrameStream(Protocol):
         """Start a new segment of speech."""
 
 
-class LipFrameModel(Protocol):
+class LipPositionModel(Protocol):
     """A trained model, shared by any number of streams."""
 
     @property
     def delays_s(self) -> Sequence[float]:
         """Available delays in seconds, ascending."""
 
-    def create_stream(self, delays_s: Sequence[float]) -> LipFrameStream:
+    def create_stream(self, delays_s: Sequence[float]) -> LipPositionStream:
         """Create a session's stream with some of the delays."""
 
     def with_mouth_profile(self, content: bytes) -> Self:
