@@ -115,11 +115,11 @@ ovrLipSyncResult ovrLipSync_ProcessFrameEx(ovrLipSyncContext context, const void
   Context *found = find(context);
   if (!found || !audioBuffer || sampleCount < 0 || dataType > ovrLipSyncAudioDataType_F32_Stereo) return ovrLipSyncError_InvalidParam;
   if (!pFrame || !pFrame->visemes || pFrame->visemesLength < LIPS_NUM_VISEMES) return ovrLipSyncError_InvalidParam;
-  for (int begin = 0; begin < sampleCount; begin += LIPS_MAX_PIECE) {
-    float piece[LIPS_MAX_PIECE];
-    const int size = sampleCount - begin < LIPS_MAX_PIECE ? sampleCount - begin : LIPS_MAX_PIECE;
-    for (int i = 0; i < size; i++) piece[i] = sample_at(audioBuffer, dataType, begin + i);
-    lips_push(found->lips, piece, size);
+  for (int begin = 0; begin < sampleCount; begin += LIPS_MAX_CHUNK) {
+    float chunk[LIPS_MAX_CHUNK];
+    const int size = sampleCount - begin < LIPS_MAX_CHUNK ? sampleCount - begin : LIPS_MAX_CHUNK;
+    for (int i = 0; i < size; i++) chunk[i] = sample_at(audioBuffer, dataType, begin + i);
+    lips_push(found->lips, chunk, size);
   }
   pFrame->frameNumber = found->num_calls++;
   pFrame->frameDelay = (int)lround(1000.0 * lips_newest(found->lips, pFrame->visemes));

@@ -14,7 +14,7 @@ enum { FRAMES = SEGMENTER_FRAMES_PER_ENCODER_FRAME, MAX_RECENT = SEGMENTER_MAX_R
 typedef struct {
   int up, down, half;
   float *table; /* rows (up, 2 * half) of the filter, one for each phase */
-  float *known; /* (2 * half + LIPS_MAX_PIECE + down / up + 2,) samples */
+  float *known; /* (2 * half + LIPS_MAX_CHUNK + down / up + 2,) samples */
   int num_known;
   int64_t first, num_out; /* number of the first known sample, and of the next output */
 } Resampler;
@@ -62,7 +62,7 @@ static bool resampler_init(Resampler *r, int rate_hz) {
   r->down = rate_hz / common;
   r->half = (int)ceil(RESAMPLE_HALF_WIDTH / lower);
   r->table = malloc(sizeof(float) * r->up * 2 * r->half);
-  r->known = calloc(2 * r->half + LIPS_MAX_PIECE + r->down / r->up + 2, sizeof(float));
+  r->known = calloc(2 * r->half + LIPS_MAX_CHUNK + r->down / r->up + 2, sizeof(float));
   if (!r->table || !r->known) return false;
   for (int phase = 0; phase < r->up; phase++) {
     float *row = r->table + phase * 2 * r->half;

@@ -2,7 +2,7 @@
 #ifndef LIPS_H
 #define LIPS_H
 
-enum { LIPS_NUM_VISEMES = 15, LIPS_MAX_PIECE = 1024 };
+enum { LIPS_NUM_VISEMES = 15, LIPS_MAX_CHUNK = 1024 };
 
 typedef struct Lips Lips;
 
@@ -13,7 +13,7 @@ Lips *lips_create(int rate_hz);
 void lips_destroy(Lips *lips);
 /* Forget the audio so far. */
 void lips_reset(Lips *lips);
-/* Process at most LIPS_MAX_PIECE mono samples in [-1, 1]. */
+/* Process at most LIPS_MAX_CHUNK mono samples in [-1, 1]. */
 void lips_push(Lips *lips, const float *samples, int num_samples);
 /* Write the newest weights (LIPS_NUM_VISEMES,); return the time from them to the end of the audio, seconds. */
 double lips_newest(const Lips *lips, float *weights);

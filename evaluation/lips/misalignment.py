@@ -18,7 +18,7 @@ from kouxing.evaluation.lips.mouths import Mouth
 Array = NDArray[np.float64]
 
 RATE_HZ = 30.0
-_SMOOTHING, _PIECE = 2.0, 240  # frames
+_SMOOTHING, _SEGMENT_FRAMES = 2.0, 240  # frames
 
 
 def misalignment_s(predicted: Mouth, real: Mouth) -> float | None:
@@ -32,8 +32,8 @@ def misalignment_s(predicted: Mouth, real: Mouth) -> float | None:
     ]
     offsets = [
         offset
-        for first in range(0, len(time_s), _PIECE)
-        for offset in match_extrema(*(curve[first : first + _PIECE] for curve in curves))
+        for first in range(0, len(time_s), _SEGMENT_FRAMES)
+        for offset in match_extrema(*(curve[first : first + _SEGMENT_FRAMES] for curve in curves))
     ]
     return float(np.mean(np.abs(offsets))) / RATE_HZ if offsets else None
 

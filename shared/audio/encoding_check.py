@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, audio_file_kind, find_sound_start
 from kouxing.shared.audio.pcm import FULL_SCALE
-from kouxing.shared.audio.sound_formats import NUM_BEGIN_BYTES, audio_file_kind, find_sound_start
 from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]

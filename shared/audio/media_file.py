@@ -9,9 +9,7 @@ from typing import Any, BinaryIO, NamedTuple, cast
 import av
 import numpy as np
 
-from kouxing.shared.audio.pcm import as_floats
-from kouxing.shared.audio.phase_cancellation import PhaseCancellationGuard, Samples
-from kouxing.shared.audio.sound_formats import (
+from kouxing.shared.audio.audio_formats import (
     MAX_OGG_PAGE_BYTES,
     MIN_UNKNOWN_BYTES,
     codec_of_padded_wav,
@@ -22,6 +20,8 @@ from kouxing.shared.audio.sound_formats import (
     unprobed_format,
     why_unreadable,
 )
+from kouxing.shared.audio.pcm import as_floats
+from kouxing.shared.audio.phase_cancellation import PhaseCancellationGuard, Samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import is_interrupted
 

@@ -3,7 +3,7 @@
 import math
 from typing import BinaryIO, Protocol
 
-from kouxing.shared.audio.sound_formats import MIN_UNKNOWN_BYTES
+from kouxing.shared.audio.audio_formats import MIN_UNKNOWN_BYTES
 from kouxing.shared.errors import UserError
 
 _MAX_CHUNK_BYTES = 16 << 20  # limit for pictures and notes between two parts

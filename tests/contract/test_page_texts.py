@@ -11,9 +11,9 @@ PAGE = ROOT / "services" / "gateway" / "page"
 PAGE_TEXTS = PAGE / "gateway-texts.js"
 # The texts of other modules are about messages and samples that the page does not send.
 SOURCES = (
-    *("shared/audio/audio_file.py", "shared/audio/media_file.py", "shared/audio/sound_formats.py"),
+    *("shared/audio/audio_file.py", "shared/audio/media_file.py", "shared/audio/audio_formats.py"),
     *("shared/audio/phase_cancellation.py", "shared/audio/wav_parts.py"),
-    "services/gateway/uploads/sound_upload.py",
+    "services/gateway/uploads/audio_upload.py",
     *("services/gateway/uploads/upload_handler.py", "services/gateway/uploads/mouth_learner.py"),
     "services/gateway/viewers/viewer_handler.py",
     *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),

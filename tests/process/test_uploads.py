@@ -16,9 +16,9 @@ import pytest
 import soundfile
 from aiohttp import web
 
-from kouxing.services.gateway.uploads import sound_upload
+from kouxing.services.gateway.uploads import audio_upload
+from kouxing.services.gateway.uploads.audio_upload import REMARKS_HEADER, AudioUploadHandler
 from kouxing.services.gateway.uploads.mouth_learner import MAX_BYTES, MouthLearner
-from kouxing.services.gateway.uploads.sound_upload import REMARKS_HEADER, SoundUploadHandler
 from kouxing.services.gateway.uploads.upload_handler import UploadHandler
 from kouxing.services.gateway.web.access import AccessPolicy
 from kouxing.services.gateway.web.web_application import make_application
@@ -181,7 +181,7 @@ def media_bytes(suffix: str, channels: np.ndarray) -> bytes:
 async def test_answers_a_file_with_its_sound() -> None:
     six = np.zeros((len(SINE), 6))
     six[:, 2] = SINE  # which browsers would mix into another sound than FFmpeg
-    async with serve(SoundUploadHandler()) as post:
+    async with serve(AudioUploadHandler()) as post:
         status, data, warnings = await post(media_bytes("FLAC", six), "a film.flac")
     assert (status, warnings) == (200, "")
     samples, rate_hz = soundfile.read(io.BytesIO(data))
@@ -191,7 +191,7 @@ async def test_answers_a_file_with_its_sound() -> None:
 
 @async_test
 async def test_a_file_cannot_name_itself_like_a_module_or_a_path() -> None:
-    async with serve(SoundUploadHandler()) as post:
+    async with serve(AudioUploadHandler()) as post:
         for name in ("wave.py", "../../x", "-", "口型.wav"):
             status, _, warnings = await post(media_bytes("WAV", SINE)[:40_000], name)
             assert status == 200
@@ -201,11 +201,11 @@ async def test_a_file_cannot_name_itself_like_a_module_or_a_path() -> None:
 
 @async_test
 async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serve(SoundUploadHandler()) as post:
+    async with serve(AudioUploadHandler()) as post:
         status, data, _ = await post(b'{"error": "no key"}', "a.mp3")
         assert status == 422
         assert b"a.mp3: cannot read audio: this is text, not audio" in data
-        monkeypatch.setattr(sound_upload, "MAX_BYTES", 1000)
+        monkeypatch.setattr(audio_upload, "MAX_BYTES", 1000)
         status, data, _ = await post(media_bytes("WAV", SINE), "a.wav")
         assert status == 413
         assert b"larger than" in data

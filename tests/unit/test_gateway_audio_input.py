@@ -88,12 +88,12 @@ class FakeSession:
         self.num_flushes = 0
         self._frame_bytes = frame_bytes
 
-    def send(self, pcm: bytes, num_frames: int) -> None:
-        assert len(pcm) == self._frame_bytes * num_frames
+    def send(self, pcm: bytes, num_samples: int) -> None:
+        assert len(pcm) == self._frame_bytes * num_samples
         self.pcm += pcm
 
-    def skip(self, num_frames: int) -> None:
-        self.pcm += b"gap" * num_frames
+    def skip(self, num_samples: int) -> None:
+        self.pcm += b"gap" * num_samples
 
     async def flush(self) -> None:
         self.num_flushes += 1

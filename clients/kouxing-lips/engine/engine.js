@@ -79,10 +79,10 @@ export class LipEngine {
   #process(samples) {
     const frames = [];
     for (let begin = 0; begin < samples.length; ) {
-      const piece = samples.subarray(begin, begin + this.#slice.length - this.#numKnown);
-      this.#slice.set(piece, this.#numKnown);
-      this.#numKnown += piece.length;
-      begin += piece.length;
+      const chunk = samples.subarray(begin, begin + this.#slice.length - this.#numKnown);
+      this.#slice.set(chunk, this.#numKnown);
+      this.#numKnown += chunk.length;
+      begin += chunk.length;
       if (this.#numKnown === this.#slice.length) {
         frames.push(...this.#processSlice());
         this.#numKnown = 0;

@@ -4,7 +4,7 @@ import { join } from "./math.js";
 import { ProductMemory, alignedBytes } from "./products.js";
 
 const LANES = 4; // taps that a product processes together
-const PIECE_S = 0.1; // longer audio is processed in pieces
+const CHUNK_S = 0.1; // longer audio is processed in chunks
 const MIN_RATE_HZ = 8_000;
 const MAX_RATE_HZ = 192_000; // limit of browsers; the server accepts up to 48 kHz
 
@@ -19,7 +19,7 @@ export class Resampler {
   #out;
   #half;
   #numKnown;
-  #maxPiece; // samples
+  #maxChunk; // samples
   #first; // number of the first known sample
   #numIn = 0;
   #numOut = 0;
@@ -37,10 +37,10 @@ export class Resampler {
     this.#half = Math.ceil(c.HALF_WIDTH / lower);
     const rows = filterRows(this.#up, this.#half, lower * c.CUTOFF, c.KAISER_BETA);
     this.#numTaps = Math.ceil((2 * this.#half) / LANES) * LANES;
-    this.#maxPiece = Math.ceil(PIECE_S * rateHz);
-    const numOut = Math.ceil((this.#maxPiece * this.#up) / this.#down) + 1;
-    const numKept = 2 * this.#half + Math.ceil(this.#down / this.#up); // between pieces
-    const sizes = [this.#up * this.#numTaps, numKept + this.#maxPiece, numOut];
+    this.#maxChunk = Math.ceil(CHUNK_S * rateHz);
+    const numOut = Math.ceil((this.#maxChunk * this.#up) / this.#down) + 1;
+    const numKept = 2 * this.#half + Math.ceil(this.#down / this.#up); // between chunks
+    const sizes = [this.#up * this.#numTaps, numKept + this.#maxChunk, numOut];
     this.#memory = new ProductMemory(sizes.reduce((sum, size) => sum + alignedBytes(Float32Array, size), 0));
     [this.#table, this.#known, this.#out] = sizes.map((size) => this.#memory.array(Float32Array, size));
     rows.forEach((row, phase) => this.#table.set(row, phase * this.#numTaps));
@@ -64,14 +64,14 @@ export class Resampler {
   }
 
   #resample(samples) {
-    const pieces = [];
-    for (let begin = 0; begin < samples.length; begin += this.#maxPiece) {
-      pieces.push(this.#resamplePiece(samples.subarray(begin, begin + this.#maxPiece)));
+    const chunks = [];
+    for (let begin = 0; begin < samples.length; begin += this.#maxChunk) {
+      chunks.push(this.#resampleChunk(samples.subarray(begin, begin + this.#maxChunk)));
     }
-    return join(pieces);
+    return join(chunks);
   }
 
-  #resamplePiece(samples) {
+  #resampleChunk(samples) {
     const [up, down, known, out] = [this.#up, this.#down, this.#known, this.#out];
     known.set(samples, this.#numKnown);
     this.#numKnown += samples.length;

@@ -79,11 +79,11 @@ class AsyncSession(BaseSession):
 
     async def push(self, audio: Any) -> None:
         """Send audio, as ``Session.push``."""
-        for pcm, num_frames in self._chunks(audio):
+        for pcm, num_samples in self._chunks(audio):
             await self._signal.wait_async(self._can_push)
             if not self._has_room():
                 self._check()
-            self._add(pcm, num_frames)
+            self._add(pcm, num_samples)
 
     async def finish(self) -> None:
         """End the audio, as ``Session.finish``."""

@@ -118,7 +118,7 @@ class AudioStream:
         self.acknowledged = 0  # number of the newest message that the recognizer has
         self.round_trip_ms: int | None = None  # twice the shortest time to an acknowledgement
         self._sample_rate_hz = sample_rate_hz
-        self._num_frames = 0  # in all chunks
+        self._num_samples = 0  # in all chunks
         self._kept: deque[Fields] = deque(maxlen=MAX_KEPT)
         self._next = 1  # number of the next message for the socket
         self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED)  # sequence and time
@@ -129,7 +129,7 @@ class AudioStream:
     @property
     def media_time(self) -> int:
         """Media time of the next chunk, samples at 16 kHz."""
-        return self._num_frames * MEDIA_RATE_HZ // self._sample_rate_hz
+        return self._num_samples * MEDIA_RATE_HZ // self._sample_rate_hz
 
     @property
     def num_unacknowledged(self) -> int:
@@ -145,15 +145,15 @@ class AudioStream:
             return default
         return min(self.round_trip_ms, default)
 
-    def add(self, fields: Fields, num_frames: int, now_s: float) -> None:
-        """Add a chunk of ``num_frames`` samples per channel."""
+    def add(self, fields: Fields, num_samples: int, now_s: float) -> None:
+        """Add a chunk of ``num_samples`` samples per channel."""
         if self.acknowledged == self.sequence:
             self._progress_s = now_s
         self.sequence += 1
         numbered = {**fields, "sequence": self.sequence, "media_time": self.media_time}
         self._kept.append({**numbered, "acknowledge": True})
         self._sent_s.append((self.sequence, now_s))
-        self._num_frames += num_frames
+        self._num_samples += num_samples
         num_acknowledged = self.acknowledged - self._kept[0]["sequence"] + 1
         if num_acknowledged > 0:
             newest = self._kept[min(num_acknowledged, len(self._kept)) - 1]
@@ -161,9 +161,9 @@ class AudioStream:
             while self._kept[0]["media_time"] < oldest:
                 self._kept.popleft()
 
-    def skip(self, num_frames: int) -> None:
+    def skip(self, num_samples: int) -> None:
         """Advance media time without audio."""
-        self._num_frames += num_frames
+        self._num_samples += num_samples
 
     def unsent(self) -> Iterator[Fields]:
         """Yield messages for the socket; requesting the next one marks the last one as sent."""

@@ -135,13 +135,13 @@ class BaseSession:
         KouxingError
             If the audio or the session has ended, or another program opened the session.
         """
-        self._num_frames(pcm)
+        self._num_samples(pcm)
         self._check_unfinished()
         self._check_open()
         if not self._has_room():
             return False
         for chunk in split(pcm, CHUNK_BYTES):
-            self._add(chunk, self._num_frames(chunk))
+            self._add(chunk, self._num_samples(chunk))
         return True
 
     def skip(self, num_frames: int) -> None:
@@ -177,13 +177,13 @@ class BaseSession:
                 "another program opened this session; only that program can send audio"
             )
 
-    def _num_frames(self, pcm: bytes) -> int:
-        num_frames, rest = divmod(len(pcm), self._frame_bytes)
+    def _num_samples(self, pcm: bytes) -> int:
+        num_samples, rest = divmod(len(pcm), self._frame_bytes)
         if rest:
             raise KouxingError(
                 f"{len(pcm)} bytes are not complete samples; use push, which accepts any length"
             )
-        return num_frames
+        return num_samples
 
     def _chunks(self, audio: Any) -> Iterator[tuple[bytes, int]]:
         """Yield messages of PCM and their number of samples per channel."""
@@ -196,12 +196,12 @@ class BaseSession:
         end = len(pcm) // self._frame_bytes * self._frame_bytes
         pcm, self._partial_sample = pcm[:end], pcm[end:]
         for chunk in split(pcm, CHUNK_BYTES):
-            yield chunk, self._num_frames(chunk)
+            yield chunk, self._num_samples(chunk)
 
-    def _add(self, pcm: bytes, num_frames: int) -> None:
+    def _add(self, pcm: bytes, num_samples: int) -> None:
         self._check_open()
         self._num_added += 1
-        self._thread.call(lambda: self._core.add_audio(num_frames, {"pcm": pcm}))
+        self._thread.call(lambda: self._core.add_audio(num_samples, {"pcm": pcm}))
 
     def _finish(self) -> None:
         self._check_sender()

@@ -111,14 +111,14 @@ class Session(BaseSession):
             If the audio is not valid or has ended, the session has ended, another program opened
             it, or the wait timed out.
         """
-        for pcm, num_frames in self._chunks(audio):
+        for pcm, num_samples in self._chunks(audio):
             if not self._signal.wait(self._can_push, timeout_s):
                 raise KouxingError(
                     f"the recognizer has accepted no audio for {timeout_s:g} s; check that it runs"
                 )
             if not self._has_room():
                 self._check()
-            self._add(pcm, num_frames)
+            self._add(pcm, num_samples)
 
     def finish(self) -> None:
         """End the audio. Results arrive until the last frame. Raises the errors of ``push``."""

@@ -224,11 +224,11 @@ class SessionCore:
         audio = self.endpoints["audio"]
         self._audio = self.sockets.connect(audio, self._on_answer, queue=AUDIO_QUEUE)
 
-    def add_audio(self, num_frames: int, fields: Fields) -> None:
-        """Send a chunk of ``num_frames`` samples per channel."""
+    def add_audio(self, num_samples: int, fields: Fields) -> None:
+        """Send a chunk of ``num_samples`` samples per channel."""
         if self.stream is not None and not self.is_over:
             fields = {"token": self.token, **fields}
-            self.stream.add(fields, num_frames, self.sockets.now_s)
+            self.stream.add(fields, num_samples, self.sockets.now_s)
             self.send_audio()
 
     def send_audio(self) -> None:

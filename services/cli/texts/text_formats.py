@@ -13,7 +13,7 @@ from itertools import groupby, pairwise
 from typing import NamedTuple
 
 from kouxing.services.cli.texts.text_columns import remove_columns
-from kouxing.shared.audio.sound_formats import audio_file_kind
+from kouxing.shared.audio.audio_formats import audio_file_kind
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import parse_json
 

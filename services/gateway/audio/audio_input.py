@@ -63,23 +63,23 @@ class AudioInput:
         await self._pass_on(received, message=received if self._is_first else pcm)
 
     async def _pass_on(self, pcm: bytes, message: bytes = b"") -> None:
-        num_frames = len(pcm) // self._format.frame_bytes
-        end = num_frames * self._format.frame_bytes
+        num_samples = len(pcm) // self._format.frame_bytes
+        end = num_samples * self._format.frame_bytes
         pcm, self._incomplete = pcm[:end], pcm[end:]
         self._format.check_samples(pcm, is_first=self._is_first)
         if self._encoding is not None:
             self._encoding.check(message)
         self._is_first = False
-        duration_s = num_frames / self._format.sample_rate_hz
+        duration_s = num_samples / self._format.sample_rate_hz
         if self._is_ahead or duration_s > MAX_LIVE_S or not self._queue.is_empty:
             await self._queue.put(pcm)
         else:
-            self._session.send(pcm, num_frames)
+            self._session.send(pcm, num_samples)
             await self._rate_limit.wait(duration_s)
 
-    def skip(self, num_frames: int) -> None:
+    def skip(self, num_samples: int) -> None:
         """Skip audio of the client after its audio so far: media time advances."""
-        self._queue.skip(num_frames)
+        self._queue.skip(num_samples)
 
     async def flush(self) -> None:
         """Interrupt: drop queued audio, and audio whose face is not shown yet."""
@@ -136,9 +136,9 @@ class RealTimeQueue:
         self._queued += pcm
         self._not_empty.set()
 
-    def skip(self, num_frames: int) -> None:
+    def skip(self, num_samples: int) -> None:
         """Skip audio after the queued audio."""
-        self._gaps.append((self._num_forwarded + len(self._queued), num_frames))
+        self._gaps.append((self._num_forwarded + len(self._queued), num_samples))
         self._skip_due()
 
     def clear(self) -> None:
@@ -162,15 +162,15 @@ class RealTimeQueue:
             end = self._chunk_bytes
             if self._gaps:
                 end = min(end, self._gaps[0][0] - self._num_forwarded)
-            piece = bytes(self._queued[:end])
+            chunk = bytes(self._queued[:end])
             del self._queued[:end]
-            self._num_forwarded += len(piece)
+            self._num_forwarded += len(chunk)
             try:
-                self._session.send(piece, len(piece) // self._format.frame_bytes)
+                self._session.send(chunk, len(chunk) // self._format.frame_bytes)
                 self._skip_due()
             except KouxingError:  # the session is over; its errors are reported elsewhere
                 self.clear()
-            due_s += len(piece) / self._format.frame_bytes / self._format.sample_rate_hz
+            due_s += len(chunk) / self._format.frame_bytes / self._format.sample_rate_hz
             await asyncio.sleep(due_s - loop.time())
 
     def _skip_due(self) -> None:

@@ -31,18 +31,18 @@ class AudioSession:
         self._warn = warn
         self._frames_ended = asyncio.Event()
 
-    def send(self, pcm: bytes, num_frames: int) -> None:
-        """Send ``num_frames`` samples per channel; drop them if the recognizer is too slow.
+    def send(self, pcm: bytes, num_samples: int) -> None:
+        """Send ``num_samples`` samples per channel; drop them if the recognizer is too slow.
 
         Raises ``KouxingError`` if the session is over.
         """
         if not self.is_closed and not self._session.try_push(pcm):
-            self.skip(num_frames)
+            self.skip(num_samples)
             self._warn("slow_recognizer", "dropped audio: the recognizer is too slow", self.name)
 
-    def skip(self, num_frames: int) -> None:
+    def skip(self, num_samples: int) -> None:
         """Skip audio: media time advances."""
-        self._session.skip(num_frames)
+        self._session.skip(num_samples)
 
     async def flush(self) -> None:
         """Interrupt: drop audio whose face is not shown yet."""

@@ -6,7 +6,7 @@ import numpy as np
 from kouxing_client.audio import MAX_FLOAT, SAMPLE_BYTES
 from msgspec import Struct
 
-from kouxing.shared.audio.sound_formats import audio_file_kind
+from kouxing.shared.audio.audio_formats import audio_file_kind
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import parse_json
 from kouxing.shared.wire.session import Encoding, NumChannels, SampleRate

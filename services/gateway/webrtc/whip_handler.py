@@ -154,9 +154,9 @@ class WhipHandler:
         async with stack:
             LOG.info("a WebRTC client is streaming", extra={"session": session.name})
             try:
-                async for num_lost, pcm, num_frames in peer.receive_audio():
+                async for num_lost, pcm, num_samples in peer.receive_audio():
                     session.skip(num_lost)
-                    session.send(pcm, num_frames)
+                    session.send(pcm, num_samples)
                     for error in session.take_errors():
                         self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
             except KouxingError as error:  # the session is over

@@ -51,23 +51,23 @@ class SliceMeter:
     def __init__(self, start: int = 0) -> None:
         self.media_time = start  # end of the audio so far
         self._start = start
-        self._pieces: list[NDArray[np.float32]] = []  # audio of the incomplete slice
+        self._chunks: list[NDArray[np.float32]] = []  # audio of the incomplete slice
         self._pitch = PitchTracker(start // SLICE)
 
     def accept_waveform(
         self, samples: NDArray[np.float32]
     ) -> Iterator[tuple[NDArray[np.float32], Progress | None]]:
         """Accept samples, (n,); yield chunks, each with the slice that ends there."""
-        for piece in split_slices(samples, self.media_time - self._start):
-            self.media_time += len(piece)
-            self._pieces.append(piece)
+        for chunk in split_slices(samples, self.media_time - self._start):
+            self.media_time += len(chunk)
+            self._chunks.append(chunk)
             if (self.media_time - self._start) % SLICE:
-                yield piece, None
+                yield chunk, None
                 continue
-            newest = np.concatenate(self._pieces)
-            self._pieces.clear()
+            newest = np.concatenate(self._chunks)
+            self._chunks.clear()
             yield (
-                piece,
+                chunk,
                 Progress(
                     time_s=to_seconds(self.media_time),
                     level_db=level_db(newest),

@@ -11,7 +11,7 @@ from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.sessions.audio_queue import AudioQueue
 from kouxing.services.recognizer.sessions.resumption import Chunk, ReplayWindow, ResumeFilter
-from kouxing.services.recognizer.sessions.sound_packets import SoundPackets
+from kouxing.services.recognizer.sessions.sound_messages import SoundMessages
 from kouxing.services.recognizer.sessions.synthesizer_link import SynthesizerLink
 from kouxing.shared.audio.encoding_check import EncodingCheck
 from kouxing.shared.audio.pcm import decode_pcm
@@ -109,7 +109,7 @@ class RecognizerSession:
         self.speech_time = start.speech_time  # start of the current speech; None: silence
         self.is_laughing = False  # whether the speaker laughs
         self._published_acoustic = AcousticModelName.FULL
-        self._sound_packets = SoundPackets(face_delay_s)
+        self._sound_messages = SoundMessages(face_delay_s)
         is_checked = opening.encoding == "s16le" and start.epoch <= 1
         self._encoding = EncodingCheck(opening.num_channels) if is_checked else None
         self.output_sequence = 0
@@ -282,7 +282,7 @@ class RecognizerSession:
             if isinstance(result, Phone | LipPositions | Speech):
                 yield self._number(result)
             else:
-                yield from map(self._number, self._sound_packets.add(result))
+                yield from map(self._number, self._sound_messages.add(result))
 
     def acoustic_message(self, results: Sequence[SpeechMessage | Waveform]) -> Acoustic | None:
         """Return a message about the acoustic model if it has changed or speech starts."""

@@ -10,14 +10,14 @@ from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.phones.events import Waveform
 from kouxing.shared.wire.speech import AudioState, Progress
 
-PACKET_S = 0.04  # duration of a message; less if the face has a shorter delay
+MESSAGE_S = 0.04  # duration of a message; less if the face has a shorter delay
 
 
-class SoundPackets:
-    """Buffers audio up to the length of a packet, but no longer than ``face_delay_s``."""
+class SoundMessages:
+    """Buffers audio up to the length of a message, but no longer than ``face_delay_s``."""
 
     def __init__(self, face_delay_s: float) -> None:
-        self._num_joined = round(min(PACKET_S, face_delay_s) * MEDIA_RATE_HZ)  # samples
+        self._num_joined = round(min(MESSAGE_S, face_delay_s) * MEDIA_RATE_HZ)  # samples
         self._start = 0  # media time, samples
         self._samples = np.empty(0, np.float32)
 

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from aiohttp import web
 
-from kouxing.services.gateway.uploads import sound_decoder
+from kouxing.services.gateway.uploads import audio_decoder
 from kouxing.services.gateway.uploads.upload_handler import (
     UPLOAD_LIMIT_S,
     UploadHandler,
@@ -26,11 +26,11 @@ MAX_BYTES = 200 << 20
 DECODING_LIMIT_S = 60.0
 REMARKS_HEADER = "Kouxing-Remarks"
 _NOT_IN_NAMES = re.compile(r"[^\w.() -]")
-_MAX_NAME = 80
-_PIECE_BYTES = 1 << 16
+_MAX_NAME_CHARACTERS = 80
+_READ_BYTES = 1 << 16
 
 
-class SoundUploadHandler(UploadHandler):
+class AudioUploadHandler(UploadHandler):
     """Decodes an uploaded file and answers with its sound."""
 
     busy_text = "another file is being read; try again in a few seconds"
@@ -44,7 +44,9 @@ class SoundUploadHandler(UploadHandler):
             return upload_error(408, "reading the file took too long; use a shorter file")
 
     async def _answer_in(self, folder: Path, request: web.Request) -> web.StreamResponse:
-        name = _NOT_IN_NAMES.sub("_", request.query.get("name", ""))[-_MAX_NAME:].lstrip("-. ")
+        name = _NOT_IN_NAMES.sub("_", request.query.get("name", ""))[-_MAX_NAME_CHARACTERS:].lstrip(
+            "-. "
+        )
         source, target = folder / "in" / (name or "file"), folder / "out.wav"
         source.parent.mkdir()
         if not await asyncio.wait_for(_store(request, source), UPLOAD_LIMIT_S):
@@ -54,7 +56,7 @@ class SoundUploadHandler(UploadHandler):
             )
         # Python imports modules from the working folder, which must therefore not be the file's
         # folder.
-        command = (sys.executable, "-m", sound_decoder.__name__, str(source))
+        command = (sys.executable, "-m", audio_decoder.__name__, str(source))
         with target.open("wb") as output:
             status, _, messages = await self.run(request, command, DECODING_LIMIT_S, output=output)
         messages = messages.replace(f"{source.parent}/", "")
@@ -68,8 +70,8 @@ class SoundUploadHandler(UploadHandler):
         response.content_length = target.stat().st_size
         await response.prepare(request)
         with target.open("rb") as file:
-            while piece := file.read(_PIECE_BYTES):
-                await response.write(piece)
+            while data := file.read(_READ_BYTES):
+                await response.write(data)
         return response
 
 
@@ -77,9 +79,9 @@ async def _store(request: web.Request, path: Path) -> bool:
     """Write the request's body to a file; return False if it is too large."""
     num_bytes = 0
     with path.open("wb") as file:
-        async for piece in request.content.iter_chunked(_PIECE_BYTES):
-            num_bytes += len(piece)
+        async for data in request.content.iter_chunked(_READ_BYTES):
+            num_bytes += len(data)
             if num_bytes > MAX_BYTES:
                 return False
-            file.write(piece)
+            file.write(data)
     return True
