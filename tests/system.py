@@ -110,7 +110,7 @@ def headless_settings(folder: Path) -> dict[str, str]:
     return {
         "KOUXING_DRIVER_VIEW": "none",
         "KOUXING_DRIVER_OUT": str(folder),
-        "KOUXING_DRIVER_SIZE": "320x240",
+        "KOUXING_DRIVER_SIZE": "160x120",
     }
 
 

@@ -72,8 +72,9 @@ def test_frames_and_first_phones_equal_the_servers(models: Path, file: Path) -> 
 
 @pytest.mark.parametrize("file", FILES[:2], ids=lambda file: file.stem)
 def test_frames_and_final_phones_equal_the_servers(models: Path, file: Path) -> None:
-    output = package_output(models, samples_of_file(file), phones="final")
-    check_frames_and_phones(output, server_events(samples_of_file(file), "blocks"))
+    samples = samples_of_file(file)[:48_000]  # the package's block network is slow
+    output = package_output(models, samples, phones="final")
+    check_frames_and_phones(output, server_events(samples, "blocks"))
 
 
 def check_frames_and_phones(output: dict[str, Any], events: Sequence[SoundEvent]) -> None:
