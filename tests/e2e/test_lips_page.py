@@ -60,26 +60,72 @@ def open_demo(browser: Browser, origin: str) -> None:
     )
 
 
-def test_the_microphone_moves_a_face(browser: Browser, site: Path) -> None:
-    with shown_demo(browser, site):
-        browser.click("microphone")
-        browser.wait_for("window.opened > 200")
-        browser.wait_for("document.getElementById('phones').textContent.split(' ').length > 4")
-        browser.wait_for(f"{FACE}.shown && {FACE}.shown[2] > 20")
-        browser.click("microphone")
-        assert browser.evaluate("document.getElementById('microphone').ariaPressed") == "false"
-        browser.wait_for(f"Math.abs({FACE}.shown[2]) < 1")  # the face returns to rest
-        assert not [text for text in browser.page_errors if "GL Driver" not in text]
-
-
-def test_the_page_fits_on_a_phone(browser: Browser, site: Path) -> None:
+@pytest.fixture(scope="module")
+def demo(browser: Browser, site: Path) -> Iterator[Browser]:
+    """The browser with a demo page for the next tests: loading one takes long."""
     with serve_folder(site) as origin:
-        browser.resize(*SIZE_PX, mobile=True)
-        try:
-            open_demo(browser, origin)
-            assert browser.evaluate("[innerWidth, innerHeight]") == [*SIZE_PX]
-        finally:
-            browser.resize(*SIZE_PX)
+        open_demo(browser, origin)
+        yield browser
+
+
+def test_calls_without_sound_and_replaced_sources_are_reported(demo: Browser) -> None:
+    text = "no sound is open; call open() or listenTo() first"
+    demo.evaluate("window.lips.push(new Float32Array(320)); 1")
+    demo.wait_for(f"window.notices.includes('{text}')")
+    assert demo.evaluate("window.lips.finish().catch(({ message }) => message)") == text
+    result = demo.evaluate(
+        "Promise.allSettled([window.lips.open(16000), window.lips.open(48000)])"
+        ".then((all) => all.map(({ status, reason }) => reason?.name ?? status))"
+    )
+    assert result == ["AbortError", "fulfilled"]
+
+
+def test_the_page_fits_on_a_phone(demo: Browser) -> None:
+    demo.resize(*SIZE_PX, mobile=True)
+    demo.evaluate("new Promise((done) => requestAnimationFrame(() => done(1)))")
+    size = demo.evaluate("[innerWidth, innerHeight]")
+    demo.resize(*SIZE_PX)
+    assert size == [*SIZE_PX]
+
+
+def test_the_microphone_moves_a_face(demo: Browser) -> None:
+    demo.click("microphone")
+    demo.wait_for("window.opened > 200")
+    demo.wait_for("document.getElementById('phones').textContent.split(' ').length > 4")
+    demo.wait_for(f"{FACE}.shown && {FACE}.shown[2] > 20")
+    demo.click("microphone")
+    assert demo.evaluate("document.getElementById('microphone').ariaPressed") == "false"
+    demo.wait_for(f"Math.abs({FACE}.shown[2]) < 1")  # the face returns to rest
+    assert not [text for text in demo.page_errors if "GL Driver" not in text]
+
+
+def test_notices_about_the_microphone_and_the_tab(demo: Browser) -> None:
+    def wait_for_notice(start: str) -> None:
+        demo.wait_for(f"window.notices.some((text) => text.startsWith('{start}'))")
+
+    def set_hidden(is_hidden: str) -> None:
+        demo.evaluate(
+            f"Object.defineProperty(document, 'hidden', {{ value: {is_hidden}, writable: true }});"
+            "document.dispatchEvent(new Event('visibilitychange')); 1"
+        )
+
+    demo.evaluate(
+        "window.opened = 0;"
+        "MediaStreamTrack.prototype.getSettings = function () {"
+        " window.track = this; return { sampleRate: 8000 }; }; 1"
+    )
+    demo.click("microphone")
+    wait_for_notice("the microphone sends 8 kHz")
+    demo.wait_for("window.opened > 200")
+    set_hidden("true")
+    wait_for_notice("the tab is in the background")
+    demo.evaluate("window.lips.context.suspend().then(() => 1)")  # as phones do
+    set_hidden("false")
+    demo.wait_for("window.lips.context.state === 'running'")
+    demo.evaluate("window.opened = 0")
+    demo.wait_for("window.opened > 200")
+    demo.evaluate("window.track.dispatchEvent(new Event('ended'))")
+    wait_for_notice("the microphone was unplugged")
 
 
 def test_the_page_works_offline_after_the_first_visit(browser: Browser, site: Path) -> None:
@@ -167,47 +213,3 @@ def test_each_problem_gives_a_sentence(browser: Browser, site: Path) -> None:
         )
         browser.click("microphone")
         wait_for_note("open it by https")
-
-
-def test_notices_about_the_microphone_and_the_tab(browser: Browser, site: Path) -> None:
-    def wait_for_notice(start: str) -> None:
-        browser.wait_for(f"window.notices.some((text) => text.startsWith('{start}'))")
-
-    def set_hidden(is_hidden: str) -> None:
-        browser.evaluate(
-            f"Object.defineProperty(document, 'hidden', {{ value: {is_hidden}, writable: true }});"
-            "document.dispatchEvent(new Event('visibilitychange')); 1"
-        )
-
-    with shown_demo(browser, site):
-        browser.evaluate(
-            "MediaStreamTrack.prototype.getSettings = function () {"
-            " window.track = this; return { sampleRate: 8000 }; }; 1"
-        )
-        browser.click("microphone")
-        wait_for_notice("the microphone sends 8 kHz")
-        browser.wait_for("window.opened > 200")
-        set_hidden("true")
-        wait_for_notice("the tab is in the background")
-        browser.evaluate("window.lips.context.suspend().then(() => 1)")  # as phones do
-        set_hidden("false")
-        browser.wait_for("window.lips.context.state === 'running'")
-        browser.evaluate("window.opened = 0")
-        browser.wait_for("window.opened > 200")
-        browser.evaluate("window.track.dispatchEvent(new Event('ended'))")
-        wait_for_notice("the microphone was unplugged")
-
-
-def test_calls_without_sound_and_replaced_sources_are_reported(
-    browser: Browser, site: Path
-) -> None:
-    text = "no sound is open; call open() or listenTo() first"
-    with shown_demo(browser, site):
-        browser.evaluate("window.lips.push(new Float32Array(320)); 1")
-        browser.wait_for(f"window.notices.includes('{text}')")
-        assert browser.evaluate("window.lips.finish().catch(({ message }) => message)") == text
-        result = browser.evaluate(
-            "Promise.allSettled([window.lips.open(16000), window.lips.open(48000)])"
-            ".then((all) => all.map(({ status, reason }) => reason?.name ?? status))"
-        )
-        assert result == ["AbortError", "fulfilled"]
