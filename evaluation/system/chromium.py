@@ -51,6 +51,8 @@ class Chromium:
                 *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
                 *("--no-first-run", "--disable-background-networking", "--disable-sync"),
                 "--disable-component-update",
+                # pages of the address bar, which need more time than the rest of the start
+                "--disable-features=WebUIOmniboxPopup,WebUIOmniboxAimPopup",
                 "--autoplay-policy=document-user-activation-required",
                 *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
                 f"--use-file-for-fake-audio-capture={microphone}",
