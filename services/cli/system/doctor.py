@@ -76,7 +76,7 @@ def run_checks(address: str) -> Iterator[CheckResult]:
         ) as client:
             services = client.status().services
     except UserError as error:
-        yield CheckResult("status", "control does not answer", str(error))
+        yield CheckResult("status", "control does not report it", str(error))
         return
     is_one_host = is_loopback(split_endpoint(endpoint_address, "control")[0])
     with contextlib.ExitStack() as stack:
