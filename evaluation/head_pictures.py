@@ -16,7 +16,7 @@ from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
-from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
+from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
@@ -123,7 +123,7 @@ def _viseme_faps(
     """Return the FAPs (68,) of a viseme's target."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
-    ExpressivenessModifier(expressiveness).apply(faps)
+    scale_mouth(faps, expressiveness)
     return faps
 
 

@@ -240,7 +240,10 @@ class FaceAnimator:
         self._lip_model, self._lip_stream = lip_model, stream
         if self._shown is None or self._is_resuming:
             return
-        before, self._target = (self._pose(mouth).astype(np.float64) for mouth in mouths[-2:])
+        before, self._target = (
+            self._pose(mouth, step_s=0.0, levels=(), pitches=()).astype(np.float64)
+            for mouth in mouths[-2:]
+        )
         steps = (self._shown - self._previously_shown) - (self._target - before)
         velocity = np.zeros(NUM_FAPS)  # FAPs outside the mouth move as before
         velocity[_MOUTH] = steps[_MOUTH] / step_s
@@ -261,7 +264,8 @@ class FaceAnimator:
         if isinstance(event, SpeechChange):
             self._speech_changes.append(event)
         elif isinstance(event, Progress):
-            self._levels.append((event.time_s, event.level_db))
+            if math.isfinite(event.level_db):
+                self._levels.append((event.time_s, event.level_db))
             self._progress.append(event)
             if event.pitch_hz > 0.0:
                 self._pitches.append((event.time_s, event.pitch_hz))
@@ -332,18 +336,20 @@ class FaceAnimator:
         levels, self._levels = self._levels, []
         pitches, self._pitches = self._pitches, []
         self._num_frames += 1
-        faps = self._pose(mouth, 1.0 / self._frame_rate_hz, levels, pitches)
+        step_s = 1.0 / self._frame_rate_hz
+        faps = self._pose(mouth, step_s=step_s, levels=levels, pitches=pitches)
         self._target = faps.astype(np.float64)
         return faps
 
     def _pose(
         self,
         mouth: MouthFrame,
-        step_s: float = 0.0,
-        levels: Sequence[tuple[float, float]] = (),
-        pitches: Sequence[tuple[float, float]] = (),
+        *,
+        step_s: float,
+        levels: Sequence[tuple[float, float]],
+        pitches: Sequence[tuple[float, float]],
     ) -> NDArray[np.float32]:
-        """Apply all modifiers to a mouth; return FAPs (68,)."""
+        """Apply all modifiers to a mouth; return FAPs (68,). A step of 0 is a dry run."""
         faps = np.zeros(NUM_FAPS, dtype=np.float32)
         faps[_MOUTH] = mouth.faps
         soon_s = self._time_s + _SPEECH_LEAD_S

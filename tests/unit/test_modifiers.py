@@ -8,7 +8,7 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
 from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
-from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
+from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import ExpressionName, check_expressions
 from kouxing.shared.face.faps import NUM_FAPS
@@ -73,7 +73,7 @@ DEFAULT = SynthesizerConfig().expressiveness
 
 def expressed(faps: NDArray[np.float32], amount: float) -> NDArray[np.float32]:
     changed = faps.copy()
-    ExpressivenessModifier(amount).apply(changed)
+    scale_mouth(changed, amount)
     return changed
 
 

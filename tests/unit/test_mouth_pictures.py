@@ -11,7 +11,7 @@ from kouxing.services.driver.render.renderer import Renderer, mouth_light
 from kouxing.services.driver.render.scene import place_camera
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes import visemes
-from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
+from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
 from kouxing.shared.face import high_level_faps
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from tests import heads
@@ -26,7 +26,7 @@ MIN_CHANGE = 0.13  # each by this share of the region's mean brightness
 def spoken(viseme: str) -> NDArray[np.float32]:
     """FAPs (68,) of a viseme's target as the services send it by default."""
     faps = viseme_faps(viseme)
-    ExpressivenessModifier(SynthesizerConfig().expressiveness).apply(faps)
+    scale_mouth(faps, SynthesizerConfig().expressiveness)
     return faps
 
 

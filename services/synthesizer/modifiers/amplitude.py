@@ -11,14 +11,13 @@ fast visemes miss their targets, which explains about half of the reduction in r
 `_PER_RATE` is the other half (see docs/visemes.md).
 """
 
-import math
 from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.lip_model import Articulation
-from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext, pop_until
 from kouxing.shared.face.faps import LIP_HEIGHT_FAPS
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
@@ -55,10 +54,10 @@ class AmplitudeModifier:
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Scale the openings of a frame, FAPs (68,), in place."""
-        self._levels += [level for level in context.levels if all(map(math.isfinite, level))]
+        self._levels += context.levels
         until_s = min(context.known_s, context.time_s + _LEAD_S)
-        while self._levels and self._levels[0][0] <= until_s:
-            self._add_level(context.articulation, *self._levels.popleft())
+        for time_s, level_db in pop_until(self._levels, until_s):
+            self._add_level(context.articulation, time_s, level_db)
         goal = 1.0
         if context.amplitude_applies:
             goal = self._goal * _rate_gain(context.articulation.syllable_onsets_s, until_s)

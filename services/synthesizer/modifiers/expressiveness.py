@@ -45,44 +45,51 @@ class ExpressivenessModifier:
     def __init__(self, amount: float) -> None:
         self.amount = amount
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext | None = None) -> None:
-        """Scale the mouth of FAPs (68,), in place."""
-        if self.amount == 1.0:
-            return
-        # For so few numbers, floats are faster than arrays.
-        values = faps.tolist()
-        more = self.amount - 1.0
-        is_open = 0.0  # at the middle of the inner lips, 0 to 1
-        for upper, lower in _LIPS:
-            opening = -values[upper] - values[lower]
-            beyond = max(opening - CLOSED, 0.0)  # excess of the gap
-            free_upper, free_lower = (
-                max(-values[upper] - CLOSED, 0.0),
-                max(-values[lower] - CLOSED, 0.0),
-            )
-            free = free_upper + free_lower
-            # a lower lip at the teeth (f) is also a closure
-            apart = min(free_lower / (OPEN - CLOSED), 1.0)
-            if upper == _LIPS[0][0]:
-                is_open = apart * min(beyond / (OPEN - CLOSED), 1.0)
-            grown = apart * self._growth(min(free, beyond)) / max(free, 1.0)
-            faps[upper] = values[upper] - grown * free_upper
-            faps[lower] = values[lower] - grown * free_lower
-        faps[JAW] = values[JAW] + is_open * self._growth(max(values[JAW], 0.0))
-        for fap in _WIDTH:
-            before = values[fap]
-            width = before - _USUAL_WIDTH
-            # at rest, the mouth is wider than in speech, but not spread
-            change = _SIDEWAYS * more * width * (is_open if width > 0.0 else 1.0)
-            faps[fap] = max(before + change, min(before, _MIN_WIDTH))
-        for fap in _PUSH:
-            before = values[fap]
-            pushed = _SIDEWAYS * more * max(before - _USUAL_PUSH, 0.0)
-            faps[fap] = min(before + pushed, max(before, _MAX_PUSH))
+    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+        """Scale the mouth of a frame, FAPs (68,), in place."""
+        del context
+        scale_mouth(faps, self.amount)
 
-    def _growth(self, opening: float) -> float:
-        more = self.amount - 1.0
-        if more < 0.0:
-            return more * opening
-        within = min(opening, _WIDEST / 2)
-        return more * within * (1.0 - within / _WIDEST)
+
+def scale_mouth(faps: NDArray[np.float32], amount: float) -> None:
+    """Scale the mouth movements of FAPs (68,) by ``amount``, in place."""
+    if amount == 1.0:
+        return
+    # For so few numbers, floats are faster than arrays.
+    values = faps.tolist()
+    more = amount - 1.0
+    is_open = 0.0  # at the middle of the inner lips, 0 to 1
+    for upper, lower in _LIPS:
+        opening = -values[upper] - values[lower]
+        beyond = max(opening - CLOSED, 0.0)  # excess of the gap
+        free_upper, free_lower = (
+            max(-values[upper] - CLOSED, 0.0),
+            max(-values[lower] - CLOSED, 0.0),
+        )
+        free = free_upper + free_lower
+        # a lower lip at the teeth (f) is also a closure
+        apart = min(free_lower / (OPEN - CLOSED), 1.0)
+        if upper == _LIPS[0][0]:
+            is_open = apart * min(beyond / (OPEN - CLOSED), 1.0)
+        grown = apart * _growth(min(free, beyond), more) / max(free, 1.0)
+        faps[upper] = values[upper] - grown * free_upper
+        faps[lower] = values[lower] - grown * free_lower
+    faps[JAW] = values[JAW] + is_open * _growth(max(values[JAW], 0.0), more)
+    for fap in _WIDTH:
+        before = values[fap]
+        width = before - _USUAL_WIDTH
+        # at rest, the mouth is wider than in speech, but not spread
+        change = _SIDEWAYS * more * width * (is_open if width > 0.0 else 1.0)
+        faps[fap] = max(before + change, min(before, _MIN_WIDTH))
+    for fap in _PUSH:
+        before = values[fap]
+        pushed = _SIDEWAYS * more * max(before - _USUAL_PUSH, 0.0)
+        faps[fap] = min(before + pushed, max(before, _MAX_PUSH))
+
+
+def _growth(opening: float, more: float) -> float:
+    """Return the change of an opening for e - 1 = ``more``."""
+    if more < 0.0:
+        return more * opening
+    within = min(opening, _WIDEST / 2)
+    return more * within * (1.0 - within / _WIDEST)

@@ -10,7 +10,7 @@ action units 1, 2, 4, 5, 6, 12 and 15). Closures stay closed, as in
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
+from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.smoothing import TwoPoleFilter
@@ -64,7 +64,6 @@ class FeelingModifier:
     def __init__(self, amount: float) -> None:
         self.amount = amount
         self._arousal, self._valence = TwoPoleFilter(0.0), TwoPoleFilter(0.0)
-        self._size = ExpressivenessModifier(1.0)
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add the feeling to a frame, FAPs (68,), in place."""
@@ -73,8 +72,7 @@ class FeelingModifier:
             for motion, value in zip((self._arousal, self._valence), context.feeling, strict=True)
         )
         if abs(arousal) > _VISIBLE:
-            self._size.amount = 1.0 + _SIZE * arousal
-            self._size.apply(faps)
+            scale_mouth(faps, 1.0 + _SIZE * arousal)
             faps += np.float32(abs(arousal)) * (_AROUSED if arousal > 0.0 else _TIRED)
         if abs(valence) > _VISIBLE:
             faps += np.float32(abs(valence)) * (_PLEASANT if valence > 0.0 else _UNPLEASANT)

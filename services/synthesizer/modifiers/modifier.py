@@ -1,6 +1,7 @@
 """The interface of modifiers, which change a FAP frame after the lip model has set the mouth."""
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ class FrameContext(Record, frozen=True, kw_only=True):
     elapsed_s: float  # since the first frame; continues while media time does not advance
     step_s: float  # since the previous frame
     is_speaking: bool  # speech is active or known to start very soon
-    levels: Sequence[tuple[float, float]]  # new levels: media time s, level dB
+    levels: Sequence[tuple[float, float]]  # new levels, finite: media time s, level dB
     articulation: Articulation
     pitches: Sequence[tuple[float, float]] = ()  # new pitches: media time s, Hz
     feeling: tuple[float, float] = (0.0, 0.0)  # arousal and valence of the voice, -1 to 1
@@ -32,3 +33,9 @@ class Modifier(Protocol):
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Change a frame, FAPs (68,) in FAP units, in place."""
+
+
+def pop_until(values: deque[tuple[float, float]], until_s: float) -> Iterator[tuple[float, float]]:
+    """Remove and yield the values up to a media time."""
+    while values and values[0][0] <= until_s:
+        yield values.popleft()

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.expression import ExpressionModifier
-from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.services.synthesizer.modifiers.prosody import pop_until
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext, pop_until
 from kouxing.shared.face.expression_motion import EXPRESSION_FAPS
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
@@ -63,7 +62,7 @@ class NonverbalModifier:
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add laughter and breath to a frame, FAPs (68,), in place."""
-        self._levels += [level for level in context.levels if math.isfinite(level[1])]
+        self._levels += context.levels
         until_s = min(context.known_s, context.time_s + _LEAD_S)
         self._loudest_db -= _FORGET_DB_S * context.step_s
         for _, level_db in pop_until(self._levels, until_s):

@@ -15,10 +15,9 @@ Most questions with a question word do not rise.
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 
-from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext, pop_until
 from kouxing.shared.face.smoothing import smoothing_gain
 
 _LEAD_S = 0.06  # levels act this much earlier, if known, to compensate for the filters
@@ -63,7 +62,7 @@ class ProsodyTracker:
     def update(self, context: FrameContext) -> Prosody:
         """Return the prosody at a frame. The object is valid until the next call."""
         now = self._now
-        self._levels += [level for level in context.levels if all(map(math.isfinite, level))]
+        self._levels += context.levels
         self._pitches += context.pitches
         until_s = min(context.known_s, context.time_s + _LEAD_S)
         before_s = now.silence_s
@@ -119,9 +118,3 @@ class ProsodyTracker:
         lowest_st = min(pitch for _, pitch in self._recent)
         high_st = self._mean_st + _RISE_SPREADS * max(self._spread_st, _MIN_SPREAD_ST)
         return final_st > max(high_st, lowest_st + _RISE_ST)
-
-
-def pop_until(values: deque[tuple[float, float]], until_s: float) -> Iterable[tuple[float, float]]:
-    """Remove and yield the values up to a media time."""
-    while values and values[0][0] <= until_s:
-        yield values.popleft()
