@@ -42,6 +42,7 @@ _MAX_BYTES = 64 << 20  # limit for a table
 _MAX_ROWS = 1_000_000
 _FULL_PERCENTILE = 98.0
 _FILMED = "tracked video"  # start of the kind of a filmed clip
+CLOSED_FRACTION = 0.1  # lips that touch open at most this fraction of their tracked range
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
 
 # Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import LipClip
+from kouxing.corpora.lip_clips import CLOSED_FRACTION, LipClip
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
+from kouxing.shared.face.expression_motion import CLOSED
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 Array = NDArray[np.float64]
@@ -18,8 +19,6 @@ CURVES: dict[str, Callable[[Array], Array]] = {  # functions of FAPs (num_frames
     "width": lambda faps: faps[:, 5] + faps[:, 6],
     "jaw": lambda faps: faps[:, 2],
 }
-_CLOSED = 20.0  # opening of predicted lips in FAP units: 0.6 mm on a face
-_CLOSED_FRACTION = 0.1  # fraction of a real mouth's range
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,7 @@ class Mouth:
 def predicted_mouth(faps: Array) -> Mouth:
     """Return the mouth of frames (num_frames, 68) at ``FRAME_RATE_HZ``."""
     curves = {name: curve(faps) for name, curve in CURVES.items()}
-    return Mouth(np.arange(len(faps)) / FRAME_RATE_HZ, curves, curves["opening"] < _CLOSED)
+    return Mouth(np.arange(len(faps)) / FRAME_RATE_HZ, curves, curves["opening"] < CLOSED)
 
 
 def real_mouth(time_s: Array, faps: Array) -> Mouth:
@@ -57,7 +56,7 @@ def real_mouth(time_s: Array, faps: Array) -> Mouth:
     curves = {name: curve[is_known] for name, curve in curves.items()}
     opening = curves["opening"]
     low, high = np.percentile(opening, [1, 99]) if len(opening) else (0.0, 0.0)
-    return Mouth(time_s[is_known], curves, opening < low + _CLOSED_FRACTION * (high - low))
+    return Mouth(time_s[is_known], curves, opening < low + CLOSED_FRACTION * (high - low))
 
 
 def clip_mouth(clip: LipClip) -> Mouth:

@@ -33,6 +33,7 @@ from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
     parse_topology,
 )
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, count_frames
 from kouxing.shared.audio.pcm import as_floats, as_integers
 from kouxing.shared.command.terminal import print_message
@@ -57,7 +58,6 @@ _PHONE_PENALTY, _RATE_WEIGHT = 3.2, 120.0  # chosen on speech of many rates, for
 _DATA_MIX = DataMix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
 _SUNG_EVERY, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
 _MAX_SUNG_FRAMES = 800  # limit for the sung part of a recording
-_FRAMES_PER_ENCODER_FRAME = 2
 
 
 def train_blocks(
@@ -178,11 +178,11 @@ def _sung_copy(recordings: Sequence[LabeledRecording], number: int) -> LabeledRe
     """Sing the start of a recording; None if it has too little voice."""
     recording = recordings[number]
     speech = as_floats(recording.samples[: HOP_SAMPLES * _MAX_SUNG_FRAMES])
-    num_positions = len(speech) // HOP_SAMPLES // _FRAMES_PER_ENCODER_FRAME
+    num_positions = len(speech) // HOP_SAMPLES // FRAMES_PER_ENCODER_FRAME
     sung = sing(speech, num_positions, np.random.default_rng([SEED, number]))
     if sung is None:
         return None
-    frames = _FRAMES_PER_ENCODER_FRAME * sung.source[:, None] + np.arange(_FRAMES_PER_ENCODER_FRAME)
+    frames = FRAMES_PER_ENCODER_FRAME * sung.source[:, None] + np.arange(FRAMES_PER_ENCODER_FRAME)
     targets = recording.targets.select(np.minimum(frames.flatten(), len(recording.targets) - 1))
     num_frames = min(len(targets), count_frames(len(sung.samples)))
     return LabeledRecording(

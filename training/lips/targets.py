@@ -19,13 +19,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import LipClip, opening_of
+from kouxing.corpora.lip_clips import CLOSED_FRACTION, LipClip, opening_of
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, select_lip_faps
 from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
 
-_CLOSED_FRACTION = 0.1  # fraction of the range of a speaker's opening
 _RANGE_PERCENTILES = (1.0, 99.0)
 _LIP_TO_TEETH = "f"
 
@@ -40,7 +39,7 @@ def closed_below(clips: Sequence[LipClip]) -> dict[str, float]:
         known = np.concatenate(heights)
         known = known[~np.isnan(known)]
         low, high = np.percentile(known, _RANGE_PERCENTILES) if len(known) else (np.nan, np.nan)
-        limits[speaker] = float(low + _CLOSED_FRACTION * (high - low))
+        limits[speaker] = float(low + CLOSED_FRACTION * (high - low))
     return limits
 
 

@@ -90,7 +90,7 @@ class BlockModel(NetworkModel):
 
     @cached_property
     def runner(self) -> BlockRunner:
-        """The network, opened at its first use."""
+        """The network, opened when the model is loaded."""
         return BlockRunner(self.network)
 
     @cached_property

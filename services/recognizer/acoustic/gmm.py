@@ -28,6 +28,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -115,7 +116,7 @@ class GmmModel(AcousticModel):
 
     def score(self, requests: Sequence[ScoreRequest]) -> list[Floats]:
         """Score the frames of several streams, one stream at a time."""
-        return [stream.score(frames) for stream, frames in requests]
+        return [cast(GmmStream, stream).score_frames(frames) for stream, frames in requests]
 
 
 class GmmStream(AcousticStream):
@@ -130,7 +131,7 @@ class GmmStream(AcousticStream):
         self._deltas = DeltaFeatures(model.half_width)
         self.look_ahead_frames = self._deltas.look_ahead_frames
 
-    def score(self, frames: Floats | None) -> Floats:
+    def score_frames(self, frames: Floats | None) -> Floats:
         """Score log-mel frames with their pitch, (n, 43); None ends the segment.
 
         The next segment continues with the speaker's mean and pitch.

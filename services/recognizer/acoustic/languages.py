@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import (
@@ -34,7 +33,7 @@ def load_model_for_language(
     Raises ``UserError`` if the language is not installed, or the model has other phones.
     """
     is_default = language in (None, DEFAULT_LANGUAGE)
-    model = _load(acoustic or (DEFAULT_MODEL if is_default else UNIVERSAL))
+    model = load_model(acoustic or (DEFAULT_MODEL if is_default else UNIVERSAL))
     model_language = model.inventory.language
     if language in (None, model_language):
         return model
@@ -47,11 +46,6 @@ def load_model_for_language(
     return restrict_phones(model, inventory.phones)
 
 
-@cache
-def _load(acoustic: str) -> AcousticModel:
-    return load_model(acoustic)
-
-
 def restrict_phones(model: AcousticModel, phones: tuple[str, ...]) -> AcousticModel:
     """Return a copy of a model that recognizes only these phones. Both share the network."""
     language_model = model.topology.phone_lm
@@ -59,8 +53,6 @@ def restrict_phones(model: AcousticModel, phones: tuple[str, ...]) -> AcousticMo
     log_prob = np.where(
         is_spoken[language_model.phone], language_model.log_prob, _EXCLUDED_LOG_PROB
     )
-    if isinstance(model, BlockModel):
-        model.runner  # noqa: B018 - opens the network before the copy
     limited = copy.copy(model)
     topology = replace(model.topology, phone_lm=replace(language_model, log_prob=log_prob))
     object.__setattr__(limited, "topology", topology)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     blocks.FORMAT: blocks.parse_block_model,
     universal.FORMAT: lambda archive: universal.parse_universal_model(archive, _block_network()),
 }
-_loaded: WeakValueDictionary[str, AcousticModel] = WeakValueDictionary()  # shipped models in use
+_loaded: dict[str, AcousticModel] = {}  # shipped models
 
 
 def model_path(name: str) -> Path:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
-from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.shared.errors import StartFailure, UserError
 from kouxing.shared.wire.control import StartSession
@@ -34,8 +33,9 @@ class PendingSessions:
         if language in (None, self._language):
             return False
         if language not in self._models:
-            model = self._models[language] = self._executor.submit(_load, language)
-            model.add_done_callback(lambda _: self._on_loaded())
+            loading = self._executor.submit(load_model_for_language, language)
+            loading.add_done_callback(lambda _: self._on_loaded())
+            self._models[language] = loading
         if self._models[language].done():
             try:
                 self._models[language].result()
@@ -64,10 +64,3 @@ class PendingSessions:
         for start in ready:
             del self._starts[start.session]
         return ready
-
-
-def _load(language: str) -> AcousticModel:
-    model = load_model_for_language(language)
-    if isinstance(model, BlockModel):
-        model.runner  # noqa: B018 - opens the network, which takes most of the time
-    return model
