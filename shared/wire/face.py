@@ -7,6 +7,7 @@ from typing import Annotated
 
 from kouxing_client.field_types import Name, SessionName
 from msgspec import Meta, Struct
+from msgspec.structs import asdict
 
 from kouxing.shared.face.expressions import (
     DEFAULT_HOLD_S,
@@ -41,11 +42,7 @@ class FaceSettings(Struct, frozen=True, kw_only=True):
 
     def merged_with(self, change: FaceSettings) -> FaceSettings:
         """Return these settings after a change."""
-        changed = {
-            name: value
-            for name in change.__struct_fields__
-            if (value := getattr(change, name)) is not None
-        }
+        changed = {name: value for name, value in asdict(change).items() if value is not None}
         if change.expressions is None:
             del changed["hold_s"]  # it belongs to the expressions
         shapes = dict.fromkeys([*(self.shapes or ()), *(change.shapes or ())])

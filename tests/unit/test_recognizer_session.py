@@ -1,5 +1,6 @@
 """A session of the recognizer: the audio that it accepts, the order of messages, its sound."""
 
+import math
 from functools import cache
 from types import SimpleNamespace
 from typing import Any, cast
@@ -52,7 +53,7 @@ def lip_predictor() -> LipPredictor:
 
 def make_session(epoch: int = 1, **opening: Any) -> RecognizerSession:
     start = with_opening(replace(START, epoch=epoch), **opening)
-    return RecognizerSession(start, recognizer(), lip_predictor(), SOCKET, SOCKET, 0.0)
+    return RecognizerSession(start, recognizer(), lip_predictor(), SOCKET, SOCKET, 0.0, math.inf)
 
 
 def chunk(

@@ -54,11 +54,11 @@ class RecognizerSession:
         self,
         start: StartSession,
         recognizer: Recognizer,
-        lip_predictor: LipPositionModel | None,
+        lip_predictor: LipPositionModel,
         socket: Socket,
         publisher: Socket,
         now_s: float,
-        max_lag_s: float = math.inf,
+        max_lag_s: float,
     ) -> None:
         self.start = start
         self.replay = ReplayingPublisher(publisher, now_s)
@@ -70,8 +70,6 @@ class RecognizerSession:
         self.mouth_profile_error = ""  # why the profile is not used; empty once reported
         if opening.mouth_profile is not None:
             try:
-                if lip_predictor is None:
-                    raise UserError("this recognizer runs without a lip predictor")
                 lip_predictor = lip_predictor.with_mouth_profile(opening.mouth_profile)
             except UserError as error:
                 self.mouth_profile_error = f"the mouth profile is not used: {error}"
