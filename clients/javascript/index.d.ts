@@ -51,8 +51,8 @@ export interface ViewerHandlers {
   end?(message: { media_time: MediaTime }): void;
   error?(message: { code: string; text: string }): void;
   status?(message: { missing: string[] }): void;
-  /** The lip model of the session changed. */
-  face?(message: { lip_model: string }): void;
+  /** One of these settings of the session changed. */
+  face?(message: { lip_model: string; expressiveness: number | null; feeling: number | null }): void;
   /** The acoustic model of the session changed: "full" or "light". */
   acoustic?(message: { acoustic: string }): void;
 }

@@ -225,16 +225,16 @@ class GatewayService(SessionService):
         return super().control_handlers() | {SetFace: self._on_set_face}
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
-        """Change the face at rest, or notify viewers that a session's lip model has changed."""
+        """Change the face at rest, or notify viewers of a change of a session's face."""
         if message.session == "" and (strengths := message.face.expressions) is not None:
             self._resting_face.express(strengths, message.face.hold_s)
             self._senders.pool.express(strengths, message.face.hold_s)
         session = self._sessions.get(message.session)
-        if session is not None and message.face.lip_model is not None:
+        if session is not None:
             start = session.follower.session_start
             face = start.opening.face.merged_with(message.face)
             session.follower.session_start = start.with_face(face)
-            self._viewers.set_lip_model(message.session, message.face.lip_model)
+            self._viewers.change_face(message.session, message.face)
 
     def session_progress(self) -> dict[str, SessionProgress]:
         """Return the subscribed sessions, so that control can report ended ones."""

@@ -265,6 +265,8 @@ def test_settings_apply_at_once_and_to_later_sessions(
     first = turn_on_microphone(control, page)
     page.wait_for(f"{STATE}.lipModel === 'dynamic-visemes'")
     page.wait_for("document.getElementById('expressiveness-shown').value === '100 %'")
+    control.send(SetFace(session=first, face=FaceSettings(expressiveness=1.2)))  # another viewer's
+    page.wait_for("document.getElementById('expressiveness-shown').value === '120 %'")
     choose(page, "lips", "ferguson")
     page.wait_for(f"{STATE}.lipModel === 'ferguson'")
     assert control.messages_of(OpenSession)[-1].language == "zh"

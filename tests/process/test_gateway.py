@@ -169,7 +169,8 @@ async def test_viewers_receive_shapes_in_the_requested_format(
 async def test_a_viewer_sets_the_expressions_of_its_face(
     control: FakeControl, gateway: Gateway
 ) -> None:
-    async with open_websockets(gateway.page, "viewer?session=seen") as (viewer,):
+    viewers = open_websockets(gateway.page, *2 * ["viewer?session=seen"])
+    async with viewers as (viewer, other):
         await viewer.send_json({"expressiveness": 2})
         assert "no session is shown" in (await receive_json(viewer, "error"))["text"]
         control.start("seen")
@@ -180,6 +181,8 @@ async def test_a_viewer_sets_the_expressions_of_its_face(
         await viewer.send_json({"expressions": {}})
         await viewer.send_json({"expressiveness": 2})
         await wait_until_async(lambda: len(control.messages_of(SetFace)) == 3)
+        size = {"expressiveness": 2.0, "feeling": None}
+        await receive_json(other, "face", lip_model="dynamic-visemes", **size)
     faces = [message.face for message in control.messages_of(SetFace)]
     assert [face.expressions for face in faces] == [{"joy": 0.5, "squint": 1.0}, {}, None]
     assert (faces[0].hold_s, faces[2].expressiveness) == (7, 2.0)

@@ -100,7 +100,8 @@ function handleMessage(message) {
     phone: () => caption.add(message),
     error: showError,
     face() {
-      gateway.lipModel = message.lip_model;
+      gateway.lipModel = message.lip_model || null;
+      settings.showSizes(message);
       showLipModel();
     },
     acoustic() {

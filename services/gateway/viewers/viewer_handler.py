@@ -22,7 +22,6 @@ from kouxing.services.gateway.web.limits import COMMAND_S, ConnectionQuota, Real
 from kouxing.services.gateway.web.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
-from kouxing.shared.fast_record import replace
 from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.name_rules import NAME_RULE, is_name
 from kouxing.shared.wire.face import FaceSettings
@@ -89,14 +88,15 @@ class ViewerHandler:
         self._sessions[session] = _ShownSession(epoch, face, language)
         self._notify_viewers()
 
-    def set_lip_model(self, session: str, lip_model: str) -> None:
-        """Announce that the lip model of a session has changed."""
+    def change_face(self, session: str, change: FaceSettings) -> None:
+        """Change the face of a session, and announce it if viewers show the changed settings."""
         if session in self._sessions:
             shown_session = self._sessions[session]
-            shown_session.face = replace(shown_session.face, lip_model=lip_model)
-            self.forward(
-                session, MessageKind.TEXT, browser_messages.text("face", lip_model=lip_model)
-            )
+            before = _shown_settings(shown_session.face)
+            shown_session.face = shown_session.face.merged_with(change)
+            settings = _shown_settings(shown_session.face)
+            if settings != before:
+                self.forward(session, MessageKind.TEXT, browser_messages.text("face", **settings))
 
     def set_acoustic(self, session: str, model: str) -> None:
         """Announce the acoustic model of a session, if it has changed."""
@@ -266,9 +266,7 @@ class ViewerHandler:
                 session=name if session else None,
                 chosen=viewer.chosen_session,
                 epoch=session.epoch if session else 0,
-                lip_model=face.lip_model or "",
-                expressiveness=face.expressiveness,
-                feeling=face.feeling,
+                **_shown_settings(face),
                 language=session.language if session else "",
                 acoustic=session.acoustic if session else "",
                 sample=session is not None
@@ -306,6 +304,15 @@ class ViewerHandler:
 
     def _status(self) -> str:
         return browser_messages.text("status", missing=self._missing)
+
+
+def _shown_settings(face: FaceSettings) -> dict[str, object]:
+    """Return the settings of a face that viewers show."""
+    return {
+        "lip_model": face.lip_model or "",
+        "expressiveness": face.expressiveness,
+        "feeling": face.feeling,
+    }
 
 
 def _check_single(command: ViewerCommand, lip_model: str | None) -> None:
