@@ -10,7 +10,7 @@ from collections import deque
 
 MEDIA_RATE_HZ = 16_000
 MAX_GAP_S = 10.0  # longer gaps in media time have no frames
-STALL_LIMIT_S = 0.5  # a longer delay is a stall; a busy machine delays a process by less
+MIN_STALL_S = 0.5  # a longer delay is a stall; a busy machine delays a process by less
 
 
 def to_samples(time_s: float) -> int:
@@ -62,9 +62,9 @@ class StallDetector:
     stall; minus infinity before the first.
     """
 
-    def __init__(self, now_s: float, limit_s: float = STALL_LIMIT_S) -> None:
+    def __init__(self, now_s: float, min_stall_s: float = MIN_STALL_S) -> None:
         self.resumed_at_s = -math.inf
-        self._limit_s = limit_s
+        self._min_stall_s = min_stall_s
         self._checked_s = now_s
 
     def restart(self, now_s: float) -> None:
@@ -78,7 +78,7 @@ class StallDetector:
         """
         pause_s = now_s - self._checked_s - expected_s
         self._checked_s = now_s
-        if pause_s <= self._limit_s:
+        if pause_s <= self._min_stall_s:
             return 0.0
         self.resumed_at_s = now_s
         return pause_s
@@ -86,4 +86,4 @@ class StallDetector:
     def elapsed_s(self, now_s: float) -> float:
         """Return the time since the last check, up to the limit, because a stall does not count."""
         elapsed_s, self._checked_s = now_s - self._checked_s, now_s
-        return min(elapsed_s, self._limit_s)
+        return min(elapsed_s, self._min_stall_s)

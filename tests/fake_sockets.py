@@ -36,12 +36,12 @@ class FakeSockets:
         self.resumed_at_s = -math.inf
         self.connect_ms = 300
         self.connections: list[FakeConnection] = []
-        self.reach_error = ""
+        self.unreachable_reason = ""
         self.num_explained = 0
 
     def explain(self, endpoint: str, on_reason: Callable[[str], None]) -> None:
         self.num_explained += 1
-        on_reason(self.reach_error)
+        on_reason(self.unreachable_reason)
 
     def at(self, endpoint: str) -> list[FakeConnection]:
         """Return the open connections to an endpoint, oldest first."""

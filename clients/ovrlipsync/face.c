@@ -149,7 +149,7 @@ static void follow_voice(Rest *rest, double time_s) {
     const SpeechChange change = rest->changes[number];
     if (change.is_active && !rest->is_voice) {
       rest->sound_s = change.time_s;
-      rest->stays_shut = false;
+      rest->stays_closed = false;
     }
     rest->is_voice = change.is_active;
     rest->has_spoken |= change.is_active;
@@ -160,7 +160,7 @@ static void follow_voice(Rest *rest, double time_s) {
     update_background(rest, rest->levels[number].level_db);
     if (is_sound(rest, rest->levels[number].level_db)) {
       rest->sound_s = rest->levels[number].time_s;
-      rest->stays_shut = false;
+      rest->stays_closed = false;
     }
   }
   rest->num_levels -= number;
@@ -173,7 +173,7 @@ static double doubt_at(Rest *rest, double time_s, double closure) {
   const bool is_silent = rest->is_voice && rest->known_s > time_s + REST_LAST_SOUND_S && next_s > rest->known_s;
   const bool is_onset = REST_YIELD_S < next_s - time_s && next_s - time_s <= REST_LIKELY_BEFORE_S;
   if (closure >= (is_onset ? REST_LIKELY : REST_CERTAIN)) {
-    if (is_silent || is_onset) rest->stays_shut = true;
+    if (is_silent || is_onset) rest->stays_closed = true;
     return 0.0;
   }
   if (rest->goal > 0.0) return INFINITY;
@@ -187,7 +187,7 @@ static double ajar_amount_at(Rest *rest, double time_s) {
     starts_soon |= rest->changes[i].is_active && rest->changes[i].time_s <= time_s + REST_LEAD_S;
   }
   if (starts_soon) set_goal(rest, 1.0, REST_PART_S);
-  else if (rest->stays_shut || next_s <= time_s + REST_YIELD_S) set_goal(rest, 0.0, REST_YIELD_S);
+  else if (rest->stays_closed || next_s <= time_s + REST_YIELD_S) set_goal(rest, 0.0, REST_YIELD_S);
   else if (time_s < rest->start_s + REST_START_S || closes_for_onset(rest, time_s)) set_goal(rest, 0.0, REST_ONSET_CLOSE_S);
   else if (time_s > rest->sound_s + REST_HOLD_S) set_goal(rest, 0.0, REST_CLOSE_S);
   else if (!rest->is_voice || fmin(next_s, rest->known_s) >= rest->sound_s + REST_MIN_PAUSE_S) set_goal(rest, 1.0, REST_PART_S);

@@ -39,7 +39,7 @@ typedef struct {
   int num_levels;
   SpeechChange changes[MAX_CHANGES]; /* of future frames */
   int num_changes;
-  bool is_voice, has_spoken, stays_shut;
+  bool is_voice, has_spoken, stays_closed;
   double loudest_db, start_s, known_s, sound_s, time_s;
   double background_db, onset_until_s; /* NAN: no background yet */
   double goal, start, velocity, duration_s, elapsed_s; /* of the way to the goal */

@@ -26,14 +26,14 @@ class DetectionCounts:
     """Numbers of real, reproduced and predicted events, and of predictions that are true."""
 
     real: int = 0
-    met: int = 0
+    reproduced: int = 0
     predicted: int = 0
     true: int = 0
 
     def __add__(self, other: DetectionCounts) -> DetectionCounts:
         return DetectionCounts(
             self.real + other.real,
-            self.met + other.met,
+            self.reproduced + other.reproduced,
             self.predicted + other.predicted,
             self.true + other.true,
         )
@@ -41,7 +41,7 @@ class DetectionCounts:
     @property
     def recall(self) -> float | None:
         """Share of the real events that are reproduced."""
-        return self.met / self.real if self.real else None
+        return self.reproduced / self.real if self.real else None
 
     @property
     def precision(self) -> float | None:
@@ -123,6 +123,6 @@ def closures(predicted: Mouth, real: Mouth) -> DetectionCounts:
     (1.0, 0.5, 0.67)
     """
     real_s, predicted_contacts = real_closures(real), contacts(predicted, real)
-    num_met = int(is_closed_at(real_s, predicted).sum())
+    num_reproduced = int(is_closed_at(real_s, predicted).sum())
     num_true = sum(contact.is_true for contact in predicted_contacts)
-    return DetectionCounts(len(real_s), num_met, len(predicted_contacts), num_true)
+    return DetectionCounts(len(real_s), num_reproduced, len(predicted_contacts), num_true)

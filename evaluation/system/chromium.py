@@ -169,7 +169,7 @@ class Chromium:
         )
         return x, y
 
-    def wait_for(self, condition: str, limit_s: float = _TIMEOUT_S) -> None:
+    def wait_for(self, condition: str, timeout_s: float = _TIMEOUT_S) -> None:
         """Wait until an expression becomes true."""
 
         def holds() -> bool:
@@ -180,7 +180,7 @@ class Chromium:
                     return False
                 raise
 
-        if not wait_until(holds, limit_s):
+        if not wait_until(holds, timeout_s):
             state = self.evaluate("JSON.stringify(window.kouxing?.state)")
             raise TimeoutError(f"{condition}; state {state}; {self.page_errors}")
 

@@ -13,7 +13,7 @@ from kouxing.shared.errors import UserError
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
 CHUNK_S = CHUNK / MEDIA_RATE_HZ
-END_LIMIT_S = 15.0  # limit from the last sample to the last frame
+END_TIMEOUT_S = 15.0  # limit from the last sample to the last frame
 MAX_UNPACED_FACTOR = 5.0  # maximum time for unpaced audio, relative to its duration
 NUM_TRIES = 3
 
@@ -97,7 +97,9 @@ class _Speaker:
         self._has_finished = False
         start_s = time.monotonic()
         length_s = len(sound) / MEDIA_RATE_HZ
-        self._deadline_s = start_s + length_s * (1.0 if paced else MAX_UNPACED_FACTOR) + END_LIMIT_S
+        self._deadline_s = (
+            start_s + length_s * (1.0 if paced else MAX_UNPACED_FACTOR) + END_TIMEOUT_S
+        )
         self.received = ReceivedResults(start_s=start_s, live_until_s=start_s + length_s)
 
     @property

@@ -6,9 +6,9 @@ from collections.abc import Callable
 _STEP_S = 0.03
 
 
-def wait_until(condition: Callable[[], object], limit_s: float) -> bool:
-    """Wait until a condition holds; return False if it does not within ``limit_s``."""
-    end_s = time.monotonic() + limit_s
+def wait_until(condition: Callable[[], object], timeout_s: float) -> bool:
+    """Wait until a condition holds; return False if it does not within ``timeout_s``."""
+    end_s = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > end_s:
             return False

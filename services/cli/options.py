@@ -142,7 +142,7 @@ class ExportOptions:
     """How ``kouxing render`` shows and writes a face, with the defaults of its options."""
 
     lips: tuple[str, ...] = (DEFAULT_LIP_MODEL,)
-    form: CurveFormat | None = None  # None: the first one of the format
+    curve_format: CurveFormat | None = None  # None: the first one of the format
     head: str = DEFAULT_HEAD
     size: str = "1280x720"
     background: str = "studio"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from kouxing.shared.monitoring.logs import LOG
 
-SHORT_S = 1.0  # time without a service after which its loss is a warning
+WARN_AFTER_S = 1.0  # time without a service after which its loss is a warning
 MAX_FAULTS = 1000
 
 
@@ -12,7 +12,7 @@ MAX_FAULTS = 1000
 class _Fault:
     begin_s: float
     text: str
-    is_reported: bool = False
+    is_warned: bool = False
 
 
 class FaultLog:
@@ -29,11 +29,11 @@ class FaultLog:
         if len(self._faults) > MAX_FAULTS:
             del self._faults[next(iter(self._faults))]
 
-    def report(self, now_s: float) -> None:
-        """Warn about each fault that has lasted longer than ``SHORT_S``."""
+    def warn(self, now_s: float) -> None:
+        """Warn about each fault that has lasted longer than ``WARN_AFTER_S``."""
         for fault in self._faults.values():
-            if not fault.is_reported and now_s - fault.begin_s > SHORT_S:
-                fault.is_reported = True
+            if not fault.is_warned and now_s - fault.begin_s > WARN_AFTER_S:
+                fault.is_warned = True
                 LOG.warning(fault.text)
 
     def end(self, instance: str, now_s: float) -> float:
@@ -45,6 +45,6 @@ class FaultLog:
         if fault is None:
             return 0.0
         lasted_s = now_s - fault.begin_s
-        log = LOG.warning if fault.is_reported else LOG.info
+        log = LOG.warning if fault.is_warned else LOG.info
         log("%s is back after %.1f s", instance, lasted_s)
         return lasted_s

@@ -47,7 +47,7 @@ from kouxing.shared.wire.session import (
 
 STOPPED = "stopped"  # reason for a service that shut down
 CHECK_S = 0.5  # interval of checking waiting sessions and the list of keys
-MAX_PAUSE_S = 0.1  # if a tick is later than this, control itself was stalled
+MAX_TICK_DELAY_S = 0.1  # if a tick is later than this, control itself was stalled
 # events that a service may publish
 SERVICE_EVENTS = (
     EventName.AUDIO_SKIPPED,
@@ -77,7 +77,7 @@ class ControlService(Service):
         self._recovery = RestartRecovery(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
         self._keys_version = (0, 0)  # version of the key list for which revoked sessions have ended
-        self._tick_stall = StallDetector(now_s, MAX_PAUSE_S)
+        self._tick_stall = StallDetector(now_s, MAX_TICK_DELAY_S)
         self._sleep_s = 0.0  # planned time until the next tick
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
@@ -126,7 +126,7 @@ class ControlService(Service):
     def on_tick(self, now_s: float) -> float:
         """Check for lost services, sessions that wait too long, and changed keys."""
         pause_s = self._tick_stall.check(now_s, expected_s=self._sleep_s)
-        self._registry.exclude_pause(pause_s - MAX_PAUSE_S)
+        self._registry.exclude_pause(pause_s - MAX_TICK_DELAY_S)
         if self.bus.zap is not None:
             self.bus.zap.refresh()
             if self.bus.zap.version != self._keys_version:
@@ -142,7 +142,7 @@ class ControlService(Service):
                 self._on_service_lost(instance, reason)
         for instance in self._registry.overdue_services(now_s):
             self._on_service_lost(instance, "no heartbeat")
-        self._faults.report(now_s)
+        self._faults.warn(now_s)
         moves_due_s = self._lifecycle.on_tick(now_s)
         due_s = min(now_s + CHECK_S, self._registry.next_overdue_s(), moves_due_s)
         self._sleep_s = max(0.0, due_s - now_s)

@@ -60,7 +60,7 @@ class SessionRecord:
         return f"start-{self.number}-{self.epoch}"
 
     @property
-    def is_settled(self) -> bool:
+    def is_up_to_date(self) -> bool:
         """Whether all services and the client are up to date."""
         return self.announced and not (self.moved or self.waiting_for or self.lost)
 

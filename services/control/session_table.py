@@ -99,7 +99,7 @@ class SessionTable:
     def pending(self) -> list[SessionRecord]:
         """Return the sessions that wait for a service, or whose client must be notified."""
         for record in list(self._pending.values()):
-            if record.is_settled:
+            if record.is_up_to_date:
                 del self._pending[record.name]
         return list(self._pending.values())
 

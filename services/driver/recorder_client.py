@@ -21,8 +21,8 @@ IDLE_S = 10.0  # after this time without a video, the process ends and frees its
 REPORT_S = 0.02  # interval of reading the reports of the process
 HANG_S = 600.0  # limit without a report; completing a long video may take minutes
 MAX_TICK_S = 0.1  # anything longer is the driver's own delay
-CLOSE_LIMIT_S = 3.0
-KILL_LIMIT_S = 1.0
+CLOSE_TIMEOUT_S = 3.0
+KILL_TIMEOUT_S = 1.0
 HANGS = "the process that draws videos does not respond; record again"
 ENDED = "the process that draws videos ended unexpectedly; see the driver's log, and record again"
 
@@ -48,7 +48,7 @@ class _RecorderProcess:
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.join(KILL_LIMIT_S)
+        self.process.join(KILL_TIMEOUT_S)
         self.commands.put(None)  # ends the thread
 
 
@@ -151,7 +151,7 @@ class RecorderClient:
         """Save the finished part of every video."""
         if self._recorder is not None:
             self._recorder.commands.put(None)
-            while self._unfinished and self._receive(CLOSE_LIMIT_S):
+            while self._unfinished and self._receive(CLOSE_TIMEOUT_S):
                 pass  # on a timeout, the process still ends by itself
 
     def _send(self, session: str, command: str, *arguments: object) -> None:

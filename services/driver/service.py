@@ -33,7 +33,7 @@ from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import ErrorCode
 
-LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
+LAST_FRAME_TIMEOUT_S = 10.0  # wait for the last frames of a closed session
 MAX_DRAIN_S = 3.0  # time to draw the remaining images when the driver stops
 RETRY_AFTER_S = 5.0  # sent to a client whose session cannot be recorded now
 
@@ -113,7 +113,7 @@ class DriverService(SessionService):
         if not self.recorder.is_open(session):
             self._unfollow(stopped)
         elif stopped.leave_by_s is None:
-            stopped.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
+            stopped.leave_by_s = time.monotonic() + LAST_FRAME_TIMEOUT_S
 
     def gauges(self) -> dict[str, float]:
         """Return the number of videos that are not written yet."""

@@ -23,7 +23,7 @@ from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.messages import browser_messages
 from kouxing.services.gateway.senders_api import SendersApi
 from kouxing.services.gateway.uploads.audio_upload import AudioUploadHandler
-from kouxing.services.gateway.uploads.mouth_learner import MouthLearner
+from kouxing.services.gateway.uploads.learn_mouth_handler import LearnMouthHandler
 from kouxing.services.gateway.viewers.viewer_handler import ViewerHandler
 from kouxing.services.gateway.viewers.viewer_queue import MessageKind
 from kouxing.services.gateway.web import web_application
@@ -95,7 +95,7 @@ class GatewayService(SessionService):
             self._viewers,
             [] if ipaddress.ip_address(host).is_unspecified else [host],
         )
-        self._mouth_learner = MouthLearner()
+        self._learn_mouth_handler = LearnMouthHandler()
         self._audio_upload = AudioUploadHandler()
         self._senders = SendersApi(config.senders, config.idle_motion_seed, self.waker.wake)
         self._routes = (
@@ -103,7 +103,7 @@ class GatewayService(SessionService):
             web.get("/microphone", self._microphones.serve),
             web.post("/whip", self._whip_handler.serve_post),
             web.delete("/whip/{name}", self._whip_handler.serve_delete),
-            web.post("/learn-mouth", self._mouth_learner.serve),
+            web.post("/learn-mouth", self._learn_mouth_handler.serve),
             web.post("/sound", self._audio_upload.serve),
             web.get("/senders", self._senders.serve_get),
             web.post("/senders", self._senders.serve_post),
@@ -157,10 +157,10 @@ class GatewayService(SessionService):
         if self._closing is None:
             self._closing = self._create_task(self._web_sockets.close_all())
             self._create_task(self._whip_handler.close_all())
-            self._mouth_learner.close()
+            self._learn_mouth_handler.close()
             self._audio_upload.close()
             self._sample.stop()
-        is_uploading = self._mouth_learner.is_running or self._audio_upload.is_running
+        is_uploading = self._learn_mouth_handler.is_running or self._audio_upload.is_running
         is_connected = self._web_sockets or self._whip_handler or self._sample.session
         return self._closing.done() and not is_uploading and not is_connected
 

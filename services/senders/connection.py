@@ -8,9 +8,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
-from kouxing.services.senders.camera import CameraInput, open_camera
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.target import Target
+from kouxing.services.senders.tracker_input import TrackerInput, open_tracker_input
 
 RETRY_S = 1.0
 _REFUSED_S = 1.0  # if no error arrives within this time, assume that a program is listening
@@ -49,7 +49,7 @@ class DatagramConnection(TargetConnection):
         self._socket: socket.socket | None = None
         self._refused_s = -_REFUSED_S
         self._newest_frame: FaceFrame | None = None
-        self._camera: tuple[asyncio.DatagramTransport, CameraInput] | None = None
+        self._tracker_input: tuple[asyncio.DatagramTransport, TrackerInput] | None = None
 
     @abstractmethod
     def encode(self, frame: FaceFrame) -> Iterable[bytes]:
@@ -73,17 +73,17 @@ class DatagramConnection(TargetConnection):
                         self.problem = ""
                     except OSError as error:
                         self.problem = f"cannot reach {self.target.host}: {error.strerror}"
-                if self._camera is None and self.target.camera is not None:
-                    await self._open_camera(*self.target.camera)
+                if self._tracker_input is None and self.target.tracker_address is not None:
+                    await self._open_tracker_input(*self.target.tracker_address)
                 await asyncio.sleep(RETRY_S)
         finally:
             self._close()
-            if self._camera is not None:
-                self._camera[0].close()
+            if self._tracker_input is not None:
+                self._tracker_input[0].close()
 
-    async def _open_camera(self, host: str, port: int) -> None:
+    async def _open_tracker_input(self, host: str, port: int) -> None:
         try:
-            self._camera = await open_camera(host, port, self._forward)
+            self._tracker_input = await open_tracker_input(host, port, self._forward)
         except OSError as error:
             self.problem = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
 
@@ -97,7 +97,7 @@ class DatagramConnection(TargetConnection):
     def send(self, frame: FaceFrame) -> bool:
         """Send the datagrams of a frame, unless a tracker's packets contain its mouth."""
         self._newest_frame = frame
-        if self._camera is not None and self._camera[1].is_live:
+        if self._tracker_input is not None and self._tracker_input[1].is_live:
             return True
         return self._send(self.encode(frame))
 

@@ -62,7 +62,11 @@ def parse_target(url: str) -> Target:
 def _check_combination(target: Target) -> None:
     if target.is_mouth_only and target.options.get("head") == "on":
         raise UserError("only=mouth lets another program control the head; leave out head=on")
-    if target.camera is not None and is_loopback(target.host) and target.camera[1] == target.port:
+    if (
+        target.tracker_address is not None
+        and is_loopback(target.host)
+        and target.tracker_address[1] == target.port
+    ):
         raise UserError(
             f"camera={target.port} is the port of the avatar program itself; choose another port,"
             " and set the tracker to send to it"

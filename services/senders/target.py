@@ -54,13 +54,15 @@ class Target:
     @property
     def is_local(self) -> bool:
         """Whether the target, and the tracker if any, are on this machine."""
-        return is_loopback(self.host) and (self.camera is None or is_loopback(self.camera[0]))
+        return is_loopback(self.host) and (
+            self.tracker_address is None or is_loopback(self.tracker_address[0])
+        )
 
     @property
-    def camera(self) -> tuple[str, int] | None:
+    def tracker_address(self) -> tuple[str, int] | None:
         """Address and port on which a tracker's packets arrive, if any."""
         option = self.options.get("camera", "")
-        return parse_camera(option) if option else None
+        return parse_tracker_address(option) if option else None
 
 
 def is_host(text: str) -> bool:
@@ -72,7 +74,7 @@ def is_host(text: str) -> bool:
     return True
 
 
-def parse_camera(option: str) -> tuple[str, int]:
+def parse_tracker_address(option: str) -> tuple[str, int]:
     """Return the address and port of ``PORT`` (this machine only) or ``ADDRESS:PORT``.
 
     Raises ``UserError`` if the port is not a number from 1 to 65535, or the address is invalid.

@@ -11,7 +11,7 @@ name these as Apple (jawOpen) or as Unity does (JawOpen), and case may matter, s
 Unity's axes are x to the model's right, y up, z to the front, left-handed. A bone message also
 contains a position that is unknown here. It is sent as 0, and only some receivers ignore it.
 Therefore head rotation is off unless ``head=on``. ``camera=`` receives a tracker's messages
-(:mod:`kouxing.services.senders.camera`).
+(:mod:`kouxing.services.senders.tracker_input`).
 """
 
 from collections.abc import Iterator

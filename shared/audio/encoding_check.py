@@ -18,7 +18,7 @@ Measure = tuple[float, float, float]  # spectral flatness, correlation of neighb
 
 BLOCK = 2400  # samples per channel that are checked together; a multiple of all sample sizes
 _MAX_BLOCKS = 60  # non-silent blocks after which the check ends
-_MAX_REFUSED = 2  # blocks that are not PCM after which the data is rejected
+_MAX_REJECTED_BLOCKS = 2  # blocks that are not PCM after which the data is rejected
 _MIN_SOUND = 3  # blocks of sound that end the check
 _SEGMENT = 200  # samples of a spectrum
 _MAX_SAMPLE = 1.5  # largest plausible sample in another encoding
@@ -76,7 +76,7 @@ class EncodingCheck:
         self._waiting = b""
         self._num_blocks = 0  # number of non-silent blocks
         self._num_sound = 0
-        self._refused: list[str] = []  # likely encodings of the rejected blocks
+        self._rejected_encodings: list[str] = []  # likely encodings of the rejected blocks
         self._packet_starts: list[int] = []
 
     def check(self, message: bytes) -> None:
@@ -148,9 +148,9 @@ class EncodingCheck:
             self._is_done = self._num_sound == _MIN_SOUND
 
     def _reject(self, kind: str) -> None:
-        self._refused.append(kind)
-        if len(self._refused) == _MAX_REFUSED:
-            kinds = " or ".join(sorted(set(self._refused)))
+        self._rejected_encodings.append(kind)
+        if len(self._rejected_encodings) == _MAX_REJECTED_BLOCKS:
+            kinds = " or ".join(sorted(set(self._rejected_encodings)))
             self._error = (
                 f"expected s16le samples; this looks like noise, perhaps {kinds}: decode it if it"
                 " is compressed, or convert it if it has another encoding"

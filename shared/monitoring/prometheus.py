@@ -24,7 +24,7 @@ from prometheus_client.core import (
 from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.metrics import BUCKETS_MS, Distribution, Metrics
 
-REQUEST_LIMIT_S = 5.0  # limit for a peer to send its request and read the answer
+REQUEST_TIMEOUT_S = 5.0  # limit for a peer to send its request and read the answer
 MAX_REQUESTS = 16  # concurrent requests; above this, the oldest connection is closed
 # Counters with these prefixes become one metric with a label: name, label and help text.
 LABELED = {
@@ -143,7 +143,7 @@ class MetricsServer(ThreadingHTTPServer):
 
 
 class _Handler(MetricsHandler):
-    timeout = REQUEST_LIMIT_S
+    timeout = REQUEST_TIMEOUT_S
     server: MetricsServer
 
     def send_header(self, keyword: str, value: str) -> None:

@@ -46,7 +46,7 @@ class ProbeResult(Enum):
     """Result of an attempt to connect to an endpoint."""
 
     ACCEPTED = "accepted"
-    REFUSED = "refused"  # the service rejects this key, or has another key
+    REJECTED = "rejected"  # the service rejects this key, or has another key
     UNREACHABLE = "unreachable"
 
 
@@ -130,8 +130,8 @@ class Bus:
         self.drop(probe, linger_s=0.0)
         if zmq.EVENT_HANDSHAKE_SUCCEEDED in events:
             return ProbeResult.ACCEPTED
-        is_refused = {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
-        return ProbeResult.REFUSED if is_refused else ProbeResult.UNREACHABLE
+        is_rejected = {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
+        return ProbeResult.REJECTED if is_rejected else ProbeResult.UNREACHABLE
 
     def wake_on_connections(self, waker: Waker) -> None:
         """Wake the caller's loop when a connection ends, or while a message is incomplete."""

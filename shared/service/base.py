@@ -18,9 +18,9 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar
 
+from kouxing_client.connection_check import explain_unreachable
 from kouxing_client.keys import Key
 from kouxing_client.messages import Message, SessionFacts
-from kouxing_client.reach import reach_error
 
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.errors import UserError
@@ -317,7 +317,7 @@ class Service(MessageLoop):
         sessions, load = self.session_progress(), self.load_meter.load(now_s)
         is_idle = not sessions or self.kind.role != "worker"
         self._heartbeat_due_s = now_s + (IDLE_HEARTBEAT_S if is_idle else HEARTBEAT_S)
-        parent_process.send_pulse(is_idle=is_idle)
+        parent_process.write_heartbeat(is_idle=is_idle)
         self.metrics.values |= {"sessions": len(sessions), "load": load, **self.gauges()}
         if now_s >= self._snapshot_due_s:
             self._snapshot_due_s = now_s + SNAPSHOT_S
@@ -367,12 +367,12 @@ class Service(MessageLoop):
     def _warn_about_control(self) -> None:
         """Log why control does not answer, with the remedy. Runs on a thread, because it waits."""
         host, port = split_endpoint(self.config.control, "control")
-        if reason := reach_error(host, port, is_zeromq=True):
+        if reason := explain_unreachable(host, port, is_zeromq=True):
             LOG.warning("waiting for control at %s: %s", self.config.control, reason)
             return
         try:
             with Bus(self.key) as bus:
-                if bus.probe(self.control_endpoint) is not ProbeResult.REFUSED:
+                if bus.probe(self.control_endpoint) is not ProbeResult.REJECTED:
                     return
             if self.key is not None and self._load_key() != self.key:
                 LOG.warning("restarting with a new key")

@@ -8,8 +8,9 @@ import contextlib
 import os
 
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # process id
-PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that gets a byte per heartbeat
-IDLE_PULSE = b"-"  # the byte of a service that sends a heartbeat only every second
+# file descriptor of a pipe that gets a byte per heartbeat
+HEARTBEAT_PIPE_VARIABLE = "_KOUXING_HEARTBEAT_PIPE"
+IDLE_HEARTBEAT = b"-"  # the byte of a service that sends a heartbeat only every second
 _PARENT = int(os.environ.get(PARENT_VARIABLE, "0"))  # 0: no such process
 
 
@@ -18,8 +19,8 @@ def has_exited() -> bool:
     return _PARENT != 0 and os.getppid() != _PARENT
 
 
-def send_pulse(*, is_idle: bool) -> None:
+def write_heartbeat(*, is_idle: bool) -> None:
     """Write the byte of a heartbeat to the pipe, if the pipe exists."""
-    if pulse := os.environ.get(PULSE_VARIABLE):
+    if pipe := os.environ.get(HEARTBEAT_PIPE_VARIABLE):
         with contextlib.suppress(OSError):  # the pipe is full, or the process has exited
-            os.write(int(pulse), IDLE_PULSE if is_idle else b".")
+            os.write(int(pipe), IDLE_HEARTBEAT if is_idle else b".")

@@ -22,7 +22,7 @@ HEADS = {"woman": PAGE / "head.glb", "man": PAGE / "head-man.glb"}
 @pytest.fixture(autouse=True)
 def _wait_for_last_phones(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let clients wait longer for the last phones on a busy machine."""
-    monkeypatch.setattr("kouxing_client.session_core.END_LIMIT_S", LIMIT_S)
+    monkeypatch.setattr("kouxing_client.session_core.END_TIMEOUT_S", LIMIT_S)
 
 
 class CommandRunner:

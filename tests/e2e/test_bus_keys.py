@@ -92,7 +92,7 @@ def test_a_socket_accepts_only_keys_of_its_role(
     router, endpoint = server.router("some.setting", role=required)
     with Bus(load_key("rejected", rejected)) as bus:
         bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
-        assert bus.probe(endpoint) is ProbeResult.REFUSED
+        assert bus.probe(endpoint) is ProbeResult.REJECTED
         assert_receives_only(router, endpoint, load_key("accepted", accepted))
 
 
@@ -105,8 +105,8 @@ def test_rejects_a_key_of_another_system(
         key, control = load_key("grant", ("client",)), load_key("control", ())
     with Bus(key) as bus:
         bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
-        assert bus.probe(endpoint) is ProbeResult.REFUSED
-        assert bus.probe(with_key(router.endpoint, control.public)) is ProbeResult.REFUSED
+        assert bus.probe(endpoint) is ProbeResult.REJECTED
+        assert bus.probe(with_key(router.endpoint, control.public)) is ProbeResult.REJECTED
         assert_receives_only(router, endpoint, load_key("screen", ("subscriber:*",)))
 
 
@@ -202,14 +202,14 @@ def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
     with service.bus, Bus(key) as bus:
         router = service.bus.bind_router(LOCAL, "recognizer.audio")
         endpoint = with_key(router.endpoint, service.key.public if service.key else "")
-        assert bus.probe(endpoint) is ProbeResult.REFUSED
+        assert bus.probe(endpoint) is ProbeResult.REJECTED
         key_folder().chmod(0o755)  # nothing is written there
         allowed = {key.public: AllowedKey(name="laptop", roles=["client"])}
         service._allow_keys(allowed)
         assert "until this process ends: other users can read" in caplog.text
-        assert bus.probe(endpoint) is not ProbeResult.REFUSED
+        assert bus.probe(endpoint) is not ProbeResult.REJECTED
         service._allow_keys({})
-        assert bus.probe(endpoint) is ProbeResult.REFUSED
+        assert bus.probe(endpoint) is ProbeResult.REJECTED
 
 
 @pytest.mark.parametrize(

@@ -144,7 +144,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
         stranger.send(Progress())
         assert isinstance(next(received_by(stranger)), Error), "it gets no sequence number"
     with Bus(load_user_key()) as bus:
-        assert bus.probe(endpoint) is ProbeResult.REFUSED, "a client does not even get in"
+        assert bus.probe(endpoint) is ProbeResult.REJECTED, "a client does not even get in"
 
 
 @pytest.fixture

@@ -62,7 +62,7 @@ def expected(client: Client) -> ReceivedResults:
 
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
+    monkeypatch.setattr("kouxing.evaluation.system.live.END_TIMEOUT_S", 60.0)
 
 
 def stream_live(

@@ -114,7 +114,7 @@ def test_renders_a_sound_as_curves_and_converts_them(tmp_path: Path) -> None:
     faps = read_fap(fap)
     assert faps.frame_rate_hz == 50
     assert np.ptp(faps.faps[:, 2]) > 100
-    render(fap, lines, form=CurveFormat.ARKIT)
+    render(fap, lines, curve_format=CurveFormat.ARKIT)
     frames = [json.loads(line) for line in lines.read_text().splitlines()]
     jaw = [frame["arkit"]["jawOpen"] for frame in frames]
     assert np.corrcoef(jaw, faps.faps[:, 2])[0, 1] > 0.8

@@ -76,7 +76,7 @@ def test_refuses_one_session_too_many_and_the_others_continue(
     system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
-    monkeypatch.setattr("kouxing.evaluation.system.live.END_LIMIT_S", 60.0)
+    monkeypatch.setattr("kouxing.evaluation.system.live.END_TIMEOUT_S", 60.0)
     samples = SAMPLES[:24000]
     with Client(system.control) as client:
         alone = stream_audio(system.control, samples)

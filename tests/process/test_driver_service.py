@@ -220,7 +220,7 @@ def test_the_recorder_ends_when_there_is_no_video(
 def test_a_stopping_driver_saves_the_finished_part_of_a_video(
     harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder_client, "CLOSE_LIMIT_S", 60.0)
+    monkeypatch.setattr(recorder_client, "CLOSE_TIMEOUT_S", 60.0)
     harness.start("film", record=True)
     for number in range(26):
         harness.publish("film", number, 100.0)

@@ -289,7 +289,9 @@ def test_registers_at_an_address_where_another_program_answered_before(
 ) -> None:
     for limit in ("NO_REPLY_S", "FIRST_REPLY_S"):
         monkeypatch.setattr(f"kouxing.shared.service.base.{limit}", 0.3)
-    monkeypatch.setattr("kouxing.shared.service.base.reach_error", lambda *_, **__: "not asked")
+    monkeypatch.setattr(
+        "kouxing.shared.service.base.explain_unreachable", lambda *_, **__: "not asked"
+    )
     listener = socket.create_server(("127.0.0.1", 0))
     commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
     worker = Worker(commands)

@@ -18,7 +18,7 @@ from aiohttp import web
 
 from kouxing.services.gateway.uploads import audio_upload
 from kouxing.services.gateway.uploads.audio_upload import REMARKS_HEADER, AudioUploadHandler
-from kouxing.services.gateway.uploads.mouth_learner import MAX_BYTES, MouthLearner
+from kouxing.services.gateway.uploads.learn_mouth_handler import MAX_BYTES, LearnMouthHandler
 from kouxing.services.gateway.uploads.upload_handler import UploadHandler
 from kouxing.services.gateway.web.access import AccessPolicy
 from kouxing.services.gateway.web.web_application import make_application
@@ -68,8 +68,8 @@ async def serve(uploads: UploadHandler) -> AsyncIterator[Post]:
             await runner.cleanup()
 
 
-def fake_learner(program: str) -> MouthLearner:
-    return MouthLearner((sys.executable, "-c", program))
+def fake_learner(program: str) -> LearnMouthHandler:
+    return LearnMouthHandler((sys.executable, "-c", program))
 
 
 def error(status: int, text: str) -> Answer:
@@ -127,7 +127,7 @@ async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
         process = await process_in(path)
         assert os.getpriority(os.PRIO_PROCESS, process) == 19
         assert hanging.is_running
-        assert await post() == error(503, MouthLearner.busy_text)
+        assert await post() == error(503, LearnMouthHandler.busy_text)
         hanging.close()
         assert await first == error(422, "the gateway is stopping")
         await wait_until_ended(process)

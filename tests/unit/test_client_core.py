@@ -6,13 +6,13 @@ from typing import Any, cast
 import pytest
 from kouxing_client import SHAPE_NAMES, FapFrame, KouxingError, Phone
 from kouxing_client.audio import ANSWER_LIMITS_S
+from kouxing_client.connection_check import NO_LISTENER
 from kouxing_client.core import MAX_FAILED_OPENINGS, RETRY_S, ClientCore
 from kouxing_client.inbox import Inbox
 from kouxing_client.messages import EndOfFaps, Joined
-from kouxing_client.reach import NO_LISTENER
 from kouxing_client.session_core import (
     LAST_S,
-    MOVE_LIMIT_S,
+    MOVE_TIMEOUT_S,
     RESUBSCRIBE_S,
     SILENT_S,
     SessionCore,
@@ -104,7 +104,7 @@ def test_repeats_a_request_until_the_time_limit() -> None:
     answer = harness.core.request("flush-session", "s")
     harness.pass_time(10.1)
     assert "rejects this client" in str(answer.exception(0))
-    harness.sockets.reach_error = "another program answers there"
+    harness.sockets.unreachable_reason = "another program answers there"
     answer = harness.core.request("flush-session", "s")
     harness.pass_time(10.1)
     assert "control does not answer: another program" in str(answer.exception(0))
@@ -130,7 +130,7 @@ def test_a_bad_request_does_not_affect_other_requests(unnamed: dict[str, str]) -
 def test_reports_early_that_nothing_listens_at_an_address(reason: str) -> None:
     sockets = FakeSockets()
     core = ClientCore(cast(Any, sockets), "control", 10.0, START_S)
-    sockets.reach_error = reason
+    sockets.unreachable_reason = reason
     answer = core.request("flush-session", "s")
     for _ in range(2):
         assert not answer.done()
@@ -146,7 +146,7 @@ def test_reports_early_that_nothing_listens_at_an_address(reason: str) -> None:
 
 def test_a_restarting_control_has_the_whole_time_limit() -> None:
     harness = CoreHarness()
-    harness.sockets.reach_error = NO_LISTENER
+    harness.sockets.unreachable_reason = NO_LISTENER
     answer = harness.core.request("flush-session", "s")
     harness.pass_time(9.9)
     assert not answer.done()
@@ -223,10 +223,10 @@ def test_an_unknown_session_ends_unless_it_moves() -> None:
     harness.audio().answer("error", code="bad-audio", text="y")
     assert [error.code for error in harness.session.errors] == ["bad-audio"]
     harness.commands.answer("session-moved", **MOVED, next_sequence=1)
-    harness.pass_time(MOVE_LIMIT_S + 0.1)
+    harness.pass_time(MOVE_TIMEOUT_S + 0.1)
     assert not harness.session.is_over
     harness.audio(2).answer("error", code="unknown-session", text="x")
-    harness.pass_time(MOVE_LIMIT_S + 0.1)
+    harness.pass_time(MOVE_TIMEOUT_S + 0.1)
     assert harness.session.is_over
     assert "unknown-session" in str(harness.session.failure)
 

@@ -24,7 +24,7 @@ def test_the_exchange_with_the_shortest_round_trip_gives_the_offset() -> None:
 
 
 def test_a_pause_beyond_the_limit_is_a_stall_unless_the_clock_restarts() -> None:
-    stall = StallDetector(now_s=10.0, limit_s=0.5)
+    stall = StallDetector(now_s=10.0, min_stall_s=0.5)
     assert stall.check(10.4) == 0.0
     assert stall.check(11.3, expected_s=0.5) == 0.0
     assert stall.resumed_at_s == -math.inf
@@ -57,7 +57,7 @@ def test_only_long_faults_are_reported_with_their_end(
         LOG.addHandler(caplog.handler)
         faults.begin("recognizer-1", "no heartbeat", 10.0)
         for tick in range(1, 20):
-            faults.report(10.0 + min(tick * 0.1, lasts_s))
+            faults.warn(10.0 + min(tick * 0.1, lasts_s))
         faults.end("recognizer-1", 10.0 + lasts_s)
         faults.end("recognizer-1", 20.0)
         LOG.removeHandler(caplog.handler)

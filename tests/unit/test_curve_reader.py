@@ -42,7 +42,7 @@ def face_curves() -> FrameStream:
 )
 def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveFormat, has_head: bool) -> None:
     path, curves = tmp_path / name, face_curves()
-    CURVE_EXPORTERS[path.suffix](path, ExportOptions(form=form)).write(curves)
+    CURVE_EXPORTERS[path.suffix](path, ExportOptions(curve_format=form)).write(curves)
     animation = read_table(path)
     assert animation.frame_rate_hz == pytest.approx(RATE_HZ)
     faps = np.array([row for _, _, row in curves.rows])
@@ -52,7 +52,9 @@ def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveFormat, has_h
 
 def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:
     path = tmp_path / "take.csv"
-    CURVE_EXPORTERS[".csv"](path, ExportOptions(form=CurveFormat.LIVELINK)).write(face_curves())
+    CURVE_EXPORTERS[".csv"](path, ExportOptions(curve_format=CurveFormat.LIVELINK)).write(
+        face_curves()
+    )
     header, *rows = csv.reader(path.read_text().splitlines())
     assert header[:3] == ["Timecode", "BlendShapeCount", "EyeBlinkLeft"]
     assert header[16:20] == ["JawForward", "JawRight", "JawLeft", "JawOpen"]

@@ -19,7 +19,7 @@ def failed_endpoints(
     keys: list[str], monkeypatch: pytest.MonkeyPatch, *, is_one_host: bool = False
 ) -> set[str]:
     """Return the endpoints that doctor reports on a host with these keys that reaches none."""
-    monkeypatch.setattr(doctor, "reach_error", lambda *_, **__: "no route")
+    monkeypatch.setattr(doctor, "explain_unreachable", lambda *_, **__: "no route")
     buses: dict[str, Bus] = dict.fromkeys(keys, mock.create_autospec(Bus))
     failed = set()
     for service, endpoints in ELSEWHERE.items():

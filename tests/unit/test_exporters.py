@@ -30,10 +30,10 @@ def rows(number: int = 5) -> list[FrameRow]:
     return [(index / RATE_HZ, index, faps[index]) for index in range(number)]
 
 
-def export(output: Path, form: CurveFormat = CurveFormat.FAPS) -> None:
+def export(output: Path, curve_format: CurveFormat = CurveFormat.FAPS) -> None:
     frames = [(time_s, faps) for time_s, _, faps in rows()]
     motion = FaceMotion(frames, RATE_HZ, 25.0, samples=None)
-    exporter = open_exporter(output, ExportOptions(form=form))
+    exporter = open_exporter(output, ExportOptions(curve_format=curve_format))
     assert exporter.export(motion, Progress(disable=True)) == len(frames)
 
 
@@ -80,15 +80,27 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("output", "options", "message"),
     [
-        ("a.fap", {"form": CurveFormat.ARKIT}, "holds faps; for arkit, write .csv"),
-        ("a.glb", {"form": CurveFormat.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
+        ("a.fap", {"curve_format": CurveFormat.ARKIT}, "holds faps; for arkit, write .csv"),
+        (
+            "a.glb",
+            {"curve_format": CurveFormat.OCULUS},
+            "holds faps or arkit; for oculus, write .csv",
+        ),
         ("a.csv", {"lips": ["dynamic-visemes", "learned"]}, "a curve file holds one face"),
         ("no/a.csv", {}, "cannot write"),
         ("no/a.mp4", {}, "cannot write"),
-        ("a.jsonl", {"form": CurveFormat.LIVELINK}, "for livelink, write .csv"),
-        ("a.csv", {"form": CurveFormat.RHUBARB}, "for rhubarb, write .tsv or .xml or .json"),
-        ("a.tsv", {"form": CurveFormat.ARKIT}, "holds rhubarb or oculus; for arkit, write .csv"),
-        ("a.mp4", {"form": CurveFormat.ARKIT}, "--as does not apply .* .fap, .csv"),
+        ("a.jsonl", {"curve_format": CurveFormat.LIVELINK}, "for livelink, write .csv"),
+        (
+            "a.csv",
+            {"curve_format": CurveFormat.RHUBARB},
+            "for rhubarb, write .tsv or .xml or .json",
+        ),
+        (
+            "a.tsv",
+            {"curve_format": CurveFormat.ARKIT},
+            "holds rhubarb or oculus; for arkit, write .csv",
+        ),
+        ("a.mp4", {"curve_format": CurveFormat.ARKIT}, "--as does not apply .* .fap, .csv"),
         ("a.csv", {"size": "640x360"}, "--size does not apply .* .mp4"),
         ("a.fap", {"rate_hz": 30.0}, "--rate does not apply .* .mp4"),
         ("a.png", {"rate_hz": 30.0}, "--rate does not apply"),

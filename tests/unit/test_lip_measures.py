@@ -99,7 +99,7 @@ def test_counts_missed_and_false_closures() -> None:
     real = lips_closed_during((0.5, 0.5), (1.5, 1.5), (2.5, 2.5))
     predicted = lips_closed_during((0.54, 0.56), (2.0, 2.1), (2.4, 2.46), (3.5, 3.5))
     hits = closures(predicted, real)
-    assert hits == DetectionCounts(real=3, met=2, predicted=4, true=2)
+    assert hits == DetectionCounts(real=3, reproduced=2, predicted=4, true=2)
     assert hits.recall == pytest.approx(2 / 3)
     assert hits.precision == 0.5
     assert hits.f1 == pytest.approx(4 / 7)
@@ -119,7 +119,7 @@ def test_closures_after_the_end_of_the_clip_do_not_count() -> None:
     is_known = real.time_s < 3.0
     curves = {"opening": real.opening[is_known]}
     clip = Mouth(real.time_s[is_known], curves, real.is_closed[is_known])
-    assert closures(predicted, clip) == DetectionCounts(real=2, met=1, predicted=1, true=1)
+    assert closures(predicted, clip) == DetectionCounts(real=2, reproduced=1, predicted=1, true=1)
 
 
 def test_real_lips_are_closed_in_the_lowest_tenth_of_their_range() -> None:

@@ -139,7 +139,7 @@ SHORT_TEXT_GRID = f"""File type = "ooTextFile"
 @pytest.mark.parametrize("form", TEXTS)
 def test_extracts_the_spoken_text(form: str) -> None:
     spoken = extract_text(TEXTS[form])
-    assert spoken.form == form
+    assert spoken.format_name == form
     transcript = MANDARIN.read(spoken.text)
     assert "".join(syllable.text for syllable in transcript.syllables) == SPOKEN_TEXT
     assert transcript.dropped == ()

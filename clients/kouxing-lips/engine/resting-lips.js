@@ -16,7 +16,7 @@ export class RestingLips {
   #startS = Infinity;
   #knownS = -Infinity;
   #soundS = -Infinity;
-  #staysShut = false;
+  #staysClosed = false;
   #isClosedByPhone = false;
   #timeS = Infinity;
   #goal = 0;
@@ -41,14 +41,14 @@ export class RestingLips {
   followVoice(timeS) {
     while (this.#changes[0]?.timeS <= timeS) {
       const change = this.#changes.shift();
-      if (change.active && !this.#isVoice) [this.#soundS, this.#staysShut] = [change.timeS, false];
+      if (change.active && !this.#isVoice) [this.#soundS, this.#staysClosed] = [change.timeS, false];
       this.#isVoice = change.active;
       this.#hasSpoken ||= change.active;
     }
     while (this.#levels[0]?.[0] <= timeS) {
       const [levelS, levelDb] = this.#levels.shift();
       this.#updateBackground(levelDb);
-      if (this.#isSound(levelDb)) [this.#soundS, this.#staysShut] = [levelS, false];
+      if (this.#isSound(levelDb)) [this.#soundS, this.#staysClosed] = [levelS, false];
     }
   }
 
@@ -61,7 +61,7 @@ export class RestingLips {
     const isSilent = this.#isVoice && this.#knownS > timeS + c.LAST_SOUND_S && nextS > this.#knownS;
     const isOnset = c.YIELD_S < nextS - timeS && nextS - timeS <= c.LIKELY_BEFORE_S;
     if (closure >= (isOnset ? c.LIKELY : c.CERTAIN)) {
-      this.#staysShut ||= isSilent || isOnset;
+      this.#staysClosed ||= isSilent || isOnset;
       return 0;
     }
     if (this.#goal > 0) return Infinity;
@@ -74,7 +74,7 @@ export class RestingLips {
     const nextS = this.#nextSoundS();
     if (this.#hasEnded) this.#setGoal(0, c.END_S);
     else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#setGoal(1, c.PART_S);
-    else if (this.#isClosedByPhone || this.#staysShut || nextS <= timeS + c.YIELD_S) this.#setGoal(0, c.YIELD_S);
+    else if (this.#isClosedByPhone || this.#staysClosed || nextS <= timeS + c.YIELD_S) this.#setGoal(0, c.YIELD_S);
     else if (timeS < this.#startS + c.START_S || this.#closesForOnset(timeS)) this.#setGoal(0, c.ONSET_CLOSE_S);
     else if (timeS > this.#soundS + c.HOLD_S) this.#setGoal(0, c.CLOSE_S);
     else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#setGoal(1, c.PART_S);

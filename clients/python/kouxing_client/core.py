@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
+from kouxing_client.connection_check import NO_LISTENER
 from kouxing_client.errors import KouxingError, NotConnected, Refused
 from kouxing_client.inbox import Inbox, new_future
 from kouxing_client.messages import (
@@ -27,7 +28,6 @@ from kouxing_client.messages import (
     kind_of,
     topic,
 )
-from kouxing_client.reach import NO_LISTENER
 from kouxing_client.session_core import SILENT_S, SessionCore, refused
 
 if TYPE_CHECKING:

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
 
 RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect again
-MOVE_LIMIT_S = 5.0  # limit for the move of a session whose recognizer is lost
-END_LIMIT_S = 5.0  # maximum wait for the last phones after the last frame
+MOVE_TIMEOUT_S = 5.0  # limit for the move of a session whose recognizer is lost
+END_TIMEOUT_S = 5.0  # maximum wait for the last phones after the last frame
 LAST_S = 0.5  # wait for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
 SILENT_S = 2.0  # without results for this time, a session may have moved or ended
@@ -84,7 +84,7 @@ class Subscription:
             live=session.is_live,
             on_complete=self._on_complete,
         )
-        self._end_limit_s = math.inf
+        self._end_deadline_s = math.inf
         self._awaits_last_phones = False
 
     def start(self) -> None:
@@ -95,8 +95,8 @@ class Subscription:
     def tick(self) -> None:
         """Check for expired deadlines; call this regularly."""
         self.follower.tick()
-        if self.follower.has_ended and self._session.sockets.now_s > self._end_limit_s:
-            self._end_limit_s = math.inf
+        if self.follower.has_ended and self._session.sockets.now_s > self._end_deadline_s:
+            self._end_deadline_s = math.inf
             self.inbox.end(None)
 
     def end(self, failure: KouxingError | None) -> None:
@@ -133,7 +133,7 @@ class Subscription:
         if Phone not in self._classes:
             self.inbox.end(None)
             return
-        self._end_limit_s = self._session.sockets.now_s + END_LIMIT_S
+        self._end_deadline_s = self._session.sockets.now_s + END_TIMEOUT_S
         self._awaits_last_phones = False
         if self.follower.is_complete:
             self._await_last_phones()
@@ -287,7 +287,7 @@ class SessionCore:
             subscription.tick()
         if self._closing and now_s > self._closing[0]:
             self.end(KouxingError(f"control has closed the session: {self._closing[1]}"))
-        elif self._unknown and now_s > self._unknown[0] + MOVE_LIMIT_S:
+        elif self._unknown and now_s > self._unknown[0] + MOVE_TIMEOUT_S:
             self.end(self._unknown[1])
         elif self.stream is not None:
             if self.stream.is_stuck(now_s):

@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection
 import zmq
 from zmq.utils.monitor import parse_monitor_message
 
+from kouxing_client.connection_check import explain_unreachable
 from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
 from kouxing_client.messages import Decoders, Message, topic
-from kouxing_client.reach import reach_error
 
 QUEUE = 20_000  # messages: a subscriber to a recording may pause for 400 s
 LIVE_BUFFER = 65_536  # bytes in the kernel: some seconds of FAP frames, over any distance
@@ -210,7 +210,9 @@ class Sockets:
         host, _, port = address.removeprefix("tcp://").rpartition(":")
 
         def run() -> None:
-            reason = reach_error(host, port, _REACH_S, is_zeromq=True) if port.isdigit() else ""
+            reason = (
+                explain_unreachable(host, port, _REACH_S, is_zeromq=True) if port.isdigit() else ""
+            )
             self.call(lambda: on_reason(reason))
 
         threading.Thread(target=run, daemon=True).start()

@@ -26,7 +26,7 @@ from kouxing.shared.settings.config import BindAddress, Settings, bound_keys, va
 from kouxing.shared.settings.keys import format_key, load_key
 
 NAMESPACE = "kouxing"  # namespace of the actors' names
-PLACEMENT_LIMIT_S = 60.0  # maximum wait for Ray to start one actor per core
+PLACEMENT_TIMEOUT_S = 60.0  # maximum wait for Ray to start one actor per core
 
 
 class Worker:
@@ -124,7 +124,7 @@ class RayWorkers:
         num_ready = min(len(answers), num_cores)
         placed = []
         if num_ready:
-            placed, _ = ray.wait([*answers], num_returns=num_ready, timeout=PLACEMENT_LIMIT_S)
+            placed, _ = ray.wait([*answers], num_returns=num_ready, timeout=PLACEMENT_TIMEOUT_S)
         if len(placed) == num_cores:
             reason = "waits for a free core"
         elif ray.available_resources().get("CPU", 0) >= 1:

@@ -12,7 +12,11 @@ from typing import Any
 
 from kouxing.shared.clock import StallDetector
 from kouxing.shared.service.base import HEARTBEAT_S, IDLE_HEARTBEAT_S
-from kouxing.shared.service.parent_process import IDLE_PULSE, PARENT_VARIABLE, PULSE_VARIABLE
+from kouxing.shared.service.parent_process import (
+    HEARTBEAT_PIPE_VARIABLE,
+    IDLE_HEARTBEAT,
+    PARENT_VARIABLE,
+)
 
 POLL_S = 0.5  # interval between checks of a process
 SILENT_S = 1.0  # a loop that sends no heartbeat for longer may hang
@@ -23,8 +27,8 @@ class ServiceProcess(subprocess.Popen[bytes]):
     """Runs ``python -m kouxing.services.process KIND``. It ends when this process ends.
 
     ``environment`` is complete except for two variables. A loop counts as hung if it sends no
-    heartbeat for ``hang_limit_s``. The limit is 0.75 s longer after ``IDLE_PULSE``. Other options
-    have the types of ``subprocess.Popen``.
+    heartbeat for ``hang_limit_s``. The limit is 0.75 s longer after ``IDLE_HEARTBEAT``. Other
+    options have the types of ``subprocess.Popen``.
     """
 
     def __init__(
@@ -36,11 +40,11 @@ class ServiceProcess(subprocess.Popen[bytes]):
         hang_limit_s: float = HANG_S,
         **options: Any,
     ) -> None:
-        self._pulse, write_end = os.pipe()
-        weakref.finalize(self, os.close, self._pulse)
-        for end in (self._pulse, write_end):
+        self._heartbeats, write_end = os.pipe()
+        weakref.finalize(self, os.close, self._heartbeats)
+        for end in (self._heartbeats, write_end):
             os.set_blocking(end, False)
-        added = {PARENT_VARIABLE: str(os.getpid()), PULSE_VARIABLE: str(write_end)}
+        added = {PARENT_VARIABLE: str(os.getpid()), HEARTBEAT_PIPE_VARIABLE: str(write_end)}
         try:
             super().__init__(
                 [sys.executable, "-m", "kouxing.services.process", kind, *arguments],
@@ -59,10 +63,10 @@ class ServiceProcess(subprocess.Popen[bytes]):
         """Update the state of the process. Call this about every ``POLL_S``."""
         self._silence.update(time.monotonic(), self._waited_s())
         with contextlib.suppress(BlockingIOError):
-            if pulses := os.read(self._pulse, 65536):
+            if heartbeats := os.read(self._heartbeats, 65536):
                 self.reset_silence()
                 self.is_ready = True
-                is_idle = pulses.endswith(IDLE_PULSE)
+                is_idle = heartbeats.endswith(IDLE_HEARTBEAT)
                 self._idle_s = IDLE_HEARTBEAT_S - HEARTBEAT_S if is_idle else 0.0
 
     @property
@@ -93,7 +97,7 @@ class SilenceMeter:
 
     def __init__(self, now_s: float) -> None:
         self.duration_s = 0.0
-        self._stall = StallDetector(now_s, limit_s=2 * POLL_S)  # detects stalls of the caller
+        self._stall = StallDetector(now_s, min_stall_s=2 * POLL_S)  # detects stalls of the caller
         self._waited_s = 0.0
 
     def update(self, now_s: float, waited_s: float) -> None:

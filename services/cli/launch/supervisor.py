@@ -25,7 +25,7 @@ from kouxing.shared.errors import USER_ERROR, UserError, prefix_name
 from kouxing.shared.service.base import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # delays before restarting a service that crashed twice
-START_LIMIT_S = 120.0
+START_TIMEOUT_S = 120.0
 STEADY_S = 10.0  # a service that has run for longer restarts without delay
 WORKER_HANG_S = 2.0  # workers never work for long at a time, unless the machine is overloaded
 
@@ -105,9 +105,9 @@ class Supervisor:
     def wait_ready(self, control: str) -> None:
         """Wait until all services have registered with control.
 
-        Raises ``UserError`` if a service cannot start, or this takes longer than ``START_LIMIT_S``.
+        Raises ``UserError`` if a service cannot start, or not within ``START_TIMEOUT_S``.
         """
-        end_s = time.monotonic() + START_LIMIT_S
+        end_s = time.monotonic() + START_TIMEOUT_S
         with connect_client(control, timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.check()

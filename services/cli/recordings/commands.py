@@ -101,7 +101,7 @@ def render(
         ),
     ] = None,
     language: Language = None,
-    form: Annotated[
+    curve_format: Annotated[
         CurveFormat | None,
         typer.Option(
             "--as",
@@ -182,8 +182,8 @@ def render(
         inputs.append(Path(text))
     check_output(*(existing_output(target) for _, target in pairs), inputs=inputs, force=force)
     options = ExportOptions(
-        lips=models, form=form, head=head, size=size, background=background, camera=camera,
-        rate_hz=rate, at_s=at, sound=sound, captions=captions, speed=speed,
+        lips=models, curve_format=curve_format, head=head, size=size, background=background,
+        camera=camera, rate_hz=rate, at_s=at, sound=sound, captions=captions, speed=speed,
     )  # fmt: skip
 
     wrong_texts: list[Path] = []
@@ -235,7 +235,7 @@ def phones(
     language: Language = None,
     acoustic: Acoustic = None,
     alphabet: PhoneAlphabet = None,
-    form: Form = None,
+    phone_format: Form = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="File to write; a folder for many files.")
     ] = None,
@@ -257,7 +257,7 @@ def phones(
     if len(audio) > 1 and output is None:
         raise UserError(f"{len(audio)} files need a folder for their phones; add -o FOLDER")
     is_folder = output is not None and (len(audio) > 1 or output.is_dir())
-    style = _format(form, None if is_folder else output)
+    style = _format(phone_format, None if is_folder else output)
     pairs: list[tuple[Path, Path | None]] = [(audio[0], output)]
     if is_folder:
         pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
@@ -287,7 +287,7 @@ def align(
     language: Language = None,
     acoustic: Acoustic = None,
     alphabet: PhoneAlphabet = None,
-    form: Form = None,
+    phone_format: Form = None,
     output: Output = None,
     track: AudioTrack = None,
     force: Force = False,
@@ -309,7 +309,7 @@ def align(
         from kouxing.shared.phones.inventory import load_inventory
         from kouxing.shared.phones.phone_files import format_phones
 
-    style = _format(form, output)
+    style = _format(phone_format, output)
     check_output(output, inputs=[audio, Path(text)], force=force)
     with show_loading():
         model = load_model_for_language(language, acoustic)
@@ -380,14 +380,16 @@ def lips(
     )
 
 
-def _format(form: PhoneFormat | None, output: Path | None) -> PhoneFormat:
+def _format(phone_format: PhoneFormat | None, output: Path | None) -> PhoneFormat:
     if output is None:
-        return form or PhoneFormat.TABLE
+        return phone_format or PhoneFormat.TABLE
     suffix_format = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
     if suffix_format is None:
         raise UserError(
             f"{output}: unknown format; use a name that ends in {', '.join(_FORMAT_OF_SUFFIX)}"
         )
-    if form not in (None, suffix_format):
-        raise UserError(f"{output}: --format {form} does not fit this name; leave out the option")
+    if phone_format not in (None, suffix_format):
+        raise UserError(
+            f"{output}: --format {phone_format} does not fit this name; leave out the option"
+        )
     return suffix_format

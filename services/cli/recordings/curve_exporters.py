@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float32]
 FrameRow = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
-_SHAPE_FORMS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
+_SHAPE_FORMATS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
 _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
 
 
@@ -60,23 +60,25 @@ class CurveExporter(ABC):
     """
 
     unit: ClassVar[str] = "frame"
-    options: ClassVar[frozenset[str]] = frozenset({"lips", "form"})
-    forms: ClassVar[tuple[CurveFormat, ...]]  # the first one is the default
+    options: ClassVar[frozenset[str]] = frozenset({"lips", "curve_format"})
+    formats: ClassVar[tuple[CurveFormat, ...]]  # the first one is the default
 
     def __init__(self, output: Path, options: ExportOptions) -> None:
-        form = options.form or self.forms[0]
-        if form not in self.forms:
-            suffixes = [name for name, cls in CURVE_EXPORTERS.items() if form in cls.forms]
+        curve_format = options.curve_format or self.formats[0]
+        if curve_format not in self.formats:
+            suffixes = [
+                name for name, cls in CURVE_EXPORTERS.items() if curve_format in cls.formats
+            ]
             raise UserError(
-                f"{output}: this format holds {' or '.join(self.forms)}; for {form}, write"
-                f" {' or '.join(suffixes)}"
+                f"{output}: this format holds {' or '.join(self.formats)}; for {curve_format},"
+                f" write {' or '.join(suffixes)}"
             )
         if len(options.lips) > 1:
             raise UserError("a curve file holds one face; use --lips only once")
         if not output.parent.is_dir():
             raise write_error(output, FileNotFoundError())
         self._output = output
-        self._form = form
+        self._curve_format = curve_format
         self._head = options.head
 
     def export(self, motion: FaceMotion, progress: Progress) -> int:
@@ -98,35 +100,35 @@ class CurveExporter(ABC):
 class CsvExporter(CurveExporter):
     """Writes comma-separated values, with a column for each FAP or shape."""
 
-    forms = tuple(form for form in CurveFormat if form is not CurveFormat.RHUBARB)
+    formats = tuple(name for name in CurveFormat if name is not CurveFormat.RHUBARB)
 
     def write(self, curves: FrameStream) -> int:
         """Write each frame when it arrives."""
-        if self._form is CurveFormat.LIVELINK:
+        if self._curve_format is CurveFormat.LIVELINK:
             columns = _LIVE_LINK_COLUMNS
             cells = (_live_link_cells(row) for row in curves.rows)
         else:
-            columns = ["time_s", *_value_names(self._form)]
+            columns = ["time_s", *_value_names(self._curve_format)]
             columns += [] if curves.phones is None else ["phone"]
-            cells = (_cells(row, self._form, curves.phones) for row in curves.rows)
+            cells = (_cells(row, self._curve_format, curves.phones) for row in curves.rows)
         return _write_lines(self._output, map(",".join, chain([columns], cells)), curves) - 1
 
 
 class JsonLinesExporter(CurveExporter):
     """Writes a JSON object for each frame."""
 
-    forms = (CurveFormat.FAPS, *_SHAPE_FORMS)
+    formats = (CurveFormat.FAPS, *_SHAPE_FORMATS)
 
     def write(self, curves: FrameStream) -> int:
         """Write each frame when it arrives."""
-        lines = (json_line(row, self._form, curves.phones) for row in curves.rows)
+        lines = (json_line(row, self._curve_format, curves.phones) for row in curves.rows)
         return _write_lines(self._output, lines, curves)
 
 
 class FapExporter(CurveExporter):
     """Writes an MPEG-4 ``.fap`` file."""
 
-    forms = (CurveFormat.FAPS,)
+    formats = (CurveFormat.FAPS,)
 
     def write(self, curves: FrameStream) -> int:
         """Write the frames when the last one has arrived."""
@@ -144,7 +146,7 @@ class GlbExporter(CurveExporter):
     """Writes the head as a GLB with the motion as an animation."""
 
     options = CurveExporter.options | {"head"}
-    forms = (CurveFormat.FAPS, CurveFormat.ARKIT)
+    formats = (CurveFormat.FAPS, CurveFormat.ARKIT)
 
     def write(self, curves: FrameStream) -> int:
         """Write the frames when the last one has arrived."""
@@ -152,7 +154,7 @@ class GlbExporter(CurveExporter):
         from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
 
         frames = [(time_s, faps) for time_s, _, faps in curves.rows]
-        is_arkit = self._form is CurveFormat.ARKIT
+        is_arkit = self._curve_format is CurveFormat.ARKIT
         export_glb(load_head(self._head), self._output, frames, as_arkit=is_arkit)
         return len(frames)
 
@@ -160,11 +162,11 @@ class GlbExporter(CurveExporter):
 class CueExporter(CurveExporter):
     """Writes cues in a format of Rhubarb Lip Sync: drawn mouths, or Oculus visemes."""
 
-    forms = tuple(CUE_KINDS)
+    formats = tuple(CUE_KINDS)
 
     def write(self, curves: FrameStream) -> int:
         """Write the cues when the last frame has arrived."""
-        kind = CUE_KINDS[self._form]
+        kind = CUE_KINDS[self._curve_format]
         frames = [(time_s, faps) for time_s, _, faps in curves.rows]
         end_s = curves.duration_s or (frames[-1][0] if frames else 0.0)
         cues = kind.find_cues(frames)
@@ -183,13 +185,15 @@ CURVE_EXPORTERS: dict[str, type[CurveExporter]] = {
 }
 
 
-def json_line(row: FrameRow, form: CurveFormat, phones: Sequence[Phone] | None = None) -> str:
+def json_line(
+    row: FrameRow, curve_format: CurveFormat, phones: Sequence[Phone] | None = None
+) -> str:
     """Return a JSON object for a frame: FAPs in the order of their numbers, or named shapes."""
     time_s, number, faps = row
-    is_faps = form is CurveFormat.FAPS
-    rounded = [round(float(value), 2 if is_faps else 4) for value in _values(faps, form)]
-    values = rounded if is_faps else dict(zip(_value_names(form), rounded, strict=True))
-    fields = {"time_s": time_s, "sequence": number, form.value: values}
+    is_faps = curve_format is CurveFormat.FAPS
+    rounded = [round(float(value), 2 if is_faps else 4) for value in _values(faps, curve_format)]
+    values = rounded if is_faps else dict(zip(_value_names(curve_format), rounded, strict=True))
+    fields = {"time_s": time_s, "sequence": number, curve_format.value: values}
     return json.dumps(fields if phones is None else {**fields, "phone": phone_at(phones, time_s)})
 
 
@@ -201,9 +205,9 @@ def phone_at(phones: Sequence[Phone], time_s: float) -> str:
     return phones[index].symbol
 
 
-def _cells(row: FrameRow, form: CurveFormat, phones: Sequence[Phone] | None) -> list[str]:
+def _cells(row: FrameRow, curve_format: CurveFormat, phones: Sequence[Phone] | None) -> list[str]:
     time_s, _, faps = row
-    cells = [f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, form))]
+    cells = [f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, curve_format))]
     return cells if phones is None else [*cells, phone_at(phones, time_s)]
 
 
@@ -242,11 +246,11 @@ def _write_lines(output: Path, lines: Iterable[str], curves: FrameStream) -> int
     return count
 
 
-def _value_names(form: CurveFormat) -> tuple[str, ...]:
-    shapes = SHAPE_SETS.get(form)
+def _value_names(curve_format: CurveFormat) -> tuple[str, ...]:
+    shapes = SHAPE_SETS.get(curve_format)
     return shapes.names if shapes else tuple(fap.name for fap in FAPS)
 
 
-def _values(faps: Values, form: CurveFormat) -> Values:
-    shapes = SHAPE_SETS.get(form)
+def _values(faps: Values, curve_format: CurveFormat) -> Values:
+    shapes = SHAPE_SETS.get(curve_format)
     return shapes.weights(faps) if shapes else faps

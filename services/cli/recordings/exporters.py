@@ -134,7 +134,7 @@ def _check_options(output: Path, options: ExportOptions, exporter: type[Exporter
         name = field.name
         if getattr(options, name) != field.default and name not in exporter.options:
             suffixes = [suffix for suffix, cls in EXPORTERS.items() if name in cls.options]
-            option = {"form": "as", "rate_hz": "rate", "at_s": "at"}.get(name, name)
+            option = {"curve_format": "as", "rate_hz": "rate", "at_s": "at"}.get(name, name)
             raise UserError(
                 f"{output}: --{option} does not apply to this format; it applies to"
                 f" {', '.join(suffixes)}"

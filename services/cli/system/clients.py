@@ -174,7 +174,7 @@ def listen(
             " or .json of Rhubarb Lip Sync).",
         ),
     ] = None,
-    form: Annotated[
+    as_format: Annotated[
         ListenFormat | None,
         typer.Option(
             "--as",
@@ -194,14 +194,14 @@ def listen(
     """
     from kouxing.services.cli.system.follow import follow
 
-    if form is not ListenFormat.PHONES:
+    if as_format is not ListenFormat.PHONES:
         reject_options("applies to phones; add --as phones", alphabet=alphabet)
-    if form in SPEECH_FORMATS:
-        reject_options(f"does not apply to {form}, which are only printed", output=output)
-    if form is ListenFormat.LIVELINK and output is None:
+    if as_format in SPEECH_FORMATS:
+        reject_options(f"does not apply to {as_format}, which are only printed", output=output)
+    if as_format is ListenFormat.LIVELINK and output is None:
         raise UserError("--as livelink writes a CSV file; add --output face.csv")
     check_output(output, force=force)
-    follow(_session_name(session), output, form, find_control_address(control), alphabet)
+    follow(_session_name(session), output, as_format, find_control_address(control), alphabet)
 
 
 def send(

@@ -7,8 +7,8 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from kouxing_client import ServiceState
+from kouxing_client.connection_check import explain_unreachable
 from kouxing_client.keys import Key
-from kouxing_client.reach import reach_error
 
 from kouxing.services.cli.system.clients import find_system
 from kouxing.services.cli.system.running_system import running_systems
@@ -50,7 +50,7 @@ def run_checks(address: str) -> Iterator[CheckResult]:
     config = system.config
     control = system.running or config.control
     endpoint_address = control.partition(" ")[0]
-    if reason := reach_error(*split_endpoint(endpoint_address, "control"), is_zeromq=True):
+    if reason := explain_unreachable(*split_endpoint(endpoint_address, "control"), is_zeromq=True):
         yield CheckResult(f"control at {endpoint_address}", "cannot be reached", reason)
         return
     yield CheckResult(f"control at {endpoint_address}", "can be reached")
@@ -169,9 +169,9 @@ def _endpoint_problem(
     if endpoint.startswith("http"):
         page = urlsplit(endpoint)
         default = 443 if page.scheme == "https" else 80
-        return reach_error(page.hostname or "", str(page.port or default))
+        return explain_unreachable(page.hostname or "", str(page.port or default))
     host, port = split_endpoint(endpoint.partition(" ")[0], name)
-    if reason := reach_error(host, port, is_zeromq=True):
+    if reason := explain_unreachable(host, port, is_zeromq=True):
         if is_loopback(host) and not is_one_host:
             return (
                 "only its own host can connect; set this key of the service to tcp://0.0.0.0:PORT"
@@ -182,7 +182,7 @@ def _endpoint_problem(
         roles = {role.partition(":")[0] for role in _default_roles(key_name)}
         if not is_publisher and ROUTER_ROLES.get(name) not in roles:
             continue
-        if bus.probe(endpoint, is_publisher=is_publisher) is ProbeResult.REFUSED:
+        if bus.probe(endpoint, is_publisher=is_publisher) is ProbeResult.REJECTED:
             return (
                 f"it does not accept the key {key_name}; check its roles with 'kouxing keys list'"
                 " on control's machine, or restart the service"

@@ -39,20 +39,20 @@ T = TypeVar("T", FapFrame, Phone)
 def follow(
     session: str,
     output: Path | None,
-    form: ListenFormat | None,
+    as_format: ListenFormat | None,
     control: AbstractContextManager[str],
     alphabet: Alphabet | None = None,
 ) -> None:
     """Follow a session until it ends. Without a name, follow the newest one or wait for the next.
 
     Writes the frames to ``output``. Without it, prints the frames, or the syllables or phones that
-    ``form`` names. Phones are in ``alphabet``. ``control`` is entered only after the format of the
-    file has been checked, so that a wrong name fails at once. Raises ``UserError`` if control does
-    not answer, the file cannot be written, or its format does not fit ``form``.
+    ``as_format`` names. Phones are in ``alphabet``. ``control`` is entered only after the format of
+    the file has been checked, so that a wrong name fails at once. Raises ``UserError`` if control
+    does not answer, the file cannot be written, or its format does not fit ``as_format``.
     """
-    is_speech = form in SPEECH_FORMATS
-    curve_form = None if form is None or is_speech else CurveFormat(form)
-    exporter = None if output is None else _open_exporter(output, curve_form)
+    is_speech = as_format in SPEECH_FORMATS
+    curve_format = None if as_format is None or is_speech else CurveFormat(as_format)
+    exporter = None if output is None else _open_exporter(output, curve_format)
     with control as endpoint, connect_client(endpoint) as client:
         followed = _wait_for_session(session, client)
         results = followed.results(Phone if is_speech else FapFrame, keep_all=True)
@@ -60,16 +60,16 @@ def follow(
         if is_speech:
             inventory = load_inventory(followed.info["facts"]["language"] or DEFAULT_LANGUAGE)
             phones = map(events.Phone.from_message, arriving)
-            if form is ListenFormat.SYLLABLES:
+            if as_format is ListenFormat.SYLLABLES:
                 count = _print(_syllable_lines(phones, inventory))
             else:
                 count = _print(_phone_lines(respell(phones, inventory, alphabet)))
         else:
             rows = map(_to_row, arriving)
             live = FrameStream(rows, is_live=True)
-            count = _print_frames(rows, curve_form) if exporter is None else exporter.write(live)
-    unit = form.value.removesuffix("s") if form and is_speech else "frame"
-    if form is ListenFormat.RHUBARB and output is None:
+            count = _print_frames(rows, curve_format) if exporter is None else exporter.write(live)
+    unit = as_format.value.removesuffix("s") if as_format and is_speech else "frame"
+    if as_format is ListenFormat.RHUBARB and output is None:
         unit = "mouth shape"
     print_message(f"session {followed.name} ended: {plural(count, unit)}")
     if results.num_missed:
@@ -78,13 +78,13 @@ def follow(
         print_message(f"wrote {output}")
 
 
-def _open_exporter(output: Path, form: CurveFormat | None) -> CurveExporter:
+def _open_exporter(output: Path, curve_format: CurveFormat | None) -> CurveExporter:
     exporter = CURVE_EXPORTERS.get(output.suffix.lower())
     if exporter is None:
         raise UserError(
             f"{output}: unknown format; use a name that ends in {', '.join(CURVE_EXPORTERS)}"
         )
-    return exporter(output, ExportOptions(form=form))
+    return exporter(output, ExportOptions(curve_format=curve_format))
 
 
 def _wait_for_session(name: str, client: Client) -> Session:
@@ -135,13 +135,13 @@ def _to_row(frame: FapFrame) -> FrameRow:
     return frame.time_s, frame.sequence, np.array(frame.values, np.float32)
 
 
-def _print_frames(rows: Iterable[FrameRow], form: CurveFormat | None) -> int:
+def _print_frames(rows: Iterable[FrameRow], curve_format: CurveFormat | None) -> int:
     """Print frames, a line for each, and return their number; drawn mouths when they change."""
-    if form is CurveFormat.RHUBARB:
+    if curve_format is CurveFormat.RHUBARB:
         cues = mouth_cues((time_s, faps) for time_s, _, faps in rows)
         return _print(f"{time_s:.2f}\t{mouth}" for time_s, mouth in cues)
-    if form not in (None, CurveFormat.FAPS):
-        return _print(json_line(row, form) for row in rows)
+    if curve_format not in (None, CurveFormat.FAPS):
+        return _print(json_line(row, curve_format) for row in rows)
     CONSOLE.print(LEGEND, markup=False, highlight=False)
     return _print(
         f"{time_s:9.3f} s  " + "  ".join(f"{values[n - 1]:6.0f}" for n in PRINTED_FAPS)

@@ -88,17 +88,17 @@ def read_spoken_text(text: str) -> str:
     path = _find_file(text)
     if path is None:
         given = SpokenText(text) if _is_unicode(text) else decode_text(os.fsencode(text))
-        spoken, encoding = extract_text(given.text), given.form
+        spoken, encoding = extract_text(given.text), given.format_name
     else:
         content = read_file(path, MAX_TEXT_BYTES)
         try:
             spoken, encoding = _extract_from(content, path.suffix.lower())
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
-    forms = [form for form in (spoken.form, encoding) if form]
-    if forms:
+    formats = [name for name in (spoken.format_name, encoding) if name]
+    if formats:
         name = "the text" if path is None else str(path)
-        print_message(f"{name} was read as {' in '.join(forms)}")
+        print_message(f"{name} was read as {' in '.join(formats)}")
     elif time := _CLOCK_TIME.match(spoken.text):
         print_message(f"{time[0]} is read as a spoken time of day; delete it if it is not spoken")
     if len(labels := _LABEL.findall(spoken.text)) > 1:
@@ -129,4 +129,4 @@ def _extract_from(content: bytes, suffix: str) -> tuple[SpokenText, str]:
         raise UserError(f"this is a table ({suffix}); save the spoken text as a plain text file")
     decoded = decode_text(content)
     is_markdown = suffix in _MARKDOWN_SUFFIXES
-    return extract_text(decoded.text, is_markdown=is_markdown), decoded.form
+    return extract_text(decoded.text, is_markdown=is_markdown), decoded.format_name

@@ -102,11 +102,11 @@ class SpokenText(NamedTuple):
     """The spoken part of a text."""
 
     text: str
-    form: str = ""  # format that the rest of the text has; empty: plain text
+    format_name: str = ""  # format that the rest of the text has; empty: plain text
 
 
 def decode_text(content: bytes) -> SpokenText:
-    """Decode a text file. ``form`` is its encoding, unless it is UTF-8.
+    """Decode a text file. ``format_name`` is its encoding, unless it is UTF-8.
 
     Raises ``UserError`` if the file is not a text; the message names its format.
     """
@@ -150,19 +150,21 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
     for beginning, name in _UNSUPPORTED_TEXTS.items():
         if text.startswith(beginning):
             raise UserError(f"this is {name}; keep only the spoken text")
-    for form, pattern, extract in _FORMATS:
-        if (is_markdown and form == "Markdown") or pattern.search(text):
+    for format_name, pattern, extract in _FORMATS:
+        if (is_markdown and format_name == "Markdown") or pattern.search(text):
             try:
                 spoken = extract(text)
             except ValueError:
-                raise UserError(f"this is not valid {form}; keep only the spoken text") from None
+                raise UserError(
+                    f"this is not valid {format_name}; keep only the spoken text"
+                ) from None
             break
     else:
         spoken = remove_columns(text)
-        form = "" if spoken == text else "a table of times or names"
+        format_name = "" if spoken == text else "a table of times or names"
     if _LEFT_TIME.search(spoken):
         raise UserError("the text has times in an unknown format; keep only the spoken text")
-    return SpokenText(spoken, form)
+    return SpokenText(spoken, format_name)
 
 
 def _read_cues(text: str) -> str:

@@ -14,7 +14,7 @@ from aiohttp import web
 
 from kouxing.services.gateway.uploads import audio_decoder
 from kouxing.services.gateway.uploads.upload_handler import (
-    UPLOAD_LIMIT_S,
+    UPLOAD_TIMEOUT_S,
     UploadHandler,
     upload_error,
 )
@@ -23,7 +23,7 @@ from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.monitoring.logs import LOG
 
 MAX_BYTES = 200 << 20
-DECODING_LIMIT_S = 60.0
+DECODING_TIMEOUT_S = 60.0
 REMARKS_HEADER = "Kouxing-Remarks"
 _NOT_IN_NAMES = re.compile(r"[^\w.() -]")
 _MAX_NAME_CHARACTERS = 80
@@ -49,7 +49,7 @@ class AudioUploadHandler(UploadHandler):
         )
         source, target = folder / "in" / (name or "file"), folder / "out.wav"
         source.parent.mkdir()
-        if not await asyncio.wait_for(_store(request, source), UPLOAD_LIMIT_S):
+        if not await asyncio.wait_for(_store(request, source), UPLOAD_TIMEOUT_S):
             await discard_body(request)
             return upload_error(
                 413, f"the file is larger than {MAX_BYTES >> 20} MiB; use a smaller one"
@@ -58,7 +58,9 @@ class AudioUploadHandler(UploadHandler):
         # folder.
         command = (sys.executable, "-m", audio_decoder.__name__, str(source))
         with target.open("wb") as output:
-            status, _, messages = await self.run(request, command, DECODING_LIMIT_S, output=output)
+            status, _, messages = await self.run(
+                request, command, DECODING_TIMEOUT_S, output=output
+            )
         messages = messages.replace(f"{source.parent}/", "")
         if status == USER_ERROR:
             raise UserError(messages)

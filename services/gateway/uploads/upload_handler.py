@@ -13,7 +13,7 @@ from aiohttp import web
 from kouxing.services.gateway.web.web_application import discard_body
 from kouxing.shared.errors import UserError
 
-UPLOAD_LIMIT_S = 60.0
+UPLOAD_TIMEOUT_S = 60.0
 PRESENCE_CHECK_S = 0.5  # interval of checks whether the browser is still connected
 NICENESS = 19  # lowest priority, so that live streams do not suffer
 
@@ -61,14 +61,14 @@ class UploadHandler(ABC):
         self,
         request: web.Request,
         command: Sequence[str],
-        limit_s: float,
+        timeout_s: float,
         *,
         content: bytes = b"",
         output: BinaryIO | int = subprocess.PIPE,
     ) -> tuple[int, bytes, str]:
         """Run a command; return its exit status, its output and its messages.
 
-        Raises ``TimeoutError`` after ``limit_s``, and ``UserError`` if the client has left.
+        Raises ``TimeoutError`` after ``timeout_s``, and ``UserError`` if the client has left.
         """
         process = self._process = await asyncio.create_subprocess_exec(
             *command,
@@ -80,7 +80,7 @@ class UploadHandler(ABC):
         with contextlib.suppress(ProcessLookupError):  # the process has already ended
             os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
         exchange = asyncio.create_task(process.communicate(content))
-        end_s = asyncio.get_running_loop().time() + limit_s
+        end_s = asyncio.get_running_loop().time() + timeout_s
         try:
             while not exchange.done() and not self._is_closing:
                 await asyncio.wait({exchange}, timeout=PRESENCE_CHECK_S)

@@ -23,7 +23,7 @@ from av import AudioFrame
 
 from kouxing.shared.errors import UserError
 
-CONNECT_LIMIT_S = 20.0  # limit from the answer to the first sound
+CONNECT_TIMEOUT_S = 20.0  # limit from the answer to the first sound
 MAX_CONCEALED_SAMPLES = 14_400  # lost samples that are concealed, so that speech continues
 MAX_GAP = 600 * 48_000  # samples; after a longer gap, forward or back, timestamps restart
 _TIMESTAMP_RANGE = 2**32  # RTP timestamps wrap around at this value
@@ -107,9 +107,9 @@ class WebRtcPeer:
         expected: int | None = None
         pcm = b""
         while self._track is not None:
-            limit_s = CONNECT_LIMIT_S if expected is None else None
+            timeout_s = CONNECT_TIMEOUT_S if expected is None else None
             try:
-                frame = await asyncio.wait_for(self._track.recv(), limit_s)
+                frame = await asyncio.wait_for(self._track.recv(), timeout_s)
             except (MediaStreamError, TimeoutError):
                 return
             if not isinstance(frame, AudioFrame) or frame.pts is None:

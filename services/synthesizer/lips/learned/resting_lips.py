@@ -84,8 +84,8 @@ class RestingLips:
         self._start_s = math.inf  # start of the audio
         self._known_s = -math.inf  # the levels are known up to here
         self._sound_s = -math.inf  # last sound, start of voice activity or start of the audio
-        self._stays_shut = False  # whether the lips stay closed until the next sound
-        self._is_phone = False  # whether a phone closes the lips
+        self._stays_closed = False  # whether the lips stay closed until the next sound
+        self._is_closed_by_phone = False  # whether a phone closes the lips
         self._time_s = math.inf  # time of the last frame
         self._goal = 0.0
         self._transition, self._elapsed_s = _transition_to(0.0, 0.0, 0.0, 1.0), 0.0
@@ -115,28 +115,28 @@ class RestingLips:
         while self._speech_changes and self._speech_changes[0].time_s <= time_s:
             change = self._speech_changes.popleft()
             if change.active and not self._is_voice:
-                self._sound_s, self._stays_shut = change.time_s, False
+                self._sound_s, self._stays_closed = change.time_s, False
             self._is_voice = change.active
             self._has_spoken |= change.active
         while self._levels and self._levels[0][0] <= time_s:
             level_s, level_db = self._levels.popleft()
             self._update_background(level_db)
             if self._is_sound(level_db):
-                self._sound_s, self._stays_shut = level_s, False
+                self._sound_s, self._stays_closed = level_s, False
 
     def silence_penalty_at(self, time_s: float, closure: float, phones: float) -> float:
         """Return the log odds that silence subtracts from a closure at the time of lip positions.
 
         ``closure`` is the predicted probability, and ``phones`` are the log odds that phones add.
         """
-        self._is_phone = phones > 0.0
-        if self._is_phone:
+        self._is_closed_by_phone = phones > 0.0
+        if self._is_closed_by_phone:
             return 0.0
         ends_s, next_s = time_s + _LAST_SOUND_S, self._next_sound_s()
         is_silent = self._is_voice and self._known_s > ends_s and next_s > self._known_s
         is_onset = _YIELD_S < next_s - time_s <= _LIKELY_BEFORE_S
         if closure >= (_LIKELY if is_onset else CERTAIN):
-            self._stays_shut |= is_silent or is_onset
+            self._stays_closed |= is_silent or is_onset
             return 0.0
         if self._goal > 0.0:
             return math.inf
@@ -150,7 +150,7 @@ class RestingLips:
             self._set_goal(0.0, _END_S)
         elif any(change.active and change.time_s <= soon_s for change in self._speech_changes):
             self._set_goal(1.0, PART_S)
-        elif self._is_phone or self._stays_shut or next_s <= time_s + _YIELD_S:
+        elif self._is_closed_by_phone or self._stays_closed or next_s <= time_s + _YIELD_S:
             self._set_goal(0.0, _YIELD_S)
         elif time_s < self._start_s + START_S or self._closes_for_onset(time_s):
             self._set_goal(0.0, _ONSET_CLOSE_S)

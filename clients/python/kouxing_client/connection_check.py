@@ -11,7 +11,7 @@ LookUp = Callable[..., list[tuple[Any, ...]]]
 NO_LISTENER = "nothing listens there; start kouxing there (kouxing run), or correct the address"
 
 
-def reach_error(
+def explain_unreachable(
     host: str,
     port: str,
     timeout_s: float = 3.0,

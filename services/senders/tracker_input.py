@@ -15,7 +15,7 @@ _LIVE_S = 1.0  # after this time without a packet, the tracker is considered sto
 _MAX_RATE_HZ = 600  # packets above this rate are dropped unread
 
 
-class CameraInput(asyncio.DatagramProtocol):
+class TrackerInput(asyncio.DatagramProtocol):
     """Receives a tracker's packets and passes them to ``forward``.
 
     ``forward`` returns whether the packet contained a mouth, and raises ``ValueError`` if the
@@ -46,11 +46,11 @@ class CameraInput(asyncio.DatagramProtocol):
                 self._received_s = now_s
 
 
-async def open_camera(
+async def open_tracker_input(
     host: str, port: int, forward: Callable[[bytes], bool]
-) -> tuple[asyncio.DatagramTransport, CameraInput]:
+) -> tuple[asyncio.DatagramTransport, TrackerInput]:
     """Receive the packets of a tracker; raises ``OSError`` if the port is not free."""
     loop = asyncio.get_running_loop()
     return await loop.create_datagram_endpoint(
-        lambda: CameraInput(forward), local_addr=(host, port)
+        lambda: TrackerInput(forward), local_addr=(host, port)
     )

@@ -5,7 +5,7 @@ import threading
 from typing import Any
 
 import pytest
-from kouxing_client.reach import reach_error
+from kouxing_client.connection_check import explain_unreachable
 
 LIMIT_S = 60.0
 
@@ -17,7 +17,7 @@ def test_a_silent_name_server_is_reported() -> None:
         is_over.wait()
         return []
 
-    reason = reach_error("lab", "7700", 0.0, look_up=look_up)
+    reason = explain_unreachable("lab", "7700", 0.0, look_up=look_up)
     is_over.set()
     assert "no name server answers for the host name 'lab'; check the network" in reason
 
@@ -34,7 +34,7 @@ def test_a_failed_look_up_is_explained(error: Exception, reason: str) -> None:
     def look_up(*_: Any, **__: Any) -> list[tuple[Any, ...]]:
         raise error
 
-    assert reason in reach_error("lab", "7700", LIMIT_S, look_up=look_up)
+    assert reason in explain_unreachable("lab", "7700", LIMIT_S, look_up=look_up)
 
 
 def test_all_addresses_of_a_host_are_tried() -> None:
@@ -45,6 +45,8 @@ def test_all_addresses_of_a_host_are_tried() -> None:
         def look_up(*_: Any, **__: Any) -> list[tuple[Any, ...]]:
             return [(socket.AF_INET, socket.SOCK_STREAM, 0, "", address) for address in addresses]
 
-        assert reach_error("lab", "7700", LIMIT_S, look_up=look_up) == ""
+        assert explain_unreachable("lab", "7700", LIMIT_S, look_up=look_up) == ""
         addresses.pop()
-        assert "nothing listens there" in reach_error("lab", "7700", LIMIT_S, look_up=look_up)
+        assert "nothing listens there" in explain_unreachable(
+            "lab", "7700", LIMIT_S, look_up=look_up
+        )

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from aiohttp import web
 
 from kouxing.services.gateway.uploads.upload_handler import (
-    UPLOAD_LIMIT_S,
+    UPLOAD_TIMEOUT_S,
     UploadHandler,
     upload_error,
 )
@@ -20,10 +20,10 @@ from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.monitoring.logs import LOG
 
 MAX_BYTES = 8 << 20
-LEARNING_LIMIT_S = 180.0
+LEARNING_TIMEOUT_S = 180.0
 
 
-class MouthLearner(UploadHandler):
+class LearnMouthHandler(UploadHandler):
     """Answers a recording with the learned mouth profile."""
 
     busy_text = "another mouth profile is being created; try again in a minute"
@@ -38,19 +38,19 @@ class MouthLearner(UploadHandler):
         """Answer a recording."""
         try:
             upload = request.clone(client_max_size=MAX_BYTES)
-            recording = await asyncio.wait_for(upload.read(), UPLOAD_LIMIT_S)
+            recording = await asyncio.wait_for(upload.read(), UPLOAD_TIMEOUT_S)
         except web.HTTPRequestEntityTooLarge:
             await discard_body(request)
             return upload_error(413, f"the recording is larger than {MAX_BYTES >> 20} MiB")
         except TimeoutError:
-            return upload_error(408, f"the recording did not arrive within {UPLOAD_LIMIT_S:g} s")
+            return upload_error(408, f"the recording did not arrive within {UPLOAD_TIMEOUT_S:g} s")
         try:
             status, profile, messages = await self.run(
-                request, self._command, LEARNING_LIMIT_S, content=recording
+                request, self._command, LEARNING_TIMEOUT_S, content=recording
             )
         except TimeoutError:
             raise UserError(
-                f"learning took longer than {LEARNING_LIMIT_S:g} s; try again later"
+                f"learning took longer than {LEARNING_TIMEOUT_S:g} s; try again later"
             ) from None
         if status == USER_ERROR:
             raise UserError(messages)

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kouxing.services.senders.camera import CameraInput
 from kouxing.services.senders.connection import DatagramConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import bundle_messages, encode_message
 from kouxing.services.senders.protocols import make_connection, parse_target
+from kouxing.services.senders.tracker_input import TrackerInput
 from kouxing.shared.errors import UserError
 from tests.fake_time import run
 from tests.receivers import LIVE_LINK_ORDER, frame_of, read_live_link, read_osc
@@ -124,12 +124,12 @@ def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
         return True
 
     async def receive() -> None:
-        camera = CameraInput(forward)
-        camera.datagram_received(b"bad", None)
-        assert not camera.is_live
+        tracker = TrackerInput(forward)
+        tracker.datagram_received(b"bad", None)
+        assert not tracker.is_live
         for _ in range(2000):
-            camera.datagram_received(b"good", None)
-        assert camera.is_live
+            tracker.datagram_received(b"good", None)
+        assert tracker.is_live
 
     run(receive())
     assert len(forwarded) == 600
