@@ -46,9 +46,3 @@ def blocks() -> BlockModel:
         log_prior=shipped.log_prior,
         acoustic_scale=float(SCALE),
     )
-
-
-def scores_of(model: BlockModel, frames: np.ndarray) -> np.ndarray:
-    """Return the scores of a whole recording, (frames, states)."""
-    stream = model.create_stream()
-    return np.concatenate([stream.score(frames), stream.score(None)])

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from kouxing.services.recognizer.acoustic import blocks as blocks_module
+from kouxing.services.recognizer.acoustic.acoustic_model import score_segment
 from kouxing.services.recognizer.acoustic.encoder import ENCODER_PATH
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive
@@ -15,7 +16,7 @@ from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import export_onnx
 from kouxing.training.blocks.network import block_layout
 from kouxing.training.model_files import save_blocks, write_archive
-from tests.block_networks import BLOCK, FRAMES, LENGTH, RIGHT, SCALE, blocks, networks, scores_of
+from tests.block_networks import BLOCK, FRAMES, LENGTH, RIGHT, SCALE, blocks, networks
 
 pytestmark = [pytest.mark.usefixtures("one_thread")]
 
@@ -55,7 +56,7 @@ def test_onnxruntime_and_pytorch_agree(hop: int) -> None:
 def test_the_last_run_settles_all_positions_together(num_frames: int) -> None:
     frames = FRAMES[:num_frames]
     (expected,) = torch_scores(frames, LENGTH)
-    scores = scores_of(blocks(), frames)
+    scores = score_segment(blocks(), frames)
     assert len(scores) == num_frames
     np.testing.assert_allclose(scores, expected[:num_frames], atol=0.05)
 
@@ -67,7 +68,7 @@ def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
     for frame in FRAMES:
         lone.score(frame[None])
         provisional.append(lone.provisional)
-    expected = scores_of(model, FRAMES)
+    expected = score_segment(model, FRAMES)
     rng = np.random.default_rng(0)
     num_streams = 18  # more than one run has
     streams = [model.create_stream() for _ in range(num_streams)]
@@ -86,14 +87,14 @@ def test_chunks_and_other_sessions_do_not_affect_scores() -> None:
 
 
 def test_long_speech_restarts_the_table_with_an_empty_past(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = scores_of(blocks(), FRAMES)
+    expected = score_segment(blocks(), FRAMES)
     monkeypatch.setattr(blocks_module, "MAX_POSITIONS", 40)
-    short = scores_of(blocks(), FRAMES)
+    short = score_segment(blocks(), FRAMES)
     np.testing.assert_array_equal(short[:56], expected[:56])  # with a complete right context
     assert not np.array_equal(short[80:160], expected[80:160])
     later = FRAMES.copy()
     later[:78] = later[later[:78].max(axis=1).argmax()]  # frames that only precede the restart
-    np.testing.assert_array_equal(scores_of(blocks(), later)[80:], short[80:])
+    np.testing.assert_array_equal(score_segment(blocks(), later)[80:], short[80:])
 
 
 def test_rejects_a_file_with_bad_arrays(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from kouxing.services.recognizer.acoustic import load
+from kouxing.services.recognizer.acoustic.acoustic_model import score_segment
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.live.live_decoder import StreamOutput
@@ -29,7 +30,6 @@ from tests.block_networks import (
     SCALE,
     blocks,
     networks,
-    scores_of,
 )
 from tests.live_streams import LiveStream
 from tests.system import HELLO
@@ -111,7 +111,7 @@ def test_a_file_belongs_to_one_block_network(
     save_universal(path, extended(), extension)
     model = load_model(path)
     assert isinstance(model, BlockModel)
-    np.testing.assert_array_equal(scores_of(model, FRAMES), scores_of(extended(), FRAMES))
+    np.testing.assert_array_equal(score_segment(model, FRAMES), score_segment(extended(), FRAMES))
     monkeypatch.setattr(load, "_block_network", lambda: blocks().network[:-1])
     with pytest.raises(UserError, match="another version of the block model"):
         load_model(path)
