@@ -87,26 +87,20 @@ def train_network(
     network.to(DEVICE).train()
     batches: Iterator[BlockBatch] | None = None
 
-    def loss(step: int) -> Tensor:
+    def losses(step: int) -> Iterator[Tensor]:
         nonlocal batches
         if batches is None:
             numbers = range(BATCHES_PER_STEP * step, BATCHES_PER_STEP * num_steps)
             batches = process_in_order(partial(draw_block_batch, batch_source), numbers)
-        total = torch.zeros((), device=DEVICE)
-        for last in range(_JOINED, BATCHES_PER_STEP + 1, _JOINED):
+        for _ in range(0, BATCHES_PER_STEP, _JOINED):
             joined = list(islice(batches, _JOINED))
             part = _loss(network, teacher, joined, only_readout=step < _READOUT_STEPS)
-            part = part * (_JOINED / BATCHES_PER_STEP)
-            if last < BATCHES_PER_STEP:
-                part.backward()  # type: ignore[no-untyped-call]
-                part = part.detach()
-            total = total + part
-        return total
+            yield part * (_JOINED / BATCHES_PER_STEP)
 
     return optimize(
         network,
         _groups(network),
-        loss,
+        losses,
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,

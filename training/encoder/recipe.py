@@ -180,20 +180,21 @@ def _train_network(batch_source: BatchSource, num_steps: int, checkpoint: Path) 
     encoder = AudioEncoder(batch_source.columns.num_phones).to(DEVICE)
     batches: Iterator[Batch] | None = None
 
-    def loss(step: int) -> Tensor:
+    def losses(step: int) -> Iterator[Tensor]:
         nonlocal batches
         if batches is None:
             numbers = range(step, num_steps)
             batches = process_in_order(partial(draw_batch, batch_source), numbers)
         with mixed_precision():
-            return encoder.loss(
+            loss = encoder.loss(
                 *(torch.from_numpy(part).to(DEVICE).float() for part in next(batches))
             )
+        yield loss
 
     return optimize(
         encoder,
         [{"params": list(encoder.parameters()), "lr": _LEARNING_RATE}],
-        loss,
+        losses,
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,

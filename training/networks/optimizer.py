@@ -11,7 +11,7 @@ stay constant, and fall to 0 at the end.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
@@ -33,7 +33,7 @@ _Tensors: TypeAlias = tuple[Tensor, ...] | list[Tensor]
 def optimize(
     network: N,
     groups: Sequence[dict[str, Any]],
-    loss_of: Callable[[int], Tensor],
+    losses_of: Callable[[int], Iterable[Tensor]],
     *,
     num_steps: int,
     warm_up_steps: int,
@@ -44,17 +44,18 @@ def optimize(
 ) -> N:
     """Train a network in place; return one with the running mean of the weights.
 
-    ``groups`` are parameter groups with their learning rates, as for ``torch.optim``. ``loss_of``
-    computes the loss of a step. It may itself add gradients of parts of the loss. The rates fall
-    during ``decay_fraction`` of the steps, at the end. Each step has its own random state. The
-    state is saved in ``checkpoint``, and training resumes from this file if it exists.
+    ``groups`` are parameter groups with their learning rates, as for ``torch.optim``. ``losses_of``
+    yields the parts of the loss of a step. The gradients of a part are added before the next part
+    is computed, so only one part needs memory. The rates fall during ``decay_fraction`` of the
+    steps, at the end. Each step has its own random state. The state is saved in ``checkpoint``, and
+    training resumes from this file if it exists.
     """
     averaged = AveragedModel(network, multi_avg_fn=_average)
     averaged.eval()
     adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
     rates = [group["lr"] for group in adam.param_groups]
-    parts = {"network": network, "averaged": averaged, "optimizer": adam}
-    first_step = _load(checkpoint, parts) if checkpoint and checkpoint.exists() else 0
+    saved = {"network": network, "averaged": averaged, "optimizer": adam}
+    first_step = _load(checkpoint, saved) if checkpoint and checkpoint.exists() else 0
     if first_step:
         print_message(f"resuming after step {first_step}")
     losses = []
@@ -62,21 +63,23 @@ def optimize(
     for step in range(first_step, num_steps):
         torch.manual_seed(SEED + step)
         adam.zero_grad()
-        loss = loss_of(step)
+        parts = []
+        for part in losses_of(step):
+            part.backward()  # type: ignore[no-untyped-call]
+            parts.append(part.detach())
         rise = min(1.0, (step + 1) / warm_up_steps)
         factor = rise * min(1.0, (num_steps - step) / (decay_fraction * num_steps))
         for group, rate in zip(adam.param_groups, rates, strict=True):
             group["lr"] = factor * rate
-        loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(network.parameters(), max_norm)
         adam.step()
         averaged.update_parameters(network)
-        losses.append(loss.detach())
+        losses.append(torch.stack(parts).sum())
         if (step + 1) % SAVE_EVERY == 0 or step + 1 == num_steps:
             print_message(f"step {step + 1}: loss {torch.stack(losses).mean():.3f}")
             losses = []
             if checkpoint and (time.monotonic() >= next_save_s or step + 1 == num_steps):
-                _save(checkpoint, parts, step + 1)
+                _save(checkpoint, saved, step + 1)
                 next_save_s = time.monotonic() + MIN_SAVE_S
     return cast(N, averaged.module).eval()
 

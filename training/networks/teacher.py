@@ -178,15 +178,15 @@ def train_teacher(
     drawn = rng.choice(len(sampling), size=_NUM_STANDARDIZED, p=sampling)
     readout.standardize(torch.cat([torch.from_numpy(features[number]).float() for number in drawn]))
 
-    def loss(_step: int) -> Tensor:
+    def losses(_step: int) -> Iterator[Tensor]:
         batch = padded_batch([draw() for _ in range(_NUM_CROPS)])
         inputs, states, probs = (tensor.to(DEVICE) for tensor in batch)
-        return cross_entropy(readout(inputs)[:, : states.shape[1]], states, probs)
+        yield cross_entropy(readout(inputs)[:, : states.shape[1]], states, probs)
 
     trained = optimize(
         readout,
         [{"params": list(readout.parameters()), "lr": _LEARNING_RATE}],
-        loss,
+        losses,
         num_steps=_NUM_STEPS,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,

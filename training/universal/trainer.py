@@ -5,7 +5,7 @@ cross-entropy with the aligned states, of a block's own positions and, with half
 right context. The encoder is not trained.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,28 +56,27 @@ def train_readout(
     layout = block_layout(_CROP_POSITIONS, BLOCK_LENGTH, RIGHT_CONTEXT)
     readout.train()
 
-    def loss(step: int) -> Tensor:
+    def losses(step: int) -> Iterator[Tensor]:
         rng = np.random.default_rng([SEED, step])
         drawn = [recordings[int(np.searchsorted(probs, rng.random()))] for _ in range(_NUM_CROPS)]
         crops = [_crop(recording, states[recording.name], layout, rng) for recording in drawn]
         features, targets = (torch.from_numpy(np.stack(part)) for part in zip(*crops, strict=True))
         with torch.autocast("cpu", torch.bfloat16):
             log_posteriors = readout.read(features.float() * STEP, layout).float()
-        losses = [
+        own, right = (
             nll_loss(
                 log_posteriors[:, part].flatten(0, 2),
                 targets[:, part].flatten(),
                 ignore_index=_NO_STATE,
             )
             for part in (slice(_CROP_POSITIONS), slice(_CROP_POSITIONS, None))
-        ]
-        result: Tensor = losses[0] + _RIGHT_WEIGHT * losses[1]
-        return result
+        )
+        yield own + _RIGHT_WEIGHT * right
 
     return optimize(
         readout,
         [{"params": list(readout.parameters()), "lr": _LEARNING_RATE}],
-        loss,
+        losses,
         num_steps=num_steps,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,
