@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from kouxing_client import NotConnected
 
-from kouxing.services.cli.system.clients import find_control_address
 from kouxing.services.cli.system.running_system import (
     announce_system,
     find_control,
+    find_control_address,
     lock_output_folder,
     lock_startup,
 )

@@ -10,8 +10,7 @@ from kouxing_client import ServiceState
 from kouxing_client.connection_check import explain_unreachable
 from kouxing_client.keys import Key
 
-from kouxing.services.cli.system.clients import find_system
-from kouxing.services.cli.system.running_system import running_systems
+from kouxing.services.cli.system.running_system import find_system, running_systems
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.command.terminal import plural

@@ -11,12 +11,16 @@ import contextlib
 import fcntl
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from kouxing.services.service_kinds import read_settings
 from kouxing.shared.errors import UserError
-from kouxing.shared.settings.keys import key_folder
+from kouxing.shared.settings.config import ServiceConfig
+from kouxing.shared.settings.endpoints import split_endpoint
+from kouxing.shared.settings.keys import control_endpoint, key_folder
 
 
 class RunningSystem(NamedTuple):
@@ -29,6 +33,15 @@ class RunningSystem(NamedTuple):
     def address(self) -> str:
         """Address of control."""
         return self.control.partition(" ")[0]
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenSystem:
+    """The system that a command connects to."""
+
+    config: ServiceConfig
+    running: str  # control's endpoint in the user's newest system; empty if none was found
+    is_guess: bool  # nothing names control and no system was found: try the default address
 
 
 @contextlib.contextmanager
@@ -95,6 +108,43 @@ def lock_output_folder(folder: Path) -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def find_control_address(address: str) -> Iterator[str]:
+    """Yield the address of control, followed by its public key unless connections are insecure.
+
+    Without ``address`` and a setting, it is the address of the newest system with this user's keys.
+    Raises ``UserError`` if there is no such system, and control's default address cannot be used.
+    """
+    from kouxing_client import NotConnected
+
+    system = find_system(address)
+    config = system.config
+    others = other_systems() if system.is_guess else []
+    if any(other.address == config.control for other in others):
+        raise UserError(_not_running_text(others))
+    try:
+        yield system.running or control_endpoint(config.control, insecure=config.insecure)
+    except UserError as error:
+        if system.is_guess and isinstance(error.__cause__, NotConnected):
+            raise UserError(f"{_not_running_text(others)}. Tried: {error}") from error
+        raise
+
+
+def find_system(address: str) -> ChosenSystem:
+    """Choose the system whose control is ``address``, is in the settings, or was started last."""
+    if address:
+        split_endpoint(address, "--control")
+    settings, overrides = read_settings(), {"control": address} if address else {}
+    keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
+    is_given = not keys["control"].is_default
+    running = "" if is_given else find_control()
+    config = settings.load(ServiceConfig, overrides)
+    if "*" in config.control:
+        key = "--control" if address else "common.control"
+        raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
+    return ChosenSystem(config, running, is_guess=not (running or is_given))
+
+
 def find_control() -> str:
     """Return control of the newest running system with this user's keys, or an empty string."""
     addresses = [system.control for system in running_systems() if system.keys == _key_folder()]
@@ -124,6 +174,19 @@ def running_systems() -> list[RunningSystem]:
                 continue
             path.unlink()  # the system has ended
     return [system for _, system in sorted(systems, reverse=True)]
+
+
+def _not_running_text(others: Sequence[RunningSystem]) -> str:
+    text = "your kouxing is not running on this machine; start it with 'kouxing run'"
+    if not others:
+        text += ", or set --control or KOUXING_CONTROL to the address of control"
+    else:
+        listed = ", ".join(f"{system.address} (keys: {system.keys})" for system in others)
+        text += (
+            f". A system with other keys runs at {listed}; to use it, set XDG_STATE_HOME to the"
+            " folder that contains its key folder, and --control or KOUXING_CONTROL to its address"
+        )
+    return text
 
 
 def _key_folder() -> str:
