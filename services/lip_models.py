@@ -11,13 +11,13 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.plugins import plugins
 
 ENTRY_POINTS = "kouxing.lip_models"
 _BUILT_IN = "synthesizer", "lips"
@@ -60,8 +60,7 @@ def _packages() -> dict[str, str]:
         for module in pkgutil.iter_modules([str(folder)])
         if module.ispkg
     }
-    packages |= {entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)}
-    return dict(sorted(packages.items()))
+    return dict(sorted((packages | plugins(ENTRY_POINTS)).items()))
 
 
 def lip_model_info(name: str) -> LipModelInfo:

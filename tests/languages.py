@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSITIONS, Topology
 from kouxing.services.recognizer.search.phone_lm import ContextGraph, PhoneLanguageModel
-from kouxing.shared.phones.inventory import PhoneInventory, installed_packages, load_inventory
+from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.plugins import plugins
 
 MANDARIN = load_inventory("mandarin")
 NUM_PHONES = len(MANDARIN)
@@ -37,9 +38,9 @@ def installed_language(folder: Path, name: str, package: str) -> Iterator[None]:
     (distribution / "entry_points.txt").write_text(f"[kouxing.languages]\n{name} = {package}\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
-        installed_packages.cache_clear()
+        plugins.cache_clear()
         yield
-    installed_packages.cache_clear()
+    plugins.cache_clear()
 
 
 def small_inventory(**changes: object) -> PhoneInventory:

@@ -22,11 +22,12 @@ COMMON_OPTIONS: Options = {"delay": ("0",), "only": ("face", "mouth")}
 class TargetConnection(ABC):
     """A connection to a target, which reconnects automatically.
 
-    Each protocol is one subclass, listed in ``protocols.PROTOCOLS``.
+    Each protocol is one subclass, listed by ``protocols.protocols``.
     """
 
     default_port: ClassVar[int]  # default port of the protocol
     options: ClassVar[Options] = COMMON_OPTIONS  # names and values, default first; (): any text
+    contents: ClassVar[str] = ""  # what a frame contains; empty: the target's shapes
 
     def __init__(self, target: Target) -> None:
         self.target = target

@@ -1,5 +1,11 @@
-"""Lists the sender protocols, and parses target addresses."""
+"""Lists the sender protocols, and parses target addresses.
 
+Other distributions add protocols by entry points of the group ``kouxing.senders``. The entry point
+has the name of the protocol. Its value is the ``package:Class`` of a ``TargetConnection``.
+"""
+
+from functools import lru_cache
+from pkgutil import resolve_name
 from urllib.parse import parse_qsl, urlsplit
 
 from kouxing.services.senders.connection import TargetConnection
@@ -9,23 +15,39 @@ from kouxing.services.senders.target import Target, is_host, parse_delay_s
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
+from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.plugins import plugins
 from kouxing.shared.settings.endpoints import is_loopback
 
 LOOPBACK = "127.0.0.1"
 MAX_TEXT = 64  # characters of an option without fixed values
-PROTOCOLS: dict[str, type[TargetConnection]] = {
+ENTRY_POINTS = "kouxing.senders"
+_BUILT_IN: dict[str, type[TargetConnection]] = {
     "vmc": VmcConnection,
     "livelink": LiveLinkConnection,
     "osc": OscConnection,
     "vts": VTubeStudioConnection,
 }
-_FORMS = [f"{name}://HOST:{connection.default_port}" for name, connection in PROTOCOLS.items()]
-ADDRESS_FORMS = f"{', '.join(_FORMS[:-1])} or {_FORMS[-1]}"
+
+
+@lru_cache
+def protocols() -> dict[str, type[TargetConnection]]:
+    """Return the installed protocols by name. Faulty ones are logged and left out."""
+    installed = dict(_BUILT_IN)
+    for name, reference in plugins(ENTRY_POINTS).items():
+        try:
+            connection = resolve_name(reference)
+            if not issubclass(connection, TargetConnection):
+                raise TypeError(f"{reference} is not a TargetConnection")
+            installed[name] = connection
+        except Exception as error:  # code of another distribution may raise any exception
+            LOG.warning("cannot import the sender protocol %s from %s: %s", name, reference, error)
+    return installed
 
 
 def make_connection(target: Target) -> TargetConnection:
     """Return a connection to a target; ``run`` opens it."""
-    return PROTOCOLS[target.protocol](target)
+    return protocols()[target.protocol](target)
 
 
 def parse_target(url: str) -> Target:
@@ -37,17 +59,18 @@ def parse_target(url: str) -> Target:
         parts = urlsplit(url)
         host, port = parts.hostname or LOOPBACK, parts.port
     except ValueError:
-        raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}") from None
-    protocol = PROTOCOLS.get(parts.scheme)
+        raise _address_error(url) from None
+    protocol = protocols().get(parts.scheme)
     is_bare = parts.path in ("", "/") and not parts.fragment and parts.username is None
     is_readable = url.isprintable() and " " not in url
     if protocol is None or not is_bare or port == 0 or not is_readable or not is_host(host):
-        raise UserError(f"{url!r} is not a valid address; write {ADDRESS_FORMS}")
+        raise _address_error(url)
     options = _parse_options(url, parts.query, protocol)
     try:
         target = Target(
             url=url,
             protocol=parts.scheme,
+            frame_contents=protocol.contents,
             host=host,
             port=port or protocol.default_port,
             options=options,
@@ -57,6 +80,12 @@ def parse_target(url: str) -> Target:
     except UserError as error:
         raise UserError(f"{url}: {error}") from None
     return target
+
+
+def _address_error(url: str) -> UserError:
+    *others, last = (f"{name}://HOST:{kind.default_port}" for name, kind in protocols().items())
+    forms = f"{', '.join(others)} or {last}"
+    return UserError(f"{url!r} is not a valid address; write {forms}")
 
 
 def _check_combination(target: Target) -> None:

@@ -14,7 +14,8 @@ class Target:
     """A program that receives the face."""
 
     url: str  # as entered; identifies the target
-    protocol: str  # one of ``protocols.PROTOCOLS``
+    protocol: str  # one of ``protocols.protocols``
+    frame_contents: str  # what a frame contains; empty: the shapes
     host: str
     port: int
     options: Mapping[str, str]  # options of the protocol
@@ -34,7 +35,7 @@ class Target:
     def contents(self) -> str:
         """Description of what the target receives."""
         names = {"arkit": "ARKit shapes", "vrm": "VRM shapes", "oculus": "Oculus visemes"}
-        contents = "tracking parameters" if self.protocol == "vts" else names[self.shapes]
+        contents = self.frame_contents or names[self.shapes]
         if self.is_mouth_only:
             contents += " of the mouth"
         elif self.options.get("head", "on") == "on":

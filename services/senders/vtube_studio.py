@@ -198,6 +198,7 @@ class VTubeStudioConnection(TargetConnection):
     """Sends the newest frame whenever the WebSocket is ready."""
 
     default_port = 8001
+    contents = "tracking parameters"
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)

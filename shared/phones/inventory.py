@@ -38,13 +38,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from importlib import resources
-from importlib.metadata import entry_points
 from typing import Any
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.tsv_tables import read_table
 from kouxing.shared.phones.table_language import SETTINGS, TableLanguage, load_table_language
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
+from kouxing.shared.plugins import plugins
 
 TABLE_LANGUAGES = (
     "cantonese dutch english french german hindi indonesian italian japanese korean polish"
@@ -184,15 +184,9 @@ def find_language(name: str) -> str:
     Raises ``UserError`` if it is not installed.
     """
     language = language_codes().get(name, name)
-    if language not in BUILT_IN and language not in (installed := installed_packages()):
+    if language not in BUILT_IN and language not in (installed := plugins(ENTRY_POINTS)):
         language = next(filter(partial(_has_code, name), installed), name)
     return load_inventory(language).language
-
-
-@lru_cache
-def installed_packages() -> dict[str, str]:
-    """Return the packages of the entry points, by language."""
-    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
 
 
 def _has_code(code: str, language: str) -> bool:
@@ -210,7 +204,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
     """
     package = BUILT_IN.get(language)
     if package is None:
-        installed = installed_packages()
+        installed = plugins(ENTRY_POINTS)
         package = installed.get(language)
         if package is None:
             known = ", ".join([*language_codes(), *sorted(installed.keys() - BUILT_IN.keys())])

@@ -15,6 +15,7 @@ from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.phones.events import Progress, SoundEvent
+from kouxing.shared.plugins import plugins
 from tests.documents import code_blocks
 from tests.lips import phone
 from tests.system import ROOT
@@ -29,10 +30,12 @@ LIP_MODEL = LipModelInfo(delay_ms=40.0, titles={"en": "toy", "zh": "toy"}, load=
 
 @pytest.fixture(autouse=True)
 def _fresh_registry() -> Iterator[None]:
-    _packages.cache_clear()
+    caches = plugins, _packages, load_lip_model
+    for cached in caches:
+        cached.cache_clear()
     yield
-    _packages.cache_clear()
-    load_lip_model.cache_clear()
+    for cached in caches:
+        cached.cache_clear()
 
 
 def install(folder: Path, package: str, code: str) -> None:

@@ -1,11 +1,15 @@
 """Messages of the sender protocols, and target addresses."""
 
 import json
+import logging
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
 
+from kouxing.services.senders import protocols
+from kouxing.services.senders.connection import DatagramConnection
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import make_connection, parse_target
@@ -182,6 +186,36 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
 def test_error_of_an_invalid_address(url: str, reason: str) -> None:
     with pytest.raises(UserError, match=reason):
         parse_target(url)
+
+
+class PlainConnection(DatagramConnection):
+    """A protocol of another distribution."""
+
+    default_port = 7000
+    contents = "the time"
+
+    def encode(self, frame: FaceFrame) -> Iterable[bytes]:
+        yield b"%.1f" % frame.time_s
+
+
+def test_other_distributions_add_protocols(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    here = f"{__name__}:PlainConnection"
+    references = {"plain": here, "missing": "no_such_module:Sender", "wrong": "json:JSONDecoder"}
+    monkeypatch.setattr(protocols, "plugins", lambda _group: references)
+    protocols.protocols.cache_clear()
+    try:
+        with caplog.at_level(logging.WARNING):
+            target = parse_target("plain://")
+        assert (target.port, target.contents) == (7000, "the time and head")
+        assert list(make_connection(target).encode(frame_of(jawOpen=0.7))) == [b"0.0"]  # type: ignore[attr-defined]
+        with pytest.raises(UserError, match="vts://HOST:8001 or plain://HOST:7000"):
+            parse_target("missing://")
+        assert "missing from no_such_module:Sender: No module" in caplog.text
+        assert "json:JSONDecoder is not a TargetConnection" in caplog.text
+    finally:
+        protocols.protocols.cache_clear()
 
 
 def test_playout_removes_jitter() -> None:
