@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, Self, TypeVar
 
+from kouxing_client.keys import Key
 from kouxing_client.messages import Message, ServiceState, SessionFacts
 
 from kouxing.shared.fast_record import replace
@@ -64,8 +65,8 @@ class FakeControl:
         Messages to the recognizer.
     """
 
-    def __init__(self) -> None:
-        self.bus = Bus()
+    def __init__(self, key: Key | None = None) -> None:
+        self.bus = Bus(key)
         self.commands = self.bus.bind_router(LOCAL, "commands")
         self.audio = self.bus.bind_router(LOCAL, "audio")
         self.phones = self.bus.bind_publisher(LOCAL, "phones")

@@ -18,7 +18,7 @@
 #include <time.h>
 #include <zmq.h>
 
-enum { KEY_LENGTH = 40, MAX_NAME = 64, MAX_ENDPOINT = 256 };
+enum { KEY_LENGTH = 40, MAX_NAME = 64, MAX_ID = 128, MAX_ENDPOINT = 256 };
 enum { NUM_WEIGHTS = 52, JAW_OPEN = 24 }; /* index in ARKit's names */
 
 static void fail(const char *what) {
@@ -115,6 +115,12 @@ static bool find_text(Bytes map, const char *key, char *text, size_t capacity) {
   return true;
 }
 
+/* Return whether a message is not about an earlier session with the same name. */
+static bool is_about(Bytes message, const char *id) {
+  char other[MAX_ID + 1];
+  return !*id || !find_text(message, "session_id", other, sizeof other) || !strcmp(other, id);
+}
+
 static double find_number(Bytes map, const char *key) {
   Bytes at;
   return find(map, key, &at) ? read_value(&at).number : 0;
@@ -193,7 +199,7 @@ static Bytes ask(void *control, const char *kind, const char *session, const cha
 }
 
 /* Ask control for the wanted session, or the newest; return false if there is no session yet. */
-static bool find_session(void *control, const char *wanted, char *name, char *faps) {
+static bool find_session(void *control, const char *wanted, char *name, char *id, char *faps) {
   zmq_msg_t answer;
   zmq_msg_init(&answer);
   Bytes report = ask(control, "status-request", wanted, "", &answer), sessions, endpoints;
@@ -203,8 +209,10 @@ static bool find_session(void *control, const char *wanted, char *name, char *fa
       double age_s = find_number(sessions, "age_s");
       if (age_s < min_age_s && find(sessions, "endpoints", &endpoints) &&
           find_text(endpoints, "faps", faps, MAX_ENDPOINT + 1) &&
-          find_text(sessions, "session", name, MAX_NAME + 1))
+          find_text(sessions, "session", name, MAX_NAME + 1)) {
         min_age_s = age_s;
+        if (!find_text(sessions, "session_id", id, MAX_ID + 1)) *id = '\0';
+      }
     }
   }
   zmq_msg_close(&answer);
@@ -240,14 +248,14 @@ int main(int num_arguments, char **arguments) {
   Key key = user_key();
   void *context = zmq_ctx_new();
 
-  char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1], events[MAX_ENDPOINT + 1];
+  char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1], id[MAX_ID + 1], events[MAX_ENDPOINT + 1];
   snprintf(endpoint, sizeof endpoint, "%s %s", address, key.control);
   void *control = zmq_socket(context, ZMQ_DEALER);
   int max_wait_ms = 15000, linger_ms = 0;
   zmq_setsockopt(control, ZMQ_RCVTIMEO, &max_wait_ms, sizeof max_wait_ms);
   zmq_setsockopt(control, ZMQ_LINGER, &linger_ms, sizeof linger_ms);
   connect_to(control, endpoint, &key);
-  while (!find_session(control, wanted, name, endpoint))
+  while (!find_session(control, wanted, name, id, endpoint))
     nanosleep(&(struct timespec){.tv_nsec = 500000000}, NULL);
   find_events(control, events);
 
@@ -276,7 +284,7 @@ int main(int num_arguments, char **arguments) {
       zmq_msg_close(&answer);
       connect_to(face, events, &key); /* control publishes there when the session moves */
       printf("following %s\n", name);
-    } else if (!strncmp(topic, "session-moved/", 14) &&
+    } else if (!strncmp(topic, "session-moved/", 14) && is_about(message, id) &&
                find_text(message, "faps", endpoint, sizeof endpoint)) {
       epoch = find_number(message, "epoch");
       connect_to(face, endpoint, &key);

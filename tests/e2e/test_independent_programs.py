@@ -18,11 +18,16 @@ import soundfile
 import zmq
 from kouxing_client import Client
 from kouxing_client.keys import Key
+from kouxing_client.messages import EndOfFaps, SessionState
 
 from kouxing.evaluation.system.attackers import connect
+from kouxing.shared.fast_record import replace
+from kouxing.shared.settings.endpoints import with_key
 from kouxing.shared.settings.keys import load_key, load_user_key
+from kouxing.shared.wire.session import SessionMoved, StatusReport, StatusRequest
 from tests.documents import code_blocks
 from tests.e2e.streaming import StreamedSession
+from tests.fake_control import FACTS, FakeControl
 from tests.system import (
     CHAIN,
     LIMIT_S,
@@ -280,6 +285,49 @@ def test_follow_a_session_that_moves_to_its_end(
         assert {*streamed.times} <= {*times}
         assert 0.2 < max(jaw) <= 1, "/a/ must open the jaw"
         assert min(jaw) == 0
+
+
+class NamesakeControl(FakeControl):
+    """Control of a session whose name an earlier session had; faps also publishes its events."""
+
+    def __init__(self) -> None:
+        self.key = load_key("control", ())
+        load_user_key()  # creates it
+        super().__init__(self.key)
+
+    def _status(self, request: StatusRequest) -> StatusReport:
+        faps = with_key(self.faps.endpoint, self.key.public)
+        state = SessionState(
+            session="s",
+            session_id="new",
+            state="open",
+            age_s=0,
+            speaking=False,
+            endpoints={"faps": faps},
+            workers={},
+            facts=FACTS,
+        )
+        report = super()._status(request)
+        control = replace(report.services[0], endpoints={"events": faps})
+        return replace(report, services=[control], sessions=[state])
+
+
+@pytest.mark.usefixtures("new_keys")
+def test_the_c_program_ignores_the_move_of_an_earlier_session(programs: list[list[str]]) -> None:
+    with NamesakeControl() as control:
+        elsewhere = with_key("tcp://127.0.0.1:1", control.key.public)
+        moved = SessionMoved(
+            session="s", session_id="old", epoch=9, audio="", phones="", faps=elsewhere
+        )
+        command = [*programs[-1], "s", control.address]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+            assert program.stdout is not None
+            assert program.stdout.readline() == "following s\n"
+            control.publish(control.faps, moved, EndOfFaps(session="s", epoch=1, sequence=1))
+            try:
+                assert program.wait(LIMIT_S) == 0
+            finally:
+                program.kill()
 
 
 def test_the_csharp_program_follows_through_the_gateway(system: System, tmp_path: Path) -> None:
