@@ -1,13 +1,11 @@
 """Streams audio to a running system, in real time or as fast as the system accepts it."""
 
 import contextlib
-import functools
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from kouxing_client import Client, KouxingError, Phone, Refused
+from kouxing_client import Client, KouxingError, Phone, Refused, Session
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -52,13 +50,26 @@ def stream(
     ``UserError`` if the system does not answer, rejects the session or stops answering.
     """
     with connect_client(control) as client:
-        return _Streamer(client, source, console).run(
+        for notice in source.notices:
+            _warn(console, notice)
+        drawn_before_s = _drawn_s(client) if record else 0.0
+        opened = client.open_session(
+            session,
+            encoding="f32le",
+            sample_rate_hz=source.sample_rate_hz,
+            num_channels=source.num_channels,
             record=record,
-            name=session,
             paced=paced,
             mouth_profile=mouth_profile or None,
             language=language,
         )
+        try:
+            streamer = _Streamer(client, opened, source, console, is_recorded=record)
+            streamer.run(paced=paced)
+        finally:
+            with contextlib.suppress(KouxingError):  # closed already, or control is gone
+                opened.close()
+        return streamer.summarize(drawn_before_s)
 
 
 def missed_warning(count: int, noun: str) -> str:
@@ -72,42 +83,38 @@ def missed_warning(count: int, noun: str) -> str:
 class _Streamer:
     """Streams one source into a session."""
 
-    def __init__(self, client: Client, source: AudioSource, console: Console) -> None:
+    def __init__(
+        self,
+        client: Client,
+        session: Session,
+        source: AudioSource,
+        console: Console,
+        *,
+        is_recorded: bool,
+    ) -> None:
         self._client = client
+        self._session = session
         self._source = source
         self._console = console
+        self._is_recorded = is_recorded
         self._duration_s = self._clipped = self._peak = 0.0  # statistics of the sent audio
         self._num_phones = 0
-        self._is_recorded = False
+        self._events = session.events()
+        self._frames = session.frames()
+        self._phones = session.results(Phone, keep_all=True)
+        self._progress = _new_progress(console)
+        self._task = self._progress.add_task(f"speaking {source.name}", total=source.duration_s)
 
-    def run(self, *, record: bool, paced: bool, **options: Any) -> StreamSummary:
-        """Stream the source and wait for the last frame and the video."""
+    def run(self, *, paced: bool) -> None:
+        """Stream the source and wait for the last frame."""
+        with self._progress:
+            self._send_all(paced=paced)
+            self._session.finish()
+            self._wait_for_end()
+
+    def summarize(self, drawn_before_s: float) -> StreamSummary:
+        """Wait for the video, if any; print warnings, and return the summary."""
         source = self._source
-        for notice in source.notices:
-            self._warn(notice)
-        self._is_recorded = record
-        drawn_before_s = self._drawn_s() if record else 0.0
-        self._session = self._client.open_session(
-            encoding="f32le",
-            sample_rate_hz=source.sample_rate_hz,
-            num_channels=source.num_channels,
-            record=record,
-            paced=paced,
-            **options,
-        )
-        try:
-            self._events = self._session.events()
-            self._frames = self._session.frames()
-            self._phones = self._session.results(Phone, keep_all=True)
-            with self._progress() as progress:
-                task = progress.add_task(f"speaking {source.name}", total=source.duration_s)
-                self._show_time = functools.partial(progress.update, task)
-                self._send_all(paced=paced)
-                self._session.finish()
-                self._wait_for_end()
-        finally:
-            with contextlib.suppress(KouxingError):  # closed already, or control is gone
-                self._session.close()
         video = self._wait_for_video(drawn_before_s) if self._is_recorded else ""
         if not self._num_phones:
             reason = "; it is silent" if self._peak < QUIET_PEAK else ""
@@ -118,16 +125,11 @@ class _Streamer:
             self._warn(warning)
         return StreamSummary(self._session.name, self._duration_s, self._num_phones, video)
 
-    def _progress(self) -> Progress:
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        is_shown = self._console.is_interactive
-        return Progress(*columns, console=self._console, transient=True, disable=not is_shown)
-
     def _update(self, timeout_s: float) -> None:
         """Process received results, waiting up to the timeout for a phone."""
         self._num_phones += sum(phone.is_spoken for phone in self._phones.available(timeout_s))
         for frame in self._frames.available():
-            self._show_time(completed=frame.time_s)
+            self._progress.update(self._task, completed=frame.time_s)
 
     def _send_all(self, *, paced: bool) -> None:
         source = self._source
@@ -184,11 +186,11 @@ class _Streamer:
 
     def _wait_for_video(self, drawn_before_s: float) -> str:
         """Wait for the driver's video; return its path, or an empty string."""
-        with self._progress() as progress:
+        with _new_progress(self._console) as progress:
             task = progress.add_task("writing the video", total=self._duration_s)
             newest_s = drawn_before_s
             while True:
-                drawn_s = self._drawn_s(DRIVER_TIMEOUT_S)
+                drawn_s = _drawn_s(self._client, DRIVER_TIMEOUT_S)
                 if drawn_s < newest_s:
                     raise UserError("the driver restarted, so the video is incomplete; try again")
                 newest_s = drawn_s
@@ -200,17 +202,26 @@ class _Streamer:
                         self._warn(event.detail)
                         return ""
 
-    def _drawn_s(self, timeout_s: float = 0.0) -> float:
-        """Return how many seconds of video the driver has drawn since it started."""
-        end_s = time.monotonic() + timeout_s
-        while True:
-            services = self._client.status().services
-            drivers = [state for state in services if state.service == "driver"]
-            if drivers:
-                return max(state.metrics.get("video_ms", 0.0) for state in drivers) / 1000
-            if time.monotonic() >= end_s:
-                raise UserError("no driver is running to write the video; start 'kouxing driver'")
-            time.sleep(STATUS_S)
-
     def _warn(self, text: str) -> None:
-        self._console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
+        _warn(self._console, text)
+
+
+def _new_progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_interactive)
+
+
+def _drawn_s(client: Client, timeout_s: float = 0.0) -> float:
+    """Return how many seconds of video the driver has drawn since it started."""
+    end_s = time.monotonic() + timeout_s
+    while True:
+        drivers = [state for state in client.status().services if state.service == "driver"]
+        if drivers:
+            return max(state.metrics.get("video_ms", 0.0) for state in drivers) / 1000
+        if time.monotonic() >= end_s:
+            raise UserError("no driver is running to write the video; start 'kouxing driver'")
+        time.sleep(STATUS_S)
+
+
+def _warn(console: Console, text: str) -> None:
+    console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
