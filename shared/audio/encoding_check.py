@@ -5,6 +5,7 @@ if the same bytes are plausible sound in another encoding, or contain the frames
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from kouxing.shared.audio.pcm import FULL_SCALE
 from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]
-Measure = tuple[float, float, float]  # spectral flatness, correlation of neighbors, RMS
 
 BLOCK = 2400  # samples per channel that are checked together; a multiple of all sample sizes
 _MAX_BLOCKS = 60  # non-silent blocks after which the check ends
@@ -31,6 +31,14 @@ _MIN_GAIN = 4.0  # ratio of the two flatnesses
 _MIN_SOUND_CORRELATION, _MIN_READ_CORRELATION = 0.3, 0.4  # between neighbors in sound
 _NUM_PACKETS = 10  # messages that start with the same 4 bits: packets of a codec
 _MAX_LOW_BYTE_SHARE = 0.3  # share of the most frequent low byte; larger in clipped and 8-bit sound
+
+
+class Measure(NamedTuple):
+    """How samples sound."""
+
+    flatness: float  # of the spectrum
+    correlation: float  # between neighbors
+    rms: float  # of full scale
 
 
 def _decode_mulaw(data: NDArray[np.uint8]) -> Array:
@@ -105,21 +113,20 @@ class EncodingCheck:
     def _judge(self, data: NDArray[np.uint8]) -> None:
         channels = (data.view("<i2") / FULL_SCALE).reshape(-1, self._num_channels).T
         measures = [_measure(channel) for channel in channels]
-        flatness, correlation, rms = max(measures, key=lambda measure: measure[2])
+        flatness, correlation, rms = max(measures, key=lambda measure: measure.rms)
         if rms < _SILENCE:
             self._packet_starts.clear()
             return
         self._num_blocks += 1
         self._is_done = self._num_blocks >= _MAX_BLOCKS
         white = [
-            other
-            for other, _, rms in measures
-            if rms > _MIN_WIDE_RMS and other > _MIN_WIDE_FLATNESS
+            measure.flatness
+            for measure in measures
+            if measure.rms > _MIN_WIDE_RMS and measure.flatness > _MIN_WIDE_FLATNESS
         ]
-        flatness = max(white, default=flatness)
-        is_white = white != []
-        if not is_white:
+        if not white:
             self._packet_starts.clear()
+        flatness = max(white, default=flatness)
         is_narrow = (
             rms > _MIN_NARROW_RMS
             and flatness > _MIN_NARROW_FLATNESS
@@ -128,21 +135,21 @@ class EncodingCheck:
         )
         readings = {name: self._measure_loudest(decode(data)) for name, decode in _READINGS.items()}
         likely = [
-            (other, name)
-            for name, (other, other_correlation, other_rms) in readings.items()
-            if (is_narrow if name in _NARROW else is_white and other < _MAX_SOUND_FLATNESS)
-            and flatness > _MIN_GAIN * other
-            and other_correlation > _MIN_READ_CORRELATION
-            and other_rms > _QUIET
+            (reading.flatness, name)
+            for name, reading in readings.items()
+            if (is_narrow if name in _NARROW else white and reading.flatness < _MAX_SOUND_FLATNESS)
+            and flatness > _MIN_GAIN * reading.flatness
+            and reading.correlation > _MIN_READ_CORRELATION
+            and reading.rms > _QUIET
         ]
         if likely:
             self._reject(min(likely)[1])
-        elif is_white and self._is_compressed(data[::2]):
+        elif white and self._is_compressed(data[::2]):
             self._reject("compressed data")
-        elif not is_white and (
+        elif not white and (
             correlation > _MIN_SOUND_CORRELATION
             and rms > _AUDIBLE
-            and flatness < min(other for other, _, _ in readings.values())
+            and flatness < min(reading.flatness for reading in readings.values())
         ):
             self._num_sound += 1
             self._is_done = self._num_sound == _MIN_SOUND
@@ -169,7 +176,7 @@ class EncodingCheck:
     def _measure_loudest(self, samples: NDArray[np.floating]) -> Measure:
         """Measure the loudest channel. Far beyond full scale, the flatness is infinite."""
         if not (np.abs(samples) < _MAX_SAMPLE).all():  # also for NaN
-            return np.inf, 0.0, 0.0
+            return Measure(np.inf, 0.0, 0.0)
         channels = samples.astype(np.float64).reshape(-1, self._num_channels)
         return _measure(channels[:, channels.std(axis=0).argmax()])
 
@@ -181,4 +188,5 @@ def _measure(samples: Array) -> Measure:
     power += 1e-9 * power.mean() + 1e-12
     flatness = np.exp(np.log(power).mean()) / power.mean()
     variance = (samples**2).mean() + 1e-12
-    return flatness, (samples[1:] * samples[:-1]).mean() / variance, float(samples.std())
+    correlation = (samples[1:] * samples[:-1]).mean() / variance
+    return Measure(flatness, correlation, float(samples.std()))
