@@ -121,8 +121,10 @@ def animate(
     loading = progress.add_task("loading", total=None)
     model, predictor = _load_models(mouth, language)
     changes: dict[str, Any] = {} if expressiveness is None else {"expressiveness": expressiveness}
-    models = [load_lip_model(model.inventory.language, name) for name in lip_models]
-    settings = [SynthesizerConfig(lips=name, **changes) for name in lip_models]
+    lips = [
+        (load_lip_model(model.inventory.language, name), SynthesizerConfig(lips=name, **changes))
+        for name in lip_models
+    ]
     transcript = None
     try:
         transcript = None if text is None else read_transcript(text, load_inventory(language))
@@ -139,7 +141,7 @@ def animate(
     if live:
         pipelines = [
             LivePipeline(model, lip_model, synthesizer=config, lip_predictor=predictor)
-            for lip_model, config in zip(models, settings, strict=True)
+            for lip_model, config in lips
         ]
         with_progress = partial(progress.track, description="recognizing")
         faces = [pipeline.animate(samples, with_progress) for pipeline in pipelines]
@@ -168,13 +170,13 @@ def animate(
         with_progress = partial(progress.track, description="animating")
         faces = [
             animate_recording(recording, lip_model, config, with_progress)
-            for lip_model, config in zip(models, settings, strict=True)
+            for lip_model, config in lips
         ]
         events = recording.events
     spoken = [event for event in events if isinstance(event, Phone) and event.is_spoken]
     return FaceMotion(
         frames=faces[0] if len(faces) == 1 else film.stack_faces(faces),
-        frame_rate_hz=settings[0].frame_rate_hz,
+        frame_rate_hz=lips[0][1].frame_rate_hz,
         image_rate_hz=_IMAGE_RATE_HZ,
         samples=samples,
         phones=spoken,
