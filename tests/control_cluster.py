@@ -59,7 +59,7 @@ class Cluster:
 
     def report(self, record: SessionRecord, instance: str, **fields: Any) -> None:
         """Record a heartbeat about a session that its client uses."""
-        record.announced = True
+        record.is_announced = True
         heartbeat = worker(instance.partition("-")[0], instance)
         sessions = {record.name: SessionProgress(**fields)}
         self.sessions.record_progress(record, replace(heartbeat, sessions=sessions))

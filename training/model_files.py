@@ -76,7 +76,7 @@ def save_universal(path: Path, model: blocks.BlockModel, extension: NDArray[np.u
         path,
         universal.FORMAT,
         model.topology,
-        block_network=universal.hash_of(model.network[: -len(extension)]),
+        block_network=universal.compute_network_hash(model.network[: -len(extension)]),
         extension=extension,
         log_prior=model.log_prior,
         acoustic_scale=model.acoustic_scale,

@@ -107,7 +107,7 @@ class LocalSystem(System):
             if name == self._spare_name
         }
         self.supervisor = Supervisor(
-            [], folder, console, self.environment, services=services, more=more
+            [], folder, console, self.environment, services=services, extra_workers=more
         )
 
     def __enter__(self) -> Self:

@@ -22,7 +22,7 @@ from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.launch import cluster, run
 from kouxing.services.cli.options import Assignments, ConfigFile, Panel
 from kouxing.services.cli.recordings import commands as recordings
-from kouxing.services.cli.system import clients
+from kouxing.services.cli.system import commands as system
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
@@ -137,8 +137,8 @@ def _service_command(kind: ServiceKind) -> Callable[..., None]:
 
 _COMMANDS: Mapping[Panel, Sequence[Callable[..., None]]] = {
     Panel.RUN: (
-        run.run, clients.speak, clients.listen, clients.send, clients.express, clients.devices,
-        clients.status, clients.doctor, configuration.config, cluster.cluster,
+        run.run, system.speak, system.listen, system.send, system.express, system.devices,
+        system.status, system.doctor, configuration.config, cluster.cluster,
     ),
     Panel.RECORDINGS: (recordings.render, recordings.lips, recordings.phones, recordings.align),
 }  # fmt: skip

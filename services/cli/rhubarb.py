@@ -112,14 +112,16 @@ def _animate(options: argparse.Namespace) -> FaceMotion:
 
 def _format_mouths(motion: FaceMotion, options: argparse.Namespace) -> str:
     """Return the mouths of a recording in the format of the options."""
-    instead = {
+    substitutes = {
         letter: _BASIC_MOUTHS[letter]
         for letter in _BASIC_MOUTHS
         if letter not in options.extendedShapes
     }
     samples = motion.samples if motion.samples is not None else ()
-    end_s, rest = len(samples) / MEDIA_RATE_HZ, instead.get(REST, REST)
-    cues = [(start_s, instead.get(mouth, mouth)) for start_s, mouth in mouth_cues(motion.frames)]
+    end_s, rest = len(samples) / MEDIA_RATE_HZ, substitutes.get(REST, REST)
+    cues = [
+        (start_s, substitutes.get(mouth, mouth)) for start_s, mouth in mouth_cues(motion.frames)
+    ]
     if options.exportFormat == "dat":
         names = _PRESTON_BLAIR if options.datUsePrestonBlair else {}
         return _moho_switches([*cues, (end_s, rest)], options.datFrameRate, names)

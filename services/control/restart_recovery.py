@@ -21,7 +21,7 @@ class RestartRecovery:
         self._reported: dict[str, StartSession] = {}  # sessions that are not restored yet
         self._observed: dict[str, Collection[str]] = {}  # sessions by observer
 
-    def add(self, start: StartSession, instance: str) -> bool:
+    def add_reported_session(self, start: StartSession, instance: str) -> bool:
         """Add a session that a service reports; return False if the service may not report it."""
         if not self.is_active or not self._is_recognizer(start, instance):
             return False

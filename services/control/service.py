@@ -162,11 +162,11 @@ class ControlService(Service):
             return known.opened_message(self.endpoints["events"])
         if known is not None and not self._commands.is_open(known.client.connection):
             known.client = sender  # the client has reconnected
-            if known.announced and known.next_sequence == 1:
+            if known.is_announced and known.next_sequence == 1:
                 # the client may not have received its token
                 self._lifecycle.end(known, "its client was disconnected before the answer arrived")
                 known = None
-        if known is not None and not known.announced:
+        if known is not None and not known.is_announced:
             return None  # the services are starting
         check_face(message.face, self._registry.lip_models())
         record = self._sessions.open(message, sender, time.monotonic())
@@ -299,7 +299,7 @@ class ControlService(Service):
                 continue
             if record is not None and heartbeat.instance in record.lost:
                 continue  # the session has not moved yet
-            if record is not None and record.moved and heartbeat.state == "draining":
+            if record is not None and record.has_unannounced_move and heartbeat.state == "draining":
                 continue  # the new worker is starting
             if record is None or not self._sessions.is_participant(record, heartbeat.instance):
                 self._commands.send(CloseSession(session=name), to=sender)
@@ -309,7 +309,7 @@ class ControlService(Service):
     def _on_session_started(self, started: SessionStarted, instance: str) -> None:
         record = self._sessions.get(started.session)
         if started.start is not None and record is None:
-            if self._recovery.add(started.start, instance):
+            if self._recovery.add_reported_session(started.start, instance):
                 self._restore_sessions()
             else:
                 text = f"{instance} may not report this session"
@@ -326,7 +326,7 @@ class ControlService(Service):
             return
         if instance not in record.waiting_for:
             return
-        if not record.announced:
+        if not record.is_announced:
             self._lifecycle.reject(record, error)
         elif instance in record.workers.values():
             self._lifecycle.move_from(record, instance, error)
@@ -336,11 +336,11 @@ class ControlService(Service):
         if record is None:
             self._recovery.record_speech(speech, instance)
             return
-        if not record.announced:  # it is about an earlier session with this name
+        if not record.is_announced:  # it is about an earlier session with this name
             return
         if (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
             return
-        if not record.speaking:  # a new recognizer repeats the start of speech
+        if not record.is_speaking:  # a new recognizer repeats the start of speech
             record.speech_time = speech.media_time
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
         self._lifecycle.publish(name, record, media_time=speech.media_time)
@@ -375,7 +375,7 @@ class ControlService(Service):
                 continue
             record = self._sessions.restore(start, time.monotonic())
             LOG.info("session restored", extra={"session": record.name})
-            self._lifecycle.set_speaking(record, speaking=record.speaking)
+            self._lifecycle.set_speaking(record, speaking=record.is_speaking)
             missed_start = self._recovery.observers_that_missed_start(record.name)
             self._lifecycle.send_start(record, record.waiting_for | missed_start)
             if record.lost:

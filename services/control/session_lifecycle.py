@@ -86,7 +86,7 @@ class SessionLifecycle:
 
     def set_speaking(self, record: SessionRecord, *, speaking: bool) -> None:
         """Record whether a session has speech, and notify the faces of its listeners."""
-        record.speaking = speaking
+        record.is_speaking = speaking
         for listener in self._sessions.listeners_of(record.name):
             self.change_face(listener, FaceSettings(listening=speaking))
 
@@ -98,12 +98,12 @@ class SessionLifecycle:
         """
         if record.lost:
             return
-        if not record.announced and not record.waiting_for:
-            record.announced, record.moved = True, False
+        if not record.is_announced and not record.waiting_for:
+            record.is_announced, record.has_unannounced_move = True, False
             self.publish(EventName.SESSION_OPENED, record)
             opened = record.opened_message(self._events_address)
             self._requests.answer(record.client, record.opening.request, opened)
-        elif record.moved and record.announced and not record.missing_workers:
+        elif record.has_unannounced_move and record.is_announced and not record.missing_workers:
             self._announce_move(record)
 
     def move(self, record: SessionRecord) -> None:
@@ -127,7 +127,7 @@ class SessionLifecycle:
 
     def end(self, record: SessionRecord, reason: str) -> None:
         """End a session; ``reason`` is for the log and the event."""
-        if record.speaking:
+        if record.is_speaking:
             self.set_speaking(record, speaking=False)
         close = CloseSession(session=record.name, epoch=record.epoch)
         self.send_to_participants(record, close)
@@ -175,7 +175,7 @@ class SessionLifecycle:
                 lost = ", ".join(sorted(record.lost))
                 self.end(record, f"{lost} is lost, and no other worker is free")
         elif record.waiting_for and waited_s > (
-            MOVE_TIMEOUT_S if record.announced else START_TIMEOUT_S
+            MOVE_TIMEOUT_S if record.is_announced else START_TIMEOUT_S
         ):
             self._stop_waiting(record)
         else:
@@ -183,7 +183,7 @@ class SessionLifecycle:
 
     def _announce_move(self, record: SessionRecord) -> None:
         moved = record.moved_message()
-        record.moved, record.resume_sequence = False, None
+        record.has_unannounced_move, record.resume_sequence = False, None
         record.rejected_by.clear()
         self._commands.send(moved, to=record.client)
         self._events.send(moved)
@@ -201,7 +201,7 @@ class SessionLifecycle:
             self.announce_if_started(record)
             return
         text = f"{', '.join(sorted(missing))} did not start the session in time"
-        if record.announced:
+        if record.is_announced:
             self.end(record, text)
         else:
             error = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text)

@@ -38,10 +38,10 @@ class SessionRecord:
     rejected_by: set[str] = field(default_factory=set)  # workers that rejected the current move
     started: set[str] = field(default_factory=set)  # instances that have started the session
     epoch: int = 1
-    announced: bool = False  # whether the client has the endpoints
-    moved: bool = False  # whether it was placed again and the client is not notified yet
+    is_announced: bool = False  # whether the client has the endpoints
+    has_unannounced_move: bool = False  # placed again, and the client has not been notified
     restored_epoch: int = 0  # its epoch when an earlier control process stopped; 0: not restored
-    speaking: bool = False
+    is_speaking: bool = False
     speech_time: int = 0  # media time at which the newest speech started
     next_sequence: int = 1  # first audio message that a replacement recognizer would need
     resume_sequence: int | None = None  # first message to resend; None: same recognizer
@@ -62,7 +62,9 @@ class SessionRecord:
     @property
     def is_up_to_date(self) -> bool:
         """Whether all services and the client are up to date."""
-        return self.announced and not (self.moved or self.waiting_for or self.lost)
+        return self.is_announced and not (
+            self.has_unannounced_move or self.waiting_for or self.lost
+        )
 
     @property
     def missing_workers(self) -> set[str]:
@@ -86,7 +88,7 @@ class SessionRecord:
             facts=self.facts,
             endpoints=self.endpoints,
             final_until=self.final_until,
-            speech_time=self.speech_time if self.speaking else None,
+            speech_time=self.speech_time if self.is_speaking else None,
             client=self.client.address,
             client_key=self.client.key or None,
         )
@@ -123,9 +125,9 @@ class SessionRecord:
         return SessionState(
             session=self.name,
             session_id=self.session_id,
-            state="open" if self.announced else "starting",
+            state="open" if self.is_announced else "starting",
             age_s=now_s - self.opened_s,
-            speaking=self.speaking,
+            speaking=self.is_speaking,
             endpoints=self.endpoints,
             workers=self.workers,
             facts=self.facts,

@@ -64,7 +64,7 @@ class SessionTable:
         if face.listen_to is None or face.listening is not None:
             return face
         speaker = self._records.get(face.listen_to)
-        return replace(face, listening=speaker is not None and speaker.speaking)
+        return replace(face, listening=speaker is not None and speaker.is_speaking)
 
     def find_authorized(self, name: str, token: str) -> SessionRecord:
         """Return a session after checking its token.
@@ -105,7 +105,7 @@ class SessionTable:
 
     def num_speaking(self, instance: str) -> int:
         """Return the number of a worker's sessions with current speech."""
-        return sum(record.speaking for record in self._by_worker.get(instance, {}).values())
+        return sum(record.is_speaking for record in self._by_worker.get(instance, {}).values())
 
     def participants(self, record: SessionRecord) -> set[str]:
         """Return a session's running services: its workers and all observers."""
@@ -188,10 +188,10 @@ class SessionTable:
             waiting_for=running,
             lost={*workers.values()} - running,
             epoch=start.epoch,
-            announced=True,
+            is_announced=True,
             restored_epoch=start.epoch,
             final_until=start.final_until,
-            speaking=start.speech_time is not None,
+            is_speaking=start.speech_time is not None,
             speech_time=start.speech_time or 0,
         )
         self._add(record, now_s)
@@ -216,7 +216,7 @@ class SessionTable:
 
     def record_progress(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
         """Record a service's progress in a session; return the time without input."""
-        if not record.announced:  # the heartbeat may be about an earlier session with this name
+        if not record.is_announced:  # the heartbeat may be about an earlier session with this name
             return 0.0
         state = heartbeat.sessions[record.name]
         record.final_until = max(record.final_until, state.final_until)
@@ -263,7 +263,9 @@ class SessionTable:
         ]
         for record in records:
             record.lost.remove(instance)
-        missed_start = [record for record in records if record.moved or not record.announced]
+        missed_start = [
+            record for record in records if record.has_unannounced_move or not record.is_announced
+        ]
         for record in missed_start:
             record.waiting_for.add(instance)
         return missed_start
@@ -292,7 +294,7 @@ class SessionTable:
         facts = self._registry.facts(workers.values())
         record.facts = replace(facts, language=record.facts.language)
         record.epoch += 1
-        record.moved = True
+        record.has_unannounced_move = True
         record.started_s = now_s
         record.waiting_for = self.participants(record)
         record.started = set()

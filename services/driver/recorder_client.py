@@ -23,8 +23,10 @@ HANG_S = 600.0  # limit without a report; completing a long video may take minut
 MAX_TICK_S = 0.1  # anything longer is the driver's own delay
 CLOSE_TIMEOUT_S = 3.0
 KILL_TIMEOUT_S = 1.0
-HANGS = "the process that draws videos does not respond; record again"
-ENDED = "the process that draws videos ended unexpectedly; see the driver's log, and record again"
+HANG_REASON = "the process that draws videos does not respond; record again"
+EXIT_REASON = (
+    "the process that draws videos ended unexpectedly; see the driver's log, and record again"
+)
 
 _SPAWN = multiprocessing.get_context("spawn")
 
@@ -139,7 +141,7 @@ class RecorderClient:
         self._ticked_s = now_s
         self._receive(timeout_s=0.0)
         if self._silent_s > HANG_S:
-            self._fail_all(HANGS)
+            self._fail_all(HANG_REASON)
         elif self._unfinished:
             self._busy_s = now_s
         elif now_s >= self._busy_s + IDLE_S:
@@ -160,7 +162,7 @@ class RecorderClient:
             return
         self._recorder.commands.put((command, number, *arguments))
         if self._recorder.commands.qsize() > MAX_QUEUED:
-            self._fail_all(HANGS)
+            self._fail_all(HANG_REASON)
 
     def _receive(self, timeout_s: float) -> bool:
         """Handle reports, waiting up to the timeout for the first; return whether one arrived."""
@@ -170,7 +172,7 @@ class RecorderClient:
                 self._on_report(*self._recorder.connection.recv())
                 has_received, timeout_s = True, 0.0
         except (EOFError, OSError):
-            self._fail_all(ENDED)
+            self._fail_all(EXIT_REASON)
         return has_received
 
     def _on_report(self, kind: str, number: int = -1, detail: Any = None) -> None:

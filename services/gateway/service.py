@@ -254,7 +254,7 @@ class GatewayService(SessionService):
             self._viewers.show_resting_face(self._resting_face, now_s)
         missing_due_s = self._replied_s + CONTROL_MISSING_S
         if now_s > missing_due_s:
-            self._viewers.set_missing(("control",))
+            self._viewers.announce_missing_services(("control",))
             missing_due_s = math.inf
         return min(missing_due_s, rest_due_s)
 
@@ -265,7 +265,7 @@ class GatewayService(SessionService):
         since_s = min(self._missing_since_s, self._replied_s) if reply.missing else math.inf
         self._missing_since_s = since_s
         if not reply.missing or self._replied_s > since_s + MISSING_S:
-            self._viewers.set_missing(tuple(reply.missing))
+            self._viewers.announce_missing_services(tuple(reply.missing))
 
     def _set_face(self, session: str, face: FaceSettings) -> None:
         self.send_to_control(SetFace(session=session, face=face))
@@ -318,14 +318,14 @@ class GatewayService(SessionService):
             self._senders.send_frame(frame.media_time, values)
 
     def _on_sound(self, sound: Sound) -> None:
-        message = browser_messages.binary(
+        message = browser_messages.encode_binary(
             browser_messages.SOUND_TYPE, sound.epoch, sound.media_time, sound.pcm
         )
         self._viewers.forward(sound.session, MessageKind.SOUND, message)
 
     def _on_phone(self, phone: Phone) -> None:
         syllables = self._sessions[phone.session].syllables
-        message = browser_messages.text(
+        message = browser_messages.encode_json(
             "phone",
             index=phone.index,
             symbol=phone.symbol,
@@ -337,7 +337,7 @@ class GatewayService(SessionService):
         )
         self._viewers.forward(phone.session, MessageKind.TEXT, message)
         for syllable in syllables.update(events.Phone.from_message(phone)):
-            message = browser_messages.text(
+            message = browser_messages.encode_json(
                 "syllable",
                 index=syllable.index,
                 symbol=syllable.text,
@@ -348,15 +348,15 @@ class GatewayService(SessionService):
             self._viewers.forward(phone.session, MessageKind.TEXT, message)
 
     def _on_speech(self, speech: Speech) -> None:
-        message = browser_messages.text(
+        message = browser_messages.encode_json(
             "speech", active=speech.active, media_time=speech.media_time
         )
         self._viewers.forward(speech.session, MessageKind.TEXT, message)
 
     def _on_acoustic(self, acoustic: Acoustic) -> None:
-        self._viewers.set_acoustic(acoustic.session, acoustic.model)
+        self._viewers.announce_acoustic_model(acoustic.session, acoustic.model)
 
     def _on_end(self, end: EndOfFaps) -> None:
         self._audio_client.on_last_frame(end.session)
-        message = browser_messages.text("end", media_time=end.media_time)
+        message = browser_messages.encode_json("end", media_time=end.media_time)
         self._viewers.forward(end.session, MessageKind.TEXT, message)

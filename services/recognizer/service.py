@@ -198,7 +198,7 @@ class RecognizerService(SessionService):
             flushed.silent_s = 0.0  # so that a stalled client is reported again
             flushed.stream.flush()
             self._send_results(flushed)
-            if flushed.end is not None:
+            if flushed.last_chunk is not None:
                 self._finish(flushed)
 
     def on_tick(self, now_s: float) -> float:
@@ -282,7 +282,7 @@ class RecognizerService(SessionService):
             return
         if not session.is_paced:
             self._unpaced.limit_reading()
-        if session.end is not None and not session.is_decoding:
+        if session.last_chunk is not None and not session.is_decoding:
             self._finish(session)
 
     @property
@@ -327,7 +327,7 @@ class RecognizerService(SessionService):
             session.num_gaps_counted = session.stream.num_gaps
             if session.is_paced:
                 self.metrics.observe("chunk_ms", 1e3 * (time.monotonic() - session.accepted_s))
-            if session.end is not None and not session.is_decoding:
+            if session.last_chunk is not None and not session.is_decoding:
                 self._finish(session)
 
     def _finish(self, session: RecognizerSession) -> None:
@@ -336,7 +336,7 @@ class RecognizerService(SessionService):
             session.stream.input_finished()
             self._recognizer.decode_streams([session.stream])
             self._send_results(session)
-            if session.end is not None and session.end.acknowledge:
+            if session.last_chunk is not None and session.last_chunk.acknowledge:
                 session.request_acknowledgement(time.monotonic(), at_once=True)
             LOG.info("end of audio", extra={"session": session.name})
 

@@ -13,7 +13,7 @@ from kouxing.services.senders.target import Target
 from kouxing.services.senders.tracker_input import TrackerInput, open_tracker_input
 
 RETRY_S = 1.0
-_REFUSED_S = 1.0  # if no error arrives within this time, assume that a program is listening
+_ASSUME_LISTENING_AFTER_S = 1.0  # without an error for this time, a program is listening
 
 Options = Mapping[str, tuple[str, ...]]
 COMMON_OPTIONS: Options = {"delay": ("0",), "only": ("face", "mouth")}
@@ -48,7 +48,7 @@ class DatagramConnection(TargetConnection):
     def __init__(self, target: Target) -> None:
         super().__init__(target)
         self._socket: socket.socket | None = None
-        self._refused_s = -_REFUSED_S
+        self._last_refused_s = -_ASSUME_LISTENING_AFTER_S
         self._newest_frame: FaceFrame | None = None
         self._tracker_input: tuple[asyncio.DatagramTransport, TrackerInput] | None = None
 
@@ -113,7 +113,7 @@ class DatagramConnection(TargetConnection):
         except BlockingIOError:
             return False
         except OSError as error:
-            self._refused_s = now_s
+            self._last_refused_s = now_s
             address = f"{self.target.host}:{self.target.port}"
             if error.errno == errno.ECONNREFUSED:
                 self.problem = f"no program is listening on {address}; turn its receiver on"
@@ -121,7 +121,7 @@ class DatagramConnection(TargetConnection):
                 self.problem = f"cannot reach {address}: {error.strerror}"
                 self._close()
             return False
-        if now_s - self._refused_s < _REFUSED_S:
+        if now_s - self._last_refused_s < _ASSUME_LISTENING_AFTER_S:
             return False
         self.problem = ""
         return True

@@ -126,7 +126,7 @@ def disconnect_before_the_answer(
     harness.step_until(lambda: harness.control._sessions.get("mine"))
     proxy.is_open.clear()
     lost = harness.control._sessions.find("mine")
-    harness.step_until(lambda: lost.announced)
+    harness.step_until(lambda: lost.is_announced)
     proxy.cut()
     proxy.is_open.set()
     harness.step_until(lambda: not harness.control._commands.is_open(lost.client.connection))
@@ -177,7 +177,7 @@ def send_speech(harness: ControlHarness, *, active: bool) -> None:
     """Send control the start or the end of speech in the session ``speaker``."""
     record = harness.control._sessions.find("speaker")
     harness.services[0].send(Speech(session="speaker", epoch=1, sequence=1, active=active))
-    wait_until(lambda: record.speaking == active, step=lambda: harness.control.step(0.01))
+    wait_until(lambda: record.is_speaking == active, step=lambda: harness.control.step(0.01))
 
 
 def receive_listening(harness: ControlHarness, synthesizer: Socket, num: int) -> list[bool]:

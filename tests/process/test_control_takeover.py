@@ -124,7 +124,7 @@ def test_late_speech_of_an_ended_session_does_not_concern_a_new_one_with_its_nam
     recognizer.send(Speech(session="mine", epoch=1, sequence=9, media_time=2840, active=True))
     recognizer.send(make_heartbeat("recognizer"))
     harness.receive(recognizer)
-    assert not harness.control._sessions.find("mine").speaking
+    assert not harness.control._sessions.find("mine").is_speaking
 
 
 def test_repeats_session_moved_to_the_client(

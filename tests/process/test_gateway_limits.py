@@ -26,7 +26,7 @@ from kouxing.services.gateway.web import web_server
 from kouxing.services.gateway.web.web_application import OpenWebSockets
 from kouxing.services.gateway.web.web_server import WebServer
 from kouxing.services.gateway.webrtc import whip_handler
-from kouxing.services.gateway.webrtc.whip_handler import NO_WEBRTC, WhipHandler
+from kouxing.services.gateway.webrtc.whip_handler import NO_WEBRTC_TEXT, WhipHandler
 from kouxing.shared.monitoring.metrics import Metrics
 from tests.process.web_clients import async_test
 from tests.system import LIMIT_S
@@ -349,7 +349,7 @@ async def test_whip_without_aiortc_says_what_to_install(monkeypatch: pytest.Monk
     monkeypatch.delitem(sys.modules, "kouxing.services.gateway.webrtc.connection", raising=False)
     clients = WhipHandler(1.0, UNUSED, UNUSED, ["127.0.0.1"])
     async with whip_offer(clients) as offer:
-        assert await offer() == (501, NO_WEBRTC)
+        assert await offer() == (501, NO_WEBRTC_TEXT)
     assert len(clients) == 0
 
 

@@ -38,10 +38,10 @@ class FakeSession:
         self.audio.clear()
         self.found.append("needs the network")
 
-    def start_scoring(self) -> None:
+    def hand_over_speech(self) -> None:
         assert self.is_scoring
 
-    def finish_scoring(self) -> None:
+    def take_back_speech(self) -> None:
         self.found.append("end of speech")
 
 
@@ -51,7 +51,7 @@ class FakeRecognizer:
     def __init__(self) -> None:
         self.decoded: list[str] = []
 
-    def run_encoder(self, streams: Sequence[FakeSession]) -> None:
+    def detect_speech(self, streams: Sequence[FakeSession]) -> None:
         assert len(streams) == 1
 
     def needs_network(self, stream: FakeSession) -> bool:

@@ -22,10 +22,10 @@ class FakeSession:
         self.stream = self
         self.num_scored = 0
 
-    def start_scoring(self) -> None:
+    def hand_over_speech(self) -> None:
         assert self.is_scoring
 
-    def finish_scoring(self) -> None:
+    def take_back_speech(self) -> None:
         self.num_scored += 1
 
 

@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from kouxing.services.cli.options import CaptionKind
 from kouxing.services.cli.recordings.animation import FaceMotion, animate, slow_down
-from kouxing.services.cli.recordings.captions import make_captions, write_syllables
+from kouxing.services.cli.recordings.captions import make_captions, spell_syllables
 from kouxing.services.driver.render.captions import Caption, CaptionDrawer, band_height_px
 from kouxing.services.driver.video.time_stretch import stretch_time
 from kouxing.shared import fonts
@@ -28,7 +28,7 @@ PHONES = [
 
 def motion_of(text: str | None = None) -> FaceMotion:
     transcript = None if text is None else MANDARIN.read(text)
-    syllables = write_syllables(PHONES, transcript, MANDARIN)
+    syllables = spell_syllables(PHONES, transcript, MANDARIN)
     return FaceMotion([(0.0, np.zeros(68, np.float32))], 50.0, 25.0, None, PHONES, syllables)
 
 

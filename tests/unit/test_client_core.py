@@ -11,7 +11,7 @@ from kouxing_client.core import MAX_FAILED_OPENINGS, RETRY_S, ClientCore
 from kouxing_client.inbox import Inbox
 from kouxing_client.messages import EndOfFaps, Joined
 from kouxing_client.session_core import (
-    LAST_S,
+    LAST_RESULTS_WAIT_S,
     MOVE_TIMEOUT_S,
     RESUBSCRIBE_S,
     SILENT_S,
@@ -348,7 +348,7 @@ def test_a_late_event_of_an_earlier_session_does_not_concern_a_new_one_with_its_
     assert harness.session.epoch == (2 if is_same else 1)
     events.answer("event", name="session-closed", session_id=session_id)
     assert len(inbox.messages) == is_same
-    harness.pass_time(2 * LAST_S)
+    harness.pass_time(2 * LAST_RESULTS_WAIT_S)
     assert harness.session.is_over == is_same
 
 

@@ -28,7 +28,7 @@ def failed_endpoints(
             clock_offset_ms=0.0, endpoints=endpoints, metrics={},
         )  # fmt: skip
         (check,) = doctor._check_service(state, buses, is_one_host=is_one_host)
-        failed |= {line.partition(" ")[0] for line in check.fix.splitlines()}
+        failed |= {line.partition(" ")[0] for line in check.remedy.splitlines()}
     return failed
 
 

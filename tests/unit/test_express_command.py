@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 from kouxing_client import Refused
 
-from kouxing.services.cli.system.clients import express
+from kouxing.services.cli.system.commands import express
 from kouxing.shared.command import client_connection
 
 

@@ -36,7 +36,7 @@ VOICE = 0.1 * np.exp(-(np.arange(32000) % 130) / 30) * np.sin(np.arange(32000) %
 )
 def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, error: str) -> None:
     async def speak(chunk: int) -> None:
-        audio_input = AudioInput(FakeSession(), pcm_format, is_ahead=False)  # type: ignore[arg-type]
+        audio_input = AudioInput(FakeSession(), pcm_format, is_synthesized=False)  # type: ignore[arg-type]
         for begin in range(0, len(pcm), chunk):
             await audio_input.push(pcm[begin : begin + chunk])
         await audio_input.end()
@@ -46,7 +46,7 @@ def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, erro
             run(speak(chunk))
 
 
-@pytest.mark.parametrize("is_ahead", [False, True])
+@pytest.mark.parametrize("is_synthesized", [False, True])
 @pytest.mark.parametrize("chunk", [1, 999, 10_001])
 @pytest.mark.parametrize(
     ("pcm_format", "pcm"),
@@ -57,11 +57,11 @@ def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, erro
     ],
 )
 def test_accepts_pieces_of_any_length(
-    pcm_format: PcmFormat, pcm: bytes, chunk: int, *, is_ahead: bool
+    pcm_format: PcmFormat, pcm: bytes, chunk: int, *, is_synthesized: bool
 ) -> None:
     async def speak() -> None:
         session = FakeSession(pcm_format.frame_bytes)
-        audio_input = AudioInput(session, pcm_format, is_ahead=is_ahead)  # type: ignore[arg-type]
+        audio_input = AudioInput(session, pcm_format, is_synthesized=is_synthesized)  # type: ignore[arg-type]
         async with audio_input.running():
             for begin in range(0, len(pcm), chunk):
                 await audio_input.push(pcm[begin : begin + chunk])
@@ -106,7 +106,7 @@ def test_early_audio_is_passed_on_completely_in_real_time(rate_hz: int, chunk: i
     async def speak() -> None:
         session = FakeSession()
         pcm_format = PcmFormat(sample_rate_hz=rate_hz)
-        audio_input = AudioInput(session, pcm_format, is_ahead=True)  # type: ignore[arg-type]
+        audio_input = AudioInput(session, pcm_format, is_synthesized=True)  # type: ignore[arg-type]
         async with audio_input.running():
             for begin in range(0, len(pcm), chunk):
                 await audio_input.push(pcm[begin : begin + chunk])
@@ -124,7 +124,7 @@ def test_early_audio_is_passed_on_completely_in_real_time(rate_hz: int, chunk: i
 def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
     async def speak() -> None:
         session = FakeSession()
-        audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
+        audio_input = AudioInput(session, PCM16, is_synthesized=True)  # type: ignore[arg-type]
         async with audio_input.running():
             for num_bytes in (MAX_QUEUED_BYTES, 3 * 16000 * 2):
                 await audio_input.push(bytes(num_bytes))
@@ -140,11 +140,11 @@ def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:
     run(speak())
 
 
-@pytest.mark.parametrize("is_ahead", [False, True])
-def test_skipped_audio_stays_between_the_audio_before_and_after_it(*, is_ahead: bool) -> None:
+@pytest.mark.parametrize("is_synthesized", [False, True])
+def test_skipped_audio_stays_between_the_audio_before_and_after_it(*, is_synthesized: bool) -> None:
     async def speak() -> None:
         session = FakeSession()
-        audio_input = AudioInput(session, PCM16, is_ahead=is_ahead)  # type: ignore[arg-type]
+        audio_input = AudioInput(session, PCM16, is_synthesized=is_synthesized)  # type: ignore[arg-type]
         async with audio_input.running():
             audio_input.skip(1)
             await audio_input.push(b"\1\0" * 20_000)
@@ -163,7 +163,7 @@ def test_skipped_audio_stays_between_the_audio_before_and_after_it(*, is_ahead: 
 def test_a_flush_also_drops_queued_gaps() -> None:
     async def speak() -> None:
         session = FakeSession()
-        audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
+        audio_input = AudioInput(session, PCM16, is_synthesized=True)  # type: ignore[arg-type]
         async with audio_input.running():
             await audio_input.push(bytes(320))
             audio_input.skip(1)
@@ -177,7 +177,7 @@ def test_a_flush_also_drops_queued_gaps() -> None:
 
 def test_no_task_waits_for_audio_that_a_disconnected_client_left() -> None:
     async def speak() -> None:
-        audio_input = AudioInput(FakeSession(), PCM16, is_ahead=True)  # type: ignore[arg-type]
+        audio_input = AudioInput(FakeSession(), PCM16, is_synthesized=True)  # type: ignore[arg-type]
         async with audio_input.running():
             await audio_input.push(bytes(32000))
             await audio_input.end()

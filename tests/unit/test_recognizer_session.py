@@ -94,7 +94,7 @@ def test_rejects_impossible_audio_and_audio_after_the_end() -> None:
     with pytest.raises(Rejected, match="perhaps 32-bit float samples") as rejection:
         session.read_chunk(chunk(pcm=float_pcm[: 16 * RATE_HZ]), 0.0)
     assert rejection.value.code == ErrorCode.BAD_AUDIO
-    session.end = chunk(last=True)
+    session.last_chunk = chunk(last=True)
     with pytest.raises(Rejected, match="has ended"):
         session.check_open(chunk(2))
 
@@ -125,7 +125,7 @@ def test_audio_after_a_gap_waits_for_the_end_of_scoring() -> None:
     session.accept_waveform(1.0, 0.0, hop=1)
     recognizer().decode_streams([session.stream])
     session.is_scoring = True
-    session.stream.start_scoring()
+    session.stream.hand_over_speech()
     session.audio.append((3200, samples[3200:6400]), 0.0)
     session.audio.append((16_000, samples[6400:]), 0.0)
     session.accept_waveform(1.0, 0.0, hop=1)
@@ -133,7 +133,7 @@ def test_audio_after_a_gap_waits_for_the_end_of_scoring() -> None:
     assert session.audio
     assert not session.can_accept
     session.is_scoring = False
-    session.stream.finish_scoring()
+    session.stream.take_back_speech()
     assert session.can_accept
     session.accept_waveform(1.0, 0.0, hop=1)
     assert session.stream.media_time == 19_200

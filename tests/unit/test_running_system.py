@@ -11,10 +11,10 @@ from kouxing_client import NotConnected
 
 from kouxing.services.cli.system.running_system import (
     announce_system,
-    find_control,
-    find_control_address,
     lock_output_folder,
     lock_startup,
+    newest_control_endpoint,
+    open_control_address,
 )
 from kouxing.shared.errors import UserError
 from kouxing.shared.settings.keys import load_user_key
@@ -29,19 +29,19 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_finds_the_newest_running_system_even_if_others_were_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert find_control() == ""
+    assert newest_control_endpoint() == ""
     with ExitStack() as stack:
         for number in (1, 2):
             monkeypatch.setattr(os, "getpid", lambda number=number: number)
             stack.enter_context(announce_system(f"tcp://127.0.0.1:{number}"))
             (folder,) = tmp_path.iterdir()
             os.utime(folder / str(number), (number, number))
-        assert find_control() == "tcp://127.0.0.1:2"
+        assert newest_control_endpoint() == "tcp://127.0.0.1:2"
         killed = folder / "3"  # nobody holds its lock
         killed.write_text("tcp://127.0.0.1:3", encoding="utf-8")
-        assert find_control() == "tcp://127.0.0.1:2"
+        assert newest_control_endpoint() == "tcp://127.0.0.1:2"
         assert not killed.exists()
-    assert find_control() == ""
+    assert newest_control_endpoint() == ""
 
 
 def test_a_system_that_ends_during_the_search_is_not_an_error(
@@ -51,11 +51,11 @@ def test_a_system_that_ends_during_the_search_is_not_an_error(
         (folder,) = tmp_path.iterdir()
         paths = [*folder.iterdir(), folder / "2"]  # the second one has just been removed
         monkeypatch.setattr(Path, "iterdir", lambda _: iter(paths))
-        assert find_control() == "tcp://127.0.0.1:1"
+        assert newest_control_endpoint() == "tcp://127.0.0.1:1"
 
 
 def control_address(address: str) -> str:
-    with find_control_address(address) as endpoint:
+    with open_control_address(address) as endpoint:
         return endpoint
 
 
@@ -92,7 +92,7 @@ def test_finds_no_system_with_other_keys(tmp_path: Path, monkeypatch: pytest.Mon
 def test_says_that_no_system_runs_unless_the_user_gave_its_address(
     address: str, message: str
 ) -> None:
-    with pytest.raises(UserError, match=message), find_control_address(address):
+    with pytest.raises(UserError, match=message), open_control_address(address):
         raise UserError("no answer") from NotConnected("no answer")
 
 
@@ -113,7 +113,7 @@ def test_ignores_a_folder_that_others_can_write_to(tmp_path: Path) -> None:
     with announce_system("tcp://127.0.0.1:1"):
         (folder,) = tmp_path.iterdir()
         folder.chmod(0o777)
-        assert find_control() == ""
+        assert newest_control_endpoint() == ""
 
 
 def test_a_second_start_waits_for_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,7 +139,7 @@ def test_a_system_that_cannot_be_announced_runs(monkeypatch: pytest.MonkeyPatch)
         full_disk.setattr(Path, "open", fail)
         with announce_system("tcp://127.0.0.1:1"):
             pass
-    assert find_control() == ""
+    assert newest_control_endpoint() == ""
 
 
 def test_two_systems_do_not_share_a_folder(tmp_path: Path) -> None:

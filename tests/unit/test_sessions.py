@@ -72,7 +72,7 @@ def test_control_knows_the_lip_models_of_all_synthesizers(cluster: Cluster) -> N
 
 def test_a_face_listens_to_a_session_that_already_speaks(cluster: Cluster) -> None:
     speaker = cluster.open("speaker")
-    speaker.speaking = True
+    speaker.is_speaking = True
     face = FaceSettings(listen_to="speaker")
     listener = cluster.open("listener", face=face)
     assert listener.face.settings.listening
@@ -323,8 +323,8 @@ def test_restores_a_session_from_its_newest_recognizer(cluster: Cluster) -> None
     assert cluster.sessions.move(record, 1.0)
     cluster.add(worker("recognizer", "recognizer-1"))
     recovery = RestartRecovery(cluster.registry, 2.0)
-    assert recovery.add(record.start_message(2.0), "recognizer-2")
-    recovery.add(stalled, "recognizer-1")
+    assert recovery.add_reported_session(record.start_message(2.0), "recognizer-2")
+    recovery.add_reported_session(stalled, "recognizer-1")
     (start,) = recovery.pop_complete()
     assert start.epoch == 2
 
@@ -332,9 +332,9 @@ def test_restores_a_session_from_its_newest_recognizer(cluster: Cluster) -> None
 @pytest.mark.parametrize("has_stopped", [False, True])
 def test_a_restored_session_still_speaks(cluster: Cluster, has_stopped: bool) -> None:
     record = cluster.open("demo")
-    record.speaking, record.speech_time = True, 2840
+    record.is_speaking, record.speech_time = True, 2840
     recovery = RestartRecovery(cluster.registry, 2.0)
-    assert recovery.add(record.start_message(2.0), "recognizer-1")
+    assert recovery.add_reported_session(record.start_message(2.0), "recognizer-1")
     stop = Speech(session="demo", epoch=1, media_time=5000, active=False)
     recovery.record_speech(stop, "recognizer-1" if has_stopped else "synthesizer-1")
     (start,) = recovery.pop_complete()

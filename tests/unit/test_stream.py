@@ -187,7 +187,7 @@ def test_lips_may_be_early_and_phones_are_the_same() -> None:
     num_early = 0
     for begin in range(0, len(SAMPLES), 320):
         stream.accept_waveform(SAMPLES[begin : begin + 320])
-        recognizer.run_encoder([stream])
+        recognizer.detect_speech([stream])
         if recognizer.needs_network(stream):
             stream.decode_early()
             early = recognizer.get_result(stream)
@@ -214,20 +214,20 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
         is_scoring = False
         for begin in range(0, len(SAMPLES), 320):
             stream.accept_waveform(SAMPLES[begin : begin + 320])
-            recognizer.run_encoder([stream])
+            recognizer.detect_speech([stream])
             if is_scoring:  # the other thread finishes after the next chunk
                 stream.decode_early()
                 early = recognizer.get_result(stream)
                 num_early += len(of_kind(LipPositions, early))
                 results += early
                 recognizer.decode_speech([stream])
-                stream.finish_scoring()
-                recognizer.run_encoder([stream])
+                stream.take_back_speech()
+                recognizer.detect_speech([stream])
             elif recognizer.needs_network(stream):
                 stream.decode_early()
                 results += recognizer.get_result(stream)
                 if continues:
-                    stream.start_scoring()
+                    stream.hand_over_speech()
             is_scoring = stream.can_accept_while_scoring(stream.next_media_time)
             if not is_scoring:
                 recognizer.decode_speech([stream])
@@ -245,16 +245,16 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
     begin = 0
     while not recognizer.needs_network(stream):
         stream.accept_waveform(SAMPLES[begin : begin + 320])
-        recognizer.run_encoder([stream])
+        recognizer.detect_speech([stream])
         begin += 320
-    stream.start_scoring()
+    stream.hand_over_speech()
     assert not stream.can_accept_while_scoring(begin)  # the lips of this audio are not sent yet
-    stream.finish_scoring()
+    stream.take_back_speech()
     stream.decode_early()
-    stream.start_scoring()
+    stream.hand_over_speech()
     assert stream.can_accept_while_scoring(begin)
     assert not stream.can_accept_while_scoring(begin + MAX_JITTER + 1)
-    stream.finish_scoring()
+    stream.take_back_speech()
     assert not stream.can_accept_while_scoring(begin)
 
 

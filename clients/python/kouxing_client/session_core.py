@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect again
 MOVE_TIMEOUT_S = 5.0  # limit for the move of a session whose recognizer is lost
 END_TIMEOUT_S = 5.0  # maximum wait for the last phones after the last frame
-LAST_S = 0.5  # wait for the last results of a session that control has closed
+LAST_RESULTS_WAIT_S = 0.5  # wait for the last results of a session that control has closed
 AUDIO_QUEUE = 500  # messages
 SILENT_S = 2.0  # without results for this time, a session may have moved or ended
 
@@ -116,9 +116,9 @@ class Subscription:
         if isinstance(message, EndOfFaps):
             self._on_end()
         elif isinstance(message, Phone):
-            self._pass_on(self._phones.update(message))
+            self._deliver(self._phones.update(message))
         elif isinstance(message, Speech):
-            self._pass_on(self._phones.add_speech(message))
+            self._deliver(self._phones.add_speech(message))
         self.inbox.num_missed = self.follower.num_missed + self._phones.num_missed
         if type(message) in self._classes and not isinstance(message, Phone):
             self._on_result(message)
@@ -158,7 +158,7 @@ class Subscription:
         if not self.joined.done():
             self.joined.set_result(None)
 
-    def _pass_on(self, phones: list[Phone]) -> None:
+    def _deliver(self, phones: list[Phone]) -> None:
         for phone in phones:
             self._on_result(phone)
 
@@ -296,7 +296,7 @@ class SessionCore:
 
     def close_after_results(self, reason: str) -> None:
         """End after the last results have arrived: control has closed the session."""
-        self._closing = self._closing or (self.sockets.now_s + LAST_S, reason)
+        self._closing = self._closing or (self.sockets.now_s + LAST_RESULTS_WAIT_S, reason)
 
     def end(self, failure: KouxingError | None) -> None:
         """Close all connections; ``failure`` is the reason for an early end."""

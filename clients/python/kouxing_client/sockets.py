@@ -23,7 +23,7 @@ RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to conn
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
 _REACH_S = 1.0  # limit for finding out why an address does not answer
-SUSPENDED_S = 0.5  # if a wait takes this much longer than requested, the process was stalled
+STALL_S = 0.5  # if a wait takes this much longer than requested, the process was stalled
 _MONITORED = zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CONNECT_RETRIED
 
 Connection = zmq.Socket[bytes]
@@ -101,7 +101,7 @@ class Sockets:
         """Wait up to the timeout, then handle received messages and requested calls."""
         begin_s = time.monotonic()
         ready = self._poller.poll(math.ceil(1000 * timeout_s))
-        if time.monotonic() > begin_s + timeout_s + SUSPENDED_S:
+        if time.monotonic() > begin_s + timeout_s + STALL_S:
             self.resumed_at_s = time.monotonic()
         for raw, _ in ready:
             if isinstance(raw, zmq.Socket):

@@ -64,7 +64,7 @@ class Worker:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(POLL_S)
             self._process.read_heartbeats()
-            if not self._draining and self._process.hangs:
+            if not self._draining and self._process.is_hung:
                 self._process.kill()
         shutil.rmtree(self._folder)
         if not self._draining:

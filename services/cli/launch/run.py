@@ -95,8 +95,8 @@ def run(
         startup.enter_context(
             lock_startup(lambda: print_message("waiting until another kouxing has started"))
         )
-        moved = _moved_addresses(settings, has_port_option=port is not None)
-        control_environment = _control_environment(settings, moved)
+        free_ports = _free_port_environment(settings, has_port_option=port is not None)
+        control_environment = _control_environment(settings, free_ports)
         control_address = control_environment[CONTROL_VARIABLE]
         control = _check_keys(settings, control_address)
         supervisor = Supervisor(
@@ -106,13 +106,13 @@ def run(
             {
                 **assigned_environment(given),
                 **head_environment(settings, head, out),
-                **moved,
+                **free_ports,
                 **control_environment,
             },
-            more=extra_worker_environments(settings, workers),
+            extra_workers=extra_worker_environments(settings, workers),
         )
         _install_signal_handlers()
-        if warning := _port_warning(settings, moved, control_address):
+        if warning := _port_warning(settings, free_ports, control_address):
             print_message(warning)
         try:
             with CONSOLE.status(f"starting {', '.join(KINDS)}"):
@@ -141,7 +141,7 @@ def run(
             supervisor.stop()
 
 
-def _moved_addresses(settings: Settings, *, has_port_option: bool) -> dict[str, str]:
+def _free_port_environment(settings: Settings, *, has_port_option: bool) -> dict[str, str]:
     """Return the environment in which free ports replace the default ports that are in use.
 
     An error names the option that set the port.
@@ -153,9 +153,9 @@ def _moved_addresses(settings: Settings, *, has_port_option: bool) -> dict[str, 
         raise UserError(str(error).replace("gateway.port:", key)) from None
 
 
-def _control_environment(settings: Settings, moved: Mapping[str, str]) -> dict[str, str]:
+def _control_environment(settings: Settings, free_ports: Mapping[str, str]) -> dict[str, str]:
     """Return the address that control binds, and the one that others on this machine use."""
-    bound = moved.get(BOUND_CONTROL_VARIABLE, settings.load(ControlConfig).bound_control)
+    bound = free_ports.get(BOUND_CONTROL_VARIABLE, settings.load(ControlConfig).bound_control)
     host, _ = split_endpoint(bound, "control.control")
     control = with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
     return {BOUND_CONTROL_VARIABLE: bound, CONTROL_VARIABLE: control}
@@ -205,21 +205,21 @@ def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
     return environment
 
 
-def _port_warning(settings: Settings, moved: Mapping[str, str], control: str) -> str:
+def _port_warning(settings: Settings, free_ports: Mapping[str, str], control: str) -> str:
     """Return a message about default ports that are in use, or an empty string."""
     taken = [
         setting.text
         for kind in KINDS.values()
         for setting in settings.describe(kind.config_type)
-        if setting.is_default and variable_name(kind.name, setting.key) in moved
+        if setting.is_default and variable_name(kind.name, setting.key) in free_ports
     ]
-    running = running_systems() if BOUND_CONTROL_VARIABLE in moved else []
+    running = running_systems() if BOUND_CONTROL_VARIABLE in free_ports else []
     if running:
         owner = f"another kouxing is running, with control at {running[0].address}"
     else:
         owner = f"other programs use {', '.join(taken)}"
     warnings = [f"{owner}; this kouxing uses free ports"] if taken else []
-    if BOUND_CONTROL_VARIABLE in moved:
+    if BOUND_CONTROL_VARIABLE in free_ports:
         warnings.append(
             "commands run by this user connect to this system; in other environments, set"
             f" KOUXING_CONTROL={control}"

@@ -79,7 +79,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         self._silence.duration_s = 0.0
 
     @property
-    def hangs(self) -> bool:
+    def is_hung(self) -> bool:
         """Whether the service's loop hangs, or the process is stopped."""
         return self.is_ready and self._silence.duration_s > self._hang_limit_s + self._idle_s
 

@@ -56,7 +56,7 @@ class Supervisor:
     """Runs each service in a process, with one log of JSON lines per service in ``log_folder``.
 
     Warnings also go to the console. ``arguments`` are the command-line arguments of every service,
-    and ``environment`` is added to this process's. ``more`` names additional workers, such as
+    and ``environment`` is added to this process's. ``extra_workers`` names more workers, such as
     ``recognizer-2``, with their additions to the environment
     (`services.service_kinds.extra_worker_environments`).
     """
@@ -69,13 +69,13 @@ class Supervisor:
         environment: Mapping[str, str] | None = None,
         *,
         services: Collection[str] = tuple(KINDS),
-        more: Mapping[str, Mapping[str, str]] | None = None,
+        extra_workers: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         self._arguments = arguments
         self._log_folder = log_folder
         self._console = console
         self._environment = {**os.environ, **(environment or {})}
-        self._additions = {**{name: {} for name in services}, **(more or {})}
+        self._additions = {**{name: {} for name in services}, **(extra_workers or {})}
         self._services: dict[str, _Service] = {}
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
@@ -206,7 +206,7 @@ class Supervisor:
     def _check_process(self, service: _Service, process: ServiceProcess, now_s: float) -> None:
         status = process.poll()
         if status is None:
-            if process.hangs:
+            if process.is_hung:
                 self._warn(f"{service.name} is not responding; killing it")
                 process.kill()
             elif process.is_ready and service.is_restarting:

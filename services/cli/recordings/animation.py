@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.cli.options import CaptionKind
-from kouxing.services.cli.recordings.captions import check_characters, write_syllables
+from kouxing.services.cli.recordings.captions import check_characters, spell_syllables
 from kouxing.services.cli.recordings.curve_reader import TABLE_SUFFIXES, read_table
 from kouxing.services.cli.texts.spoken_text import read_transcript, report_mismatch
 from kouxing.services.driver.video import film
@@ -53,7 +53,7 @@ class FaceMotion:
     syllables: Sequence[TimedSyllable] = ()  # as written, in order
     source: Path | None = None
     language: str = DEFAULT_LANGUAGE  # language of the phones
-    has_wrong_text: bool = False  # the mouth follows a text that does not fit the audio
+    is_text_mismatched: bool = False  # the mouth follows a text that does not fit the audio
 
 
 def slow_down(motion: FaceMotion, speed: float) -> FaceMotion:
@@ -137,7 +137,7 @@ def animate(
     progress.remove_task(loading)
     samples = read_mono_16k(source, track, progress)
     events: Sequence[SoundEvent]
-    has_wrong_text = False
+    is_text_mismatched = False
     if live:
         pipelines = [
             LivePipeline(model, lip_model, synthesizer=config, lip_predictor=predictor)
@@ -153,7 +153,7 @@ def animate(
             alignment = align_syllables(model, samples, transcript.phones, with_progress)
             report_mismatch(source, alignment)
             if alignment.fits or not text_may_differ:
-                phones, has_wrong_text = alignment.phones, not alignment.fits
+                phones, is_text_mismatched = alignment.phones, not alignment.fits
             else:
                 transcript = None
         if phones is None:
@@ -180,10 +180,10 @@ def animate(
         image_rate_hz=_IMAGE_RATE_HZ,
         samples=samples,
         phones=spoken,
-        syllables=write_syllables(spoken, transcript, model.inventory),
+        syllables=spell_syllables(spoken, transcript, model.inventory),
         source=source,
         language=language,
-        has_wrong_text=has_wrong_text,
+        is_text_mismatched=is_text_mismatched,
     )
 
 

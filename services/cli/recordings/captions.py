@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from kouxing.services.cli.recordings.animation import FaceMotion
 
 
-def write_syllables(
+def spell_syllables(
     phones: Sequence[Phone], transcript: Transcript | None, inventory: PhoneInventory
 ) -> list[TimedSyllable]:
     """Return the syllables of the text, with tones, or of recognized phones, without tones.

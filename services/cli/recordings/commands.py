@@ -217,7 +217,7 @@ def render(
             print_message(f"{source}: no speech was found; the mouth stays closed")
         phones = "" if motion.phones is None else f", {plural(len(motion.phones), 'phone')}"
         print_message(f"wrote {target}: {plural(count, exporter.unit)}{phones}")
-        if motion.has_wrong_text:
+        if motion.is_text_mismatched:
             print_message(
                 f"{target}: the mouth follows the text; without --text, it follows the audio"
             )

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.cli.options import TimingMethod, WidthSource
-from kouxing.services.cli.recordings.captions import write_syllables
+from kouxing.services.cli.recordings.captions import spell_syllables
 from kouxing.services.cli.texts.spoken_text import print_mismatch, read_transcript, report_mismatch
 from kouxing.services.driver.video.video_writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
@@ -152,7 +152,7 @@ def draw_mouth(
     mouth = _MouthMotion(
         samples=samples,
         phones=phones,
-        syllables=write_syllables(phones, transcript, inventory),
+        syllables=spell_syllables(phones, transcript, inventory),
         key_frames=build_key_frames(phones, load_table(inventory)),
         widths=widths,
         inventory=inventory,
@@ -247,18 +247,18 @@ def _key_frame_mouths(
 
 def _write_picture(output: Path, mouth: _MouthMotion) -> str:
     is_svg = output.suffix.lower() == ".svg"
-    moments = _key_frame_mouths(mouth, _syllable_labels(mouth))
-    if len(moments) > _MAX_MOUTHS:
+    mouths = _key_frame_mouths(mouth, _syllable_labels(mouth))
+    if len(mouths) > _MAX_MOUTHS:
         raise UserError(
             f"{output}: a picture can show {_MAX_MOUTHS} mouths, but this recording has"
-            f" {len(moments)}; cut the recording, or write .mp4 or .csv"
+            f" {len(mouths)}; cut the recording, or write .mp4 or .csv"
         )
-    picture = drawing.draw_strip(moments, _MOUTHS_PER_ROW, _MOUTH_PX)
+    picture = drawing.draw_strip(mouths, _MOUTHS_PER_ROW, _MOUTH_PX)
     if is_svg:
         write_text(output, drawing.to_svg(picture))
     else:
         write_picture(output, drawing.rasterize(picture))
-    return f"{plural(len(moments), 'key frame')}, {plural(len(mouth.phones), 'phone')}"
+    return f"{plural(len(mouths), 'key frame')}, {plural(len(mouth.phones), 'phone')}"
 
 
 def _write_video(output: Path, mouth: _MouthMotion) -> str:
@@ -294,8 +294,8 @@ def _write_csv(output: Path, mouth: _MouthMotion) -> str:
     with open_output(output) as file, open_progress() as progress:
         table = csv.writer(codecs.getwriter("utf-8")(file), lineterminator="\n")
         table.writerow(CSV_COLUMNS)
-        firsts = progress.track(range(0, len(times_s), _BLOCK_FRAMES), description="writing")
-        for first in firsts:
+        block_starts = progress.track(range(0, len(times_s), _BLOCK_FRAMES), description="writing")
+        for first in block_starts:
             block = slice(first, first + _BLOCK_FRAMES)
             contours = compute_rounded_contour(openings[block], widths[block], NUM_POINTS)
             for time_s, opening, lines in zip(

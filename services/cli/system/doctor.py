@@ -10,7 +10,7 @@ from kouxing_client import ServiceState
 from kouxing_client.connection_check import explain_unreachable
 from kouxing_client.keys import Key
 
-from kouxing.services.cli.system.running_system import find_system, running_systems
+from kouxing.services.cli.system.running_system import choose_system, running_systems
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.command.terminal import plural
@@ -40,14 +40,14 @@ class CheckResult(NamedTuple):
 
     subject: str
     result: str
-    fix: str = ""  # empty: the check passed
+    remedy: str = ""  # what to do; empty if the check passed
 
 
 def run_checks(address: str) -> Iterator[CheckResult]:
     """Yield the result of each check; if ``address`` is empty, control is the configured one."""
-    system = find_system(address)
+    system = choose_system(address)
     config = system.config
-    control = system.running or config.control
+    control = system.running_endpoint or config.control
     endpoint_address = control.partition(" ")[0]
     if reason := explain_unreachable(*split_endpoint(endpoint_address, "control"), is_zeromq=True):
         yield CheckResult(f"control at {endpoint_address}", "cannot be reached", reason)
@@ -62,10 +62,10 @@ def run_checks(address: str) -> Iterator[CheckResult]:
             return
     accepted: dict[str, Key | None] = {}
     for name, key in keys.items():
-        finding = _check_key(name, key, endpoint_address)
-        if not finding.fix:
+        result = _check_key(name, key, endpoint_address)
+        if not result.remedy:
             accepted[name] = key
-        yield finding
+        yield result
     if not accepted:
         return
     key = next(iter(accepted.values()))

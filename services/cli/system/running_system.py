@@ -40,8 +40,8 @@ class ChosenSystem:
     """The system that a command connects to."""
 
     config: ServiceConfig
-    running: str  # control's endpoint in the user's newest system; empty if none was found
-    is_guess: bool  # nothing names control and no system was found: try the default address
+    running_endpoint: str  # control's endpoint in the user's newest system; empty if none was found
+    uses_default_address: bool  # no address is given, and no running system was found
 
 
 @contextlib.contextmanager
@@ -109,7 +109,7 @@ def lock_output_folder(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def find_control_address(address: str) -> Iterator[str]:
+def open_control_address(address: str) -> Iterator[str]:
     """Yield the address of control, followed by its public key unless connections are insecure.
 
     Without ``address`` and a setting, it is the address of the newest system with this user's keys.
@@ -117,35 +117,35 @@ def find_control_address(address: str) -> Iterator[str]:
     """
     from kouxing_client import NotConnected
 
-    system = find_system(address)
+    system = choose_system(address)
     config = system.config
-    others = other_systems() if system.is_guess else []
+    others = other_systems() if system.uses_default_address else []
     if any(other.address == config.control for other in others):
         raise UserError(_not_running_text(others))
     try:
-        yield system.running or control_endpoint(config.control, insecure=config.insecure)
+        yield system.running_endpoint or control_endpoint(config.control, insecure=config.insecure)
     except UserError as error:
-        if system.is_guess and isinstance(error.__cause__, NotConnected):
+        if system.uses_default_address and isinstance(error.__cause__, NotConnected):
             raise UserError(f"{_not_running_text(others)}. Tried: {error}") from error
         raise
 
 
-def find_system(address: str) -> ChosenSystem:
+def choose_system(address: str) -> ChosenSystem:
     """Choose the system whose control is ``address``, is in the settings, or was started last."""
     if address:
         split_endpoint(address, "--control")
     settings, overrides = read_settings(), {"control": address} if address else {}
     keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
     is_given = not keys["control"].is_default
-    running = "" if is_given else find_control()
+    running = "" if is_given else newest_control_endpoint()
     config = settings.load(ServiceConfig, overrides)
     if "*" in config.control:
         key = "--control" if address else "common.control"
         raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
-    return ChosenSystem(config, running, is_guess=not (running or is_given))
+    return ChosenSystem(config, running, uses_default_address=not (running or is_given))
 
 
-def find_control() -> str:
+def newest_control_endpoint() -> str:
     """Return control of the newest running system with this user's keys, or an empty string."""
     addresses = [system.control for system in running_systems() if system.keys == _key_folder()]
     return addresses[0] if addresses else ""

@@ -23,22 +23,24 @@ _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ER
 class AudioInput:
     """Forwards a client's audio to its session.
 
-    If ``is_ahead``, audio may arrive faster than real time, like synthesized speech. It is queued
-    here and forwarded in real time, and an interruption drops the queue. Otherwise, only messages
-    of more than a second are queued, with the messages that follow before the queue is empty.
+    If ``is_synthesized``, audio may arrive faster than real time. It is queued here and forwarded
+    in real time, and an interruption drops the queue. Otherwise, only messages of more than a
+    second are queued, with the messages that follow before the queue is empty.
     """
 
-    def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, is_ahead: bool) -> None:
+    def __init__(
+        self, session: AudioSession, pcm_format: PcmFormat, *, is_synthesized: bool
+    ) -> None:
         self._session = session
         self._format = pcm_format
-        self._is_ahead = is_ahead
+        self._is_synthesized = is_synthesized
         self._is_first = True
         is_pcm16 = pcm_format.encoding == "s16le"
         self._encoding = EncodingCheck(pcm_format.num_channels) if is_pcm16 else None
         self._incomplete = b""  # part of a sample, or of a file's header
         self._drain_task: asyncio.Task[None] | None = None  # done when all audio is forwarded
         self._rate_limit = RealTimeLimit()
-        self._queue = RealTimeQueue(session, pcm_format, keep_alive=is_ahead)
+        self._queue = RealTimeQueue(session, pcm_format, keep_alive=is_synthesized)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -60,9 +62,9 @@ class AudioInput:
         if self._is_first and len(received) < HEADER_BYTES:
             self._incomplete = received
             return
-        await self._pass_on(received, message=received if self._is_first else pcm)
+        await self._forward(received, message=received if self._is_first else pcm)
 
-    async def _pass_on(self, pcm: bytes, message: bytes = b"") -> None:
+    async def _forward(self, pcm: bytes, message: bytes = b"") -> None:
         num_samples = len(pcm) // self._format.frame_bytes
         end = num_samples * self._format.frame_bytes
         pcm, self._incomplete = pcm[:end], pcm[end:]
@@ -71,7 +73,7 @@ class AudioInput:
             self._encoding.check(message)
         self._is_first = False
         duration_s = num_samples / self._format.sample_rate_hz
-        if self._is_ahead or duration_s > MAX_LIVE_S or not self._queue.is_empty:
+        if self._is_synthesized or duration_s > MAX_LIVE_S or not self._queue.is_empty:
             await self._queue.put(pcm)
         else:
             self._session.send(pcm, num_samples)
@@ -89,7 +91,7 @@ class AudioInput:
 
     async def end(self) -> None:
         """Mark the end of the audio: ``messages`` ends when the queue is empty."""
-        await self._pass_on(self._incomplete)
+        await self._forward(self._incomplete)
         self._drain_task = asyncio.create_task(self._queue.wait_until_empty())
 
     async def messages(self, client: web.WebSocketResponse) -> AsyncIterator[WSMessage]:

@@ -15,7 +15,7 @@ from kouxing.services.gateway.messages import browser_messages
 from kouxing.shared.errors import UserError
 
 LAST_FRAME_TIMEOUT_S = 1.5  # maximum wait for the last frame after the end of the audio
-LAST_PHONES_S = 0.2  # wait for the last phones, which arrive separately from the last frame
+LAST_PHONES_WAIT_S = 0.2  # wait for the last phones, which arrive separately from the last frame
 CONTROL_TIMEOUT_S = 3.0
 
 Warn = Callable[[str, str, str], None]  # reason, text, session
@@ -70,7 +70,7 @@ class AudioSession:
                 await self._session.finish()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._frames_ended.wait(), timeout_s)
-                await asyncio.sleep(LAST_PHONES_S)
+                await asyncio.sleep(LAST_PHONES_WAIT_S)
         except KouxingError as error:
             self._warn("close", str(error), self.name)
         try:
@@ -139,5 +139,5 @@ class AudioClient:
 def error_text(error: UserError | KouxingError) -> str:
     """Return the message about an error for a browser."""
     if isinstance(error, Refused):
-        return browser_messages.error_text(error.text, error.code, error.retry_after_s)
-    return browser_messages.error_text(str(error))
+        return browser_messages.encode_error(error.text, error.code, error.retry_after_s)
+    return browser_messages.encode_error(str(error))

@@ -54,7 +54,7 @@ class MicrophoneHandler:
         for browser in [b for b, name in self._session_names.items() if name == session]:
             reason = "the session was closed"
             with contextlib.suppress(ConnectionError):
-                await browser.send_str(browser_messages.text("closed", text=reason))
+                await browser.send_str(browser_messages.encode_json("closed", text=reason))
             await browser.close(message=reason.encode())
 
     async def _stream(self, browser: web.WebSocketResponse) -> None:
@@ -77,10 +77,10 @@ class MicrophoneHandler:
         ) as session:
             self._session_names[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})
-            await browser.send_str(browser_messages.text("opened", session=session.name))
+            await browser.send_str(browser_messages.encode_json("opened", session=session.name))
             if problem:
-                await browser.send_str(browser_messages.error_text(problem))
-            audio_input = AudioInput(session, options, is_ahead=bool(options.ahead))
+                await browser.send_str(browser_messages.encode_error(problem))
+            audio_input = AudioInput(session, options, is_synthesized=bool(options.ahead))
             try:
                 async with audio_input.running():
                     await self._forward_audio(browser, session, audio_input, options)
@@ -119,7 +119,7 @@ class MicrophoneHandler:
             await browser.send_str(error_text(error))
             return
         if command.problem:
-            await browser.send_str(browser_messages.error_text(command.problem))
+            await browser.send_str(browser_messages.encode_error(command.problem))
         if command.skip:
             audio_input.skip(command.skip)
         try:

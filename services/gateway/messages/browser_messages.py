@@ -50,20 +50,20 @@ FORMATS = ("binary", "json", "msgpack")  # formats of blendshapes
 _OLD_NAMES = {"lips": "lip_model", "express": "expressions", "eof": "last"}
 
 
-def binary(message_type: int, epoch: int, media_time: int, payload: bytes) -> bytes:
+def encode_binary(message_type: int, epoch: int, media_time: int, payload: bytes) -> bytes:
     """Return a binary message."""
     return _HEADER.pack(message_type, epoch, media_time) + payload
 
 
-def text(message_type: str, **fields: object) -> str:
+def encode_json(message_type: str, **fields: object) -> str:
     """Return a JSON message."""
     return msgspec.json.encode({"type": message_type, **fields}).decode()
 
 
-def error_text(reason: str, code: str = "refused", retry_after_s: float = 0.0) -> str:
+def encode_error(reason: str, code: str = "refused", retry_after_s: float = 0.0) -> str:
     """Return an error message; ``retry_after_s`` is left out if it is 0 (unknown)."""
     retry = {"retry_after_s": retry_after_s} if retry_after_s else {}
-    return text("error", code=code, text=reason, **retry)
+    return encode_json("error", code=code, text=reason, **retry)
 
 
 class MicrophoneOptions(PcmFormat, frozen=True, kw_only=True):

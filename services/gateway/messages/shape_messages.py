@@ -30,8 +30,8 @@ class ShapeEncoder:
     def header_message(self) -> str:
         """Return the message with the names or the targets, in the order of the weights."""
         if self.targets:
-            return browser_messages.text("avatar", set=self.shape_set, targets=self.targets)
-        return browser_messages.text(
+            return browser_messages.encode_json("avatar", set=self.shape_set, targets=self.targets)
+        return browser_messages.encode_json(
             "shapes", set=self.shape_set, names=SHAPE_SETS[self.shape_set].names
         )
 
@@ -46,7 +46,7 @@ class ShapeEncoder:
             weights = weights[[*self.indices]]
         if self.message_format == "binary":
             payload = weights.astype("<f4").tobytes()
-            return browser_messages.binary(_BINARY_TYPES[kind], epoch, media_time, payload)
+            return browser_messages.encode_binary(_BINARY_TYPES[kind], epoch, media_time, payload)
         rounded = [round(float(weight), 4) for weight in weights]
         fields = {
             "type": kind,

@@ -49,7 +49,8 @@ class Viewer:
     shape_encoder: ShapeEncoder | None  # encodes frames as blendshapes, in addition to FAPs
     queue: ViewerQueue = field(default_factory=ViewerQueue)
     shown_session: tuple[str, int] | None = None  # session and epoch
-    announced: tuple[str, int] | str = ""  # the last one; a name: this session does not exist
+    # session and epoch, or only the name of a session that does not exist
+    last_announced: tuple[str, int] | str = ""
     has_resting_face: bool = False  # whether it has the face at rest, from which its player starts
     last_frame_s: float = -math.inf  # when the newest frame was sent
 
@@ -96,15 +97,17 @@ class ViewerHandler:
             shown_session.face = shown_session.face.merged_with(change)
             settings = _shown_settings(shown_session.face)
             if settings != before:
-                self.forward(session, MessageKind.TEXT, browser_messages.text("face", **settings))
+                self.forward(
+                    session, MessageKind.TEXT, browser_messages.encode_json("face", **settings)
+                )
 
-    def set_acoustic(self, session: str, model: str) -> None:
+    def announce_acoustic_model(self, session: str, model: str) -> None:
         """Announce the acoustic model of a session, if it has changed."""
         shown_session = self._sessions.get(session)
         if shown_session is not None and shown_session.acoustic != model:
             shown_session.acoustic = model
             self.forward(
-                session, MessageKind.TEXT, browser_messages.text("acoustic", acoustic=model)
+                session, MessageKind.TEXT, browser_messages.encode_json("acoustic", acoustic=model)
             )
 
     def remove_session(self, session: str) -> None:
@@ -112,7 +115,7 @@ class ViewerHandler:
         self._sessions.pop(session, None)
         self._notify_viewers()
 
-    def set_missing(self, missing: tuple[str, ...]) -> None:
+    def announce_missing_services(self, missing: tuple[str, ...]) -> None:
         """Announce which services are not running, if this has changed."""
         if missing != self._missing:
             self._missing = missing
@@ -128,7 +131,7 @@ class ViewerHandler:
         self, session: str, epoch: int, media_time: int, faps: bytes, now_s: float
     ) -> None:
         """Send a frame to the viewers of a session."""
-        message = browser_messages.binary(browser_messages.FAP_TYPE, epoch, media_time, faps)
+        message = browser_messages.encode_binary(browser_messages.FAP_TYPE, epoch, media_time, faps)
         viewers = self._viewers_of(session)
         for viewer in viewers:
             viewer.last_frame_s = now_s
@@ -139,7 +142,7 @@ class ViewerHandler:
         """Send the face at rest to new viewers, and to viewers without recent frames."""
         viewers = [viewer for viewer in self._viewers if now_s >= _rest_due_s(viewer)]
         faps = face.faps(now_s).astype("<f4").tobytes()
-        message = browser_messages.binary(browser_messages.REST_TYPE, 0, 0, faps)
+        message = browser_messages.encode_binary(browser_messages.REST_TYPE, 0, 0, faps)
         for viewer in viewers:
             viewer.has_resting_face = True
             self._put(viewer, MessageKind.REST, message)
@@ -258,10 +261,10 @@ class ViewerHandler:
         shown_session = (name, session.epoch) if session else None
         viewer.shown_session = shown_session
         announced = shown_session or viewer.chosen_session
-        if announced != viewer.announced:
-            viewer.announced = announced
+        if announced != viewer.last_announced:
+            viewer.last_announced = announced
             face = session.face if session else FaceSettings()
-            message = browser_messages.text(
+            message = browser_messages.encode_json(
                 "session",
                 session=name if session else None,
                 chosen=viewer.chosen_session,
@@ -300,10 +303,10 @@ class ViewerHandler:
             self._metrics.count("dropped_slow_viewer", num_dropped)
 
     def _put_error(self, viewer: Viewer, text: str) -> None:
-        self._put(viewer, MessageKind.TEXT, browser_messages.error_text(text))
+        self._put(viewer, MessageKind.TEXT, browser_messages.encode_error(text))
 
     def _status(self) -> str:
-        return browser_messages.text("status", missing=self._missing)
+        return browser_messages.encode_json("status", missing=self._missing)
 
 
 def _shown_settings(face: FaceSettings) -> dict[str, object]:

@@ -38,11 +38,11 @@ SDP = "application/sdp"
 MAX_COMMANDS = 100  # limit of queued commands of one client
 MAX_BUFFERED_BYTES = 16 * 1024  # limit for a data channel; more messages stay in the viewer's queue
 BUFFER_CHECK_S = 0.02
-DROPPED = (
+COMMAND_DROPPED_TEXT = (
     f"the command is dropped: {MAX_COMMANDS} commands are queued; send at most"
     f" {1 / COMMAND_S:g} per second"
 )
-NO_WEBRTC = (
+NO_WEBRTC_TEXT = (
     "this gateway has no WebRTC; install it where the gateway runs: pip install 'kouxing[webrtc]'\n"
 )
 
@@ -137,7 +137,7 @@ class WhipHandler:
         try:
             webrtc = await asyncio.to_thread(importlib.import_module, name)
         except ModuleNotFoundError:
-            raise web.HTTPNotImplemented(text=NO_WEBRTC) from None
+            raise web.HTTPNotImplemented(text=NO_WEBRTC_TEXT) from None
         if self._addresses:
             webrtc.use_addresses(self._addresses)
         peer: WebRtcPeer = webrtc.WebRtcPeer(lambda channel: self._on_channel(client, channel))
@@ -180,7 +180,7 @@ class WhipHandler:
             try:
                 commands.put_nowait(message)
             except asyncio.QueueFull:
-                _send_error(channel, UserError(DROPPED))
+                _send_error(channel, UserError(COMMAND_DROPPED_TEXT))
 
         channel.on("message", enqueue)
         client.tasks |= {

@@ -385,10 +385,10 @@ def cache_names(num_layers: int) -> list[str]:
 
 def parse_block_model(archive: Archive) -> BlockModel:
     """Build the model after checking every size; raises ``ValueError`` if a size is wrong."""
-    return model_of(archive, archive.array("network", None).astype(np.uint8))
+    return build_block_model(archive, archive.array("network", None).astype(np.uint8))
 
 
-def model_of(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
+def build_block_model(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
     """Build the model of a file with this network; raises like :func:`parse_block_model`."""
     topology = parse_topology(archive)
     model = BlockModel(

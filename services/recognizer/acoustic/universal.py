@@ -9,7 +9,7 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.blocks import BlockModel, model_of
+from kouxing.services.recognizer.acoustic.blocks import BlockModel, build_block_model
 from kouxing.services.recognizer.acoustic.model_file import Archive
 
 FORMAT = "universal 1"
@@ -17,12 +17,12 @@ FORMAT = "universal 1"
 
 def parse_universal_model(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
     """Build the model on the block network; raises ``ValueError`` if something does not fit."""
-    if str(archive.array("block_network", ())) != hash_of(network):
+    if str(archive.array("block_network", ())) != compute_network_hash(network):
         raise ValueError("it belongs to another version of the block model")
     extension = archive.array("extension", None).astype(np.uint8)
-    return model_of(archive, np.concatenate([network, extension]))
+    return build_block_model(archive, np.concatenate([network, extension]))
 
 
-def hash_of(network: NDArray[np.uint8]) -> str:
+def compute_network_hash(network: NDArray[np.uint8]) -> str:
     """Return the hash that identifies a block network."""
     return hashlib.sha256(network.tobytes()).hexdigest()

@@ -66,7 +66,9 @@ class LiveDecoder:
         self._inventory = topology.inventory
         self._silence = self._inventory.index[self._inventory.silence]
         self._settled = Decoder(topology)  # the search over settled scores
-        self._ahead: Decoder | None = None  # its continuation over provisional scores, if any
+        self._provisional_decoder: Decoder | None = (
+            None  # its continuation over provisional scores, if any
+        )
         self._rule = OutputRule(rule, last_emitted=self._silence)
         self._num_final = 0
         self._start_speech(0)
@@ -80,7 +82,7 @@ class LiveDecoder:
                 out.append(SpeechChange(active=True, time_s=frame_time_s(event.frame)))
             elif isinstance(event, SpeechEnd):
                 path = self._settled.final_path()
-                rest = [segment for segment in path if segment.start >= self._done]
+                rest = [segment for segment in path if segment.start >= self._final_end_frame]
                 if self._open and len(rest) > 1 and rest[-1].phone == self._silence:
                     rest.pop()  # the end of speech implies it
                 out += self._revise(rest, num_following=0)
@@ -93,9 +95,11 @@ class LiveDecoder:
 
     def _start_speech(self, frame: int) -> None:
         self._start_frame = frame
-        self._done = 0  # the decoder's frame up to which phones are final
+        self._final_end_frame = 0  # the decoder's frame up to which phones are final
         self._num_checked = 0  # frames that the output rule has processed
-        self._confidence = np.empty(0)  # confidence of the settled frames from ``_done`` on
+        self._confidence = np.empty(
+            0
+        )  # confidence of the settled frames from ``_final_end_frame`` on
         self._provisional = empty_scores(self._topology.num_states)  # scores of the last search
         self._settled.reset()
         self._decoder = self._settled
@@ -110,10 +114,12 @@ class LiveDecoder:
         self._decoder = self._settled
         out = self._search(scores.settled)
         if len(scores.settled):
-            self._settled.forget_before(self._done)
+            self._settled.forget_before(self._final_end_frame)
             self._settled.drop_records()
         if len(scores.provisional):
-            self._ahead = self._decoder = self._ahead or Decoder(self._topology)
+            self._provisional_decoder = self._decoder = self._provisional_decoder or Decoder(
+                self._topology
+            )
             if not len(known):
                 self._decoder.copy_state(self._settled)
             out += self._search(scores.provisional[len(known) :])
@@ -146,13 +152,13 @@ class LiveDecoder:
     def _emit_phone(self) -> list[Phone]:
         """Return the last phone and corrections."""
         phone, start, confidence = self._decoder.last_phone
-        revised = self._revise(self._decoder.path_since(self._done), num_following=1)
+        revised = self._revise(self._decoder.path_since(self._final_end_frame), num_following=1)
         before = self._index_of(self._open[-1]) if self._open else self._last_final
         position = AFTER_PAUSE if before == self._silence else WITHIN_PHRASE
         new = Phone(
             index=self._num_final + len(self._open),
             symbol=self._inventory.phones[phone],
-            onset_s=self._time_s(max(start, self._done)),
+            onset_s=self._time_s(max(start, self._final_end_frame)),
             duration_s=float(self._topology.duration_mean_s[position, phone]),
             confidence=confidence,
             final=False,
@@ -166,7 +172,7 @@ class LiveDecoder:
         ``num_following`` phones follow the segments: one, or none if speech has ended.
         """
         num_before = len(self._open) - num_following
-        is_first = self._done == 0 and len(segments) > max(0, num_before)
+        is_first = self._final_end_frame == 0 and len(segments) > max(0, num_before)
         if is_first and segments[0].phone == self._silence:
             segments = segments[1:]  # silence before the first phone is not emitted
         emitted: list[Phone] = []
@@ -177,7 +183,7 @@ class LiveDecoder:
         final_until = self._settled.shared_end if num_following else self._settled.num_frames
         known = dict(enumerate(self._open))
         self._open = []
-        first_index, first_frame = self._num_final, self._done
+        first_index, first_frame = self._num_final, self._final_end_frame
         for number, segment in enumerate(segments):
             onset_s = self._time_s(segment.start)
             is_final = segment.end <= final_until
@@ -200,7 +206,7 @@ class LiveDecoder:
                 self._finalize(phone)
             else:
                 self._open.append(phone)
-        self._confidence = self._confidence[self._done - first_frame :]
+        self._confidence = self._confidence[self._final_end_frame - first_frame :]
         return emitted
 
     def _finalize(self, phone: Phone) -> None:
@@ -208,7 +214,7 @@ class LiveDecoder:
         self._num_final += 1
         self._last_final = self._index_of(phone)
         end_s = phone.onset_s + phone.duration_s - self._time_s(0)
-        self._done = round(end_s / HOP_S)
+        self._final_end_frame = round(end_s / HOP_S)
 
     def _index_of(self, phone: Phone) -> int:
         return self._inventory.index[phone.symbol]

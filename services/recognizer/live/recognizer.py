@@ -13,7 +13,7 @@ from kouxing.services.recognizer.acoustic.languages import load_model_for_langua
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
 from kouxing.services.recognizer.live.live_decoder import StreamOutput
-from kouxing.services.recognizer.live.speech_scorer import run_encoder, score_speech
+from kouxing.services.recognizer.live.speech_scorer import detect_speech, score_speech
 from kouxing.services.recognizer.live.stream import SpeechStream
 from kouxing.services.recognizer.search.decoder import Decoder
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
@@ -68,9 +68,9 @@ class Recognizer:
             speech_time=speech_time,
         )
 
-    def run_encoder(self, streams: Sequence[SpeechStream]) -> None:
+    def detect_speech(self, streams: Sequence[SpeechStream]) -> None:
         """Find the speech in the audio that the streams have accepted, in batches."""
-        run_encoder([scorer for stream in streams for scorer in stream.scorers])
+        detect_speech([scorer for stream in streams for scorer in stream.scorers])
 
     def needs_network(self, stream: SpeechStream) -> bool:
         """Return whether decoding a stream's audio needs a run of the block network."""
@@ -78,11 +78,11 @@ class Recognizer:
 
     def decode_streams(self, streams: Sequence[SpeechStream]) -> None:
         """Decode all audio that the streams have accepted; the model scores it in batches."""
-        self.run_encoder(streams)
+        self.detect_speech(streams)
         self.decode_speech(streams)
 
     def decode_speech(self, streams: Sequence[SpeechStream]) -> None:
-        """Decode the speech that ``run_encoder`` has found."""
+        """Decode the speech that ``detect_speech`` has found."""
         score_speech([scorer for stream in streams for scorer in stream.scorers])
         for stream in streams:
             stream.decode()

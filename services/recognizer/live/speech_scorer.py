@@ -71,7 +71,7 @@ class _SliceEnd(Record, frozen=True):
 class SpeechScorer:
     """Scores the speech of one session.
 
-    ``accept_waveform`` queues the audio. ``run_encoder`` finds the speech in it and
+    ``accept_waveform`` queues the audio. ``detect_speech`` finds the speech in it and
     ``score_speech`` scores the speech, together with other sessions' audio. ``get_events`` returns
     the results in order.
 
@@ -182,18 +182,18 @@ class SpeechScorer:
         self._encoder_queue.popleft()
         self._detected.extend(self._segmenter.process(encoder_input, output))
 
-    def start_scoring(self) -> bool:
+    def hand_over_speech(self) -> bool:
         """Hand the speech so far to another thread; return whether more audio may follow now.
 
-        If so, ``run_encoder`` and ``take_early_events`` process only audio that follows, until
-        ``finish_scoring``. Queued events prevent this, because their order would change.
+        If so, ``detect_speech`` and ``take_early_events`` process only audio that follows, until
+        ``take_back_speech``. Queued events prevent this, because their order would change.
         """
         if all(isinstance(item, SpeechFrames) for item in self._queue):
             self._detected = deque()
         return self._detected is not self._queue
 
-    def finish_scoring(self) -> None:
-        """End ``start_scoring``: score further speech on this thread."""
+    def take_back_speech(self) -> None:
+        """Take the speech back: this thread scores the speech that follows."""
         if self._detected is not self._queue:
             self._queue.extend(self._detected)
             self._detected = self._queue
@@ -255,7 +255,7 @@ class SpeechScorer:
         self._release_events()
 
 
-def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
+def detect_speech(scorers: Sequence[SpeechScorer]) -> None:
     """Find the speech in the queued audio of several sessions, in batches."""
     while waiting := [
         (scorer, encoder_input)
@@ -272,12 +272,12 @@ def run_encoder(scorers: Sequence[SpeechScorer]) -> None:
 
 def score_streams(scorers: Sequence[SpeechScorer]) -> None:
     """Score the queued audio of several sessions, in one batch for each model."""
-    run_encoder(scorers)
+    detect_speech(scorers)
     score_speech(scorers)
 
 
 def score_speech(scorers: Sequence[SpeechScorer]) -> None:
-    """Score the speech that ``run_encoder`` has found, in one batch for each model."""
+    """Score the speech that ``detect_speech`` has found, in one batch for each model."""
     while ready := [scorer for scorer in scorers if scorer.has_speech]:
         model = ready[0].model
         batch = [scorer for scorer in ready if scorer.model is model]

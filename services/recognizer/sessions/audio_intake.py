@@ -52,7 +52,7 @@ class AudioIntake:
             return
         session.check_open(message)
         if message.last:
-            session.end = message
+            session.last_chunk = message
         if not message.pcm and message.last:
             return
         if error := session.mouth_profile_error:

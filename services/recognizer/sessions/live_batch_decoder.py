@@ -91,7 +91,7 @@ class LiveBatchDecoder:
             group = sessions[begin : begin + SESSIONS_TOGETHER]
             for session in group:
                 session.accept_waveform(part_s, now_s, self._hop_controller.hop)
-            self._recognizer.run_encoder([session.stream for session in group])
+            self._recognizer.detect_speech([session.stream for session in group])
             if len(self._all_sessions) <= 1 and not group[0].is_scoring:  # no other session waits
                 network_s = BlockRunner.total_run_s
                 self._decode(group)

@@ -97,7 +97,7 @@ class RecognizerSession:
         self.last_sequence = 0  # number of the newest accepted audio message
         self._gap_since_s: float | None = None  # when messages after a gap were first dropped
         self.client = NO_PEER  # sender of the newest audio
-        self.end: AudioChunk | None = None  # the last chunk, if it has arrived
+        self.last_chunk: AudioChunk | None = None  # None until it has arrived
         self.is_finished = False  # all audio up to the end is decoded
         self.last_audio_s = now_s
         # time in which this process could have received audio but did not
@@ -128,9 +128,9 @@ class RecognizerSession:
     @property
     def received_sequence(self) -> int:
         """Number of the newest audio message that the client need not resend."""
-        if self.end is None or self.is_finished:
+        if self.last_chunk is None or self.is_finished:
             return self.last_sequence
-        return min(self.last_sequence, self.end.sequence - 1)
+        return min(self.last_sequence, self.last_chunk.sequence - 1)
 
     def accept_in_order(self, message: AudioChunk, now_s: float) -> bool:
         """Accept a message newer than the last, unless messages before it are missing.
@@ -164,7 +164,7 @@ class RecognizerSession:
         if message.media_time > MAX_MEDIA_TIME:
             text = f"media_time {message.media_time} is too large; count samples at 16 kHz from 0"
             raise Rejected(ErrorCode.BAD_AUDIO, text)
-        if self.end is not None:
+        if self.last_chunk is not None:
             text = f"session {self.name!r} has ended; open another"
             raise Rejected(ErrorCode.FINISHED, text)
 

@@ -24,7 +24,7 @@ from kouxing.shared.fast_record import Record, replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 
-EXPECTED = -1
+EXPECTED_PHONE_INDEX = -1  # index of a viseme that is expected but not yet recognized
 MAX_HOLD_S = 1.5  # limit for extending a phone beyond its estimated end if nothing follows
 _HOLD_SOFTNESS_S = 0.03
 _HOLD_FACTOR = 2.0  # with lower values, a long vowel half closes before it is held
@@ -55,7 +55,7 @@ class Timeline(Record, frozen=True, kw_only=True):
     viseme: NDArray[np.intp]  # (num_visemes,) rows of VisemeParameters
     apex_start_s: NDArray[np.float64]  # (num_visemes,) seconds
     apex_end_s: NDArray[np.float64]  # (num_visemes,) seconds, not before apex_start_s
-    phone_index: NDArray[np.int64]  # (num_visemes,) Phone.index, EXPECTED for the expected viseme
+    phone_index: NDArray[np.int64]  # (num_visemes,) Phone.index, or EXPECTED_PHONE_INDEX
     silence_start_s: NDArray[np.float64]  # (num_silences,) end of speech; -inf before all speech
     silence_end_s: NDArray[np.float64]  # (num_silences,) start of speech; inf after all speech
     syllable_s: NDArray[np.float64]  # (num_syllables,) onset of each syllable's vowel
@@ -166,7 +166,7 @@ def build_timeline(
                 VISEME_INDEX[_expected_after(spoken[-1].symbol, inventory)],
                 open_phone.end_s + _EXPECTED_EDGE_S,
                 open_phone.end_s + _EXPECTED_AFTER_S,
-                EXPECTED,
+                EXPECTED_PHONE_INDEX,
             )
         )
     return Timeline(

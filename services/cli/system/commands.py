@@ -17,7 +17,7 @@ from kouxing.services.cli.options import (
     PhoneAlphabet,
     reject_options,
 )
-from kouxing.services.cli.system.running_system import find_control_address
+from kouxing.services.cli.system.running_system import open_control_address
 from kouxing.services.service_kinds import read_settings
 from kouxing.shared.command.terminal import (
     CONSOLE,
@@ -118,7 +118,7 @@ def speak(
     else:
         raw_format = RawFormat(16_000 if rate is None else rate, channels or 1)
         audio = open_audio(Path(source), track=track, raw=raw_format if raw else None)
-    with find_control_address(control) as endpoint:
+    with open_control_address(control) as endpoint:
         summary = stream(
             audio,
             endpoint,
@@ -195,7 +195,7 @@ def listen(
     if as_format is ListenFormat.LIVELINK and output is None:
         raise UserError("--as livelink writes a CSV file; add --output face.csv")
     check_output(output, force=force)
-    follow(_session_name(session), output, as_format, find_control_address(control), alphabet)
+    follow(_session_name(session), output, as_format, open_control_address(control), alphabet)
 
 
 def send(
@@ -218,7 +218,7 @@ def send(
 
     config = read_settings().load(SynthesizerConfig)
     parsed = [parse_target(url) for url in targets]
-    with find_control_address(control) as endpoint:
+    with open_control_address(control) as endpoint:
         send_to(parsed, _session_name(session), endpoint, config.idle_motion_seed)
 
 
@@ -254,7 +254,7 @@ def express(
         raise UserError("--hold needs an expression: kouxing express joy=0.4 --hold 2")
     hold_s = DEFAULT_HOLD_S if hold is None else hold
     check_expressions(strengths, hold_s)
-    with find_control_address(control) as endpoint, connect_client(endpoint) as client:
+    with open_control_address(control) as endpoint, connect_client(endpoint) as client:
         all_sessions = [state.session for state in client.status().sessions]
         if session and session not in all_sessions:
             raise UserError(
@@ -291,7 +291,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
 
     check_output(json_file, force=force)
     with (
-        find_control_address(control) as endpoint,
+        open_control_address(control) as endpoint,
         connect_client(endpoint, timeout_s=3.0) as client,
     ):
         report = client.status()
@@ -330,11 +330,11 @@ def doctor(control: Control = "") -> None:
     from kouxing.services.cli.system.doctor import run_checks
 
     num_checks = num_failed = 0
-    for finding in run_checks(control):
+    for check in run_checks(control):
         num_checks += 1
-        num_failed += bool(finding.fix)
-        typer.echo(f"{'FAIL' if finding.fix else 'ok  '} {finding.subject}: {finding.result}")
-        for line in finding.fix.splitlines():
+        num_failed += bool(check.remedy)
+        typer.echo(f"{'FAIL' if check.remedy else 'ok  '} {check.subject}: {check.result}")
+        for line in check.remedy.splitlines():
             typer.echo(f"     {line}")
     typer.echo(f"{num_failed} of {plural(num_checks, 'check')} failed")
     if num_failed:
