@@ -1,14 +1,19 @@
 """Workers on a Ray cluster: placed, restarted on another node, and stopped."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from kouxing_client import Client, Status
-from ray.cluster_utils import Cluster
 
 from tests.e2e.streaming import stream_audio
 from tests.system import VOWELS_FILE, System, kouxing, samples_of_file
+
+if TYPE_CHECKING:
+    from ray.cluster_utils import Cluster
 
 NODE = {"num_cpus": 2, "object_store_memory": 80 << 20}
 # without the processes that this test does not need
@@ -22,6 +27,8 @@ HEAD = NODE | {
 
 @pytest.fixture
 def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    from ray.cluster_utils import Cluster  # noqa: PLC0415 (slow to load; only this test needs it)
+
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setenv("RAY_enable_worker_prestart", "0")
     cluster = Cluster(initialize_head=True, head_node_args=HEAD)
