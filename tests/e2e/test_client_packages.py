@@ -314,7 +314,8 @@ def test_the_web_component_shows_and_plays_a_session(faces: Browser, system: Sys
         "own.addEventListener('session', ({ detail }) => sessions.push(detail.session))"
     )
     faces.click("own")  # sound starts with a gesture
-    with speaking_session(system):
+    module = "/node_modules/kouxing-client/page/draw-rate.js"
+    with speaking_session(system), faces.drawing_seldom(module):
         faces.wait_for("own.shown?.[2] > 100 && window.isHeard")
         faces.evaluate("sessions.length = 0; own.setAttribute('token', 'another')")
         faces.wait_for("sessions.includes('seen')")  # it has reconnected
