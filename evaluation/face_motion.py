@@ -149,7 +149,7 @@ def _face_at_rest(config: SynthesizerConfig) -> Floats:
         load_lip_model(name=config.lips),
         frame_rate_hz=config.frame_rate_hz,
         delay_s=config.delay_ms / 1e3,
-        idle_motion_seed=config.idle_motion_seed,
+        idle_motion=config.idle_motion,
     )
     return np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
 

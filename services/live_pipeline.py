@@ -76,7 +76,7 @@ class LivePipeline:
             lip_model,
             frame_rate_hz=synthesizer.frame_rate_hz,
             delay_s=synthesizer.delay_ms / 1e3,
-            idle_motion_seed=synthesizer.idle_motion_seed,
+            idle_motion=synthesizer.idle_motion,
             expressiveness=synthesizer.expressiveness,
             feeling=synthesizer.feeling,
         )

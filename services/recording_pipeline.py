@@ -130,7 +130,7 @@ def animate_recording(
         lip_model,
         frame_rate_hz=config.frame_rate_hz,
         delay_s=MAX_DELAY_S,
-        idle_motion_seed=config.idle_motion_seed,
+        idle_motion=config.idle_motion,
         expressiveness=config.expressiveness,
         feeling=config.feeling,
     )

@@ -48,7 +48,11 @@ def make_face(
     *, delay_s: float = DELAY_S, frame_rate_hz: float = 50.0, idle_motion_seed: int = 0
 ) -> FaceAnimator:
     return FaceAnimator(
-        LIPS, frame_rate_hz=frame_rate_hz, delay_s=delay_s, idle_motion_seed=idle_motion_seed
+        LIPS,
+        frame_rate_hz=frame_rate_hz,
+        delay_s=delay_s,
+        idle_motion=idle_motion_seed > 0,
+        idle_motion_seed=idle_motion_seed,
     )
 
 

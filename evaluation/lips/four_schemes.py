@@ -155,7 +155,7 @@ def make_frames(
         lips,
         frame_rate_hz=config.frame_rate_hz,
         delay_s=config.delay_ms / 1e3,
-        idle_motion_seed=config.idle_motion_seed,
+        idle_motion=config.idle_motion,
         expressiveness=config.expressiveness,
     )
     return animate_live(face, face_input(condition, output))

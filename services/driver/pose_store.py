@@ -28,11 +28,11 @@ class PoseStore:
     choice is valid until that session closes, or until the user returns to the default.
     """
 
-    def __init__(self, session: str = NEWEST, idle_motion_seed: int = 0) -> None:
+    def __init__(self, session: str = NEWEST, *, idle_motion: bool = False) -> None:
         self._configured = session
         self._switched_to = ""
         self._poses: dict[str, _Pose] = {}  # in order of opening
-        self._rest = RestingFace(idle_motion_seed)
+        self._rest = RestingFace(idle_motion=idle_motion)
         self._face = np.zeros(NUM_FAPS, np.float32)  # the last session frame that was shown
         self._weight, self._shown_s = 0.0, 0.0  # weight of the face in the picture, and its time
 

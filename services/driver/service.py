@@ -57,7 +57,7 @@ class DriverService(SessionService):
         self._sessions: dict[str, _FollowedSession] = {}
         self._was_stalled = False
         self._drain_until_s = math.inf
-        self.poses = PoseStore(config.session, config.idle_motion_seed)
+        self.poses = PoseStore(config.session, idle_motion=config.idle_motion)
         self.view = View(config, self.poses.switch)
         self.recorder = RecorderClient(
             config,

@@ -27,11 +27,11 @@ class SendersApi:
     """
 
     def __init__(
-        self, urls: Iterable[str], idle_motion_seed: int, on_started: Callable[[], None]
+        self, urls: Iterable[str], on_started: Callable[[], None], *, idle_motion: bool
     ) -> None:
         self._configured = {url: parse_target(url) for url in urls}
         self._on_started = on_started
-        self.pool = SenderPool(idle_motion_seed, _log_problem)
+        self.pool = SenderPool(_log_problem, idle_motion=idle_motion)
         for target in self._configured.values():
             self.pool.start(target)
 

@@ -97,7 +97,7 @@ class GatewayService(SessionService):
         )
         self._learn_mouth_handler = LearnMouthHandler()
         self._audio_upload = AudioUploadHandler()
-        self._senders = SendersApi(config.senders, config.idle_motion_seed, self.waker.wake)
+        self._senders = SendersApi(config.senders, self.waker.wake, idle_motion=config.idle_motion)
         self._routes = (
             web.get("/viewer", self._viewers.serve),
             web.get("/microphone", self._microphones.serve),
@@ -117,7 +117,7 @@ class GatewayService(SessionService):
         self._server = WebServer(listener, endpoint.tls, share)
         self._tasks: set[asyncio.Task[None]] = set()
         self._closing: asyncio.Task[None] | None = None
-        self._resting_face = RestingFace(config.idle_motion_seed)
+        self._resting_face = RestingFace(idle_motion=config.idle_motion)
         self._rest_due_s = 0.0
         self._replied_s = -math.inf  # time of control's newest reply
         self._missing_since_s = math.inf  # time of the first reply that lacks a service

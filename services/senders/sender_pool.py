@@ -90,10 +90,10 @@ class SenderPool:
     address and problem when the problem changes. An empty problem means that it is solved.
     """
 
-    def __init__(self, idle_motion_seed: int, report: Callable[[str, str], None]) -> None:
+    def __init__(self, report: Callable[[str, str], None], *, idle_motion: bool) -> None:
         self._report = report
         self._senders: dict[str, _Sender] = {}
-        self._rest = RestingFace(idle_motion_seed)
+        self._rest = RestingFace(idle_motion=idle_motion)
         self._playout = PlayoutClock()
         self._newest = np.zeros(NUM_FAPS, np.float32)
         self._newest_s = time.monotonic() - STALL_S - FADE_S  # arrival of the newest frame

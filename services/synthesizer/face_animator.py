@@ -35,6 +35,7 @@ from kouxing.services.synthesizer.phone_renumberer import PhoneRenumberer
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.face.expression_motion import JAW, mix_expression
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.idle_motion import IDLE_MOTION_SEED
 from kouxing.shared.phones.events import (
     AudioSkipped,
     EndOfSound,
@@ -73,9 +74,10 @@ class FaceAnimator:
 
     Frame ``k`` is at media time ``k / frame_rate_hz``, with a rate of 10 to 240. It is made
     ``delay_s`` (0 to 1.5) later than its audio; at 1.5 the visemes of a recording are blended as if
-    all were known. ``idle_motion_seed`` is for blinks, gaze, brows and head motion; with 0 only the
-    mouth moves. ``expressiveness`` scales the mouth movements, 0.5 to 2. ``feeling`` is how
-    strongly the face shows the feeling in the voice, 0 to 1.
+    all were known. ``idle_motion`` adds blinks, gaze, brow and head motion, which
+    ``idle_motion_seed`` determines; without it, only the mouth moves. ``expressiveness`` scales the
+    mouth movements, 0.5 to 2. ``feeling`` is how strongly the face shows the feeling in the voice,
+    0 to 1.
     """
 
     def __init__(
@@ -84,7 +86,8 @@ class FaceAnimator:
         *,
         frame_rate_hz: float,
         delay_s: float,
-        idle_motion_seed: int = 0,
+        idle_motion: bool = False,
+        idle_motion_seed: int = IDLE_MOTION_SEED,
         expressiveness: float = 1.0,
         feeling: float = 0.0,
     ) -> None:
@@ -94,7 +97,7 @@ class FaceAnimator:
         self._expressiveness = ExpressivenessModifier(expressiveness)
         self._expression = ExpressionModifier()
         self._feeling = FeelingModifier(feeling)
-        self._idle_motion = SpeechMotionModifier(idle_motion_seed) if idle_motion_seed else None
+        self._idle_motion = SpeechMotionModifier(idle_motion_seed) if idle_motion else None
         self._num_frames = 0  # including frames at rest
         self._first_shown = 0  # earlier frames are rehearsals
         self._target: Faps | None = None  # the last frame without its transition

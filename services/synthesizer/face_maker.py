@@ -36,7 +36,7 @@ class FaceMaker:
             self._load_lip_model(start, settings.lip_model or config.lips),
             frame_rate_hz=config.frame_rate_hz,
             delay_s=config.delay_ms / 1e3,
-            idle_motion_seed=config.idle_motion_seed,
+            idle_motion=config.idle_motion,
             expressiveness=settings.expressiveness or config.expressiveness,
             feeling=config.feeling if settings.feeling is None else settings.feeling,
         )

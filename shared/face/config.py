@@ -6,19 +6,12 @@ from pydantic import Field
 
 from kouxing.shared.settings.config import ServiceConfig, Switch
 
-_IDLE_MOTION_SEED = 3
-
 
 class FaceConfig(ServiceConfig):
     """The keys of services that make or show a face."""
 
     idle_motion: Switch = True
     """Whether the face blinks and moves its gaze, brows and head."""
-
-    @property
-    def idle_motion_seed(self) -> int:
-        """Random seed of the idle motion; 0 without idle motion."""
-        return _IDLE_MOTION_SEED if self.idle_motion else 0
 
 
 class LiveConfig(ServiceConfig):

@@ -63,6 +63,8 @@ EYES_YAW = fap_slice("yaw_l_eyeball", "yaw_r_eyeball")
 EYES_PITCH = fap_slice("pitch_l_eyeball", "pitch_r_eyeball")
 HEAD = fap_slice("head_pitch", "head_roll")
 
+IDLE_MOTION_SEED = 3
+
 
 class ConversationState(Enum):
     """Conversational state, which controls gaze and head motion."""
@@ -91,7 +93,7 @@ _ON_LISTENER = {
 class IdleMotion:
     """Motion of eyes and head; the same seed gives the same motion. Times must not decrease."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int = IDLE_MOTION_SEED) -> None:
         self.is_still = False  # whether the head holds still
         self.has_eye_contact = False  # whether the eyes stay on the viewer
         self._seed = seed
@@ -201,10 +203,10 @@ class IdleMotion:
 
 
 class RestingFace:
-    """The face without a session: shows expressions and, unless the seed is 0, idle motion."""
+    """The face without a session: shows expressions and, optionally, idle motion."""
 
-    def __init__(self, seed: int) -> None:
-        self._motion = IdleMotion(seed) if seed else None
+    def __init__(self, *, idle_motion: bool) -> None:
+        self._motion = IdleMotion() if idle_motion else None
         self._expression = ExpressionMotion()
         self._start_s: float | None = None
         self._last_s = 0.0

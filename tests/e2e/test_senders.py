@@ -44,7 +44,9 @@ def reports() -> list[tuple[str, str]]:
 
 @pytest.fixture
 def senders(reports: list[tuple[str, str]]) -> Iterator[SenderPool]:
-    with contextlib.closing(SenderPool(0, lambda *report: reports.append(report))) as new_senders:
+    with contextlib.closing(
+        SenderPool(lambda *report: reports.append(report), idle_motion=False)
+    ) as new_senders:
         yield new_senders
 
 

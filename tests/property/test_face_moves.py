@@ -42,6 +42,7 @@ def make_face(lips: str) -> FaceAnimator:
         load_lip_model(name=lips),
         frame_rate_hz=RATE_HZ,
         delay_s=lip_model_info(lips).delay_ms / 1e3,
+        idle_motion=True,
         idle_motion_seed=1,
         expressiveness=1.4,
     )

@@ -256,7 +256,7 @@ def test_answers_commands_of_viewers_without_effect(command: dict[str, object], 
 
 def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
     viewers = make_viewers()
-    face = RestingFace(seed=0)
+    face = RestingFace(idle_motion=False)
     frame = np.zeros(68, "<f4").tobytes()
     viewers.add_session("talk", 1, FaceSettings(), "zh")
     with viewers.connect_viewer("", None) as viewer:

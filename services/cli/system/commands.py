@@ -219,7 +219,7 @@ def send(
     config = read_settings().load(SynthesizerConfig)
     parsed = [parse_target(url) for url in targets]
     with open_control_address(control) as endpoint:
-        send_to(parsed, _session_name(session), endpoint, config.idle_motion_seed)
+        send_to(parsed, _session_name(session), endpoint, idle_motion=config.idle_motion)
 
 
 def express(

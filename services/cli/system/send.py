@@ -22,16 +22,16 @@ STEP_S = 0.05
 _TOLERANCE_S = 0.05  # two opening times that differ less are equal
 
 
-def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_seed: int) -> None:
+def send_to(targets: Iterable[Target], session: str, control: str, *, idle_motion: bool) -> None:
     """Send the frames of a session; without a name, always of the newest session.
 
-    While there are no frames, the face's idle motion is sent, which the seed determines. Raises
+    While there are no frames, the face at rest is sent, with ``idle_motion`` if set. Raises
     ``UserError`` if control does not answer, or there are too many targets.
     """
     install_interrupt_handler()  # a background shell ignores SIGINT
     with (
         connect_client(control) as client,
-        contextlib.closing(SenderPool(idle_motion_seed, _report)) as senders,
+        contextlib.closing(SenderPool(_report, idle_motion=idle_motion)) as senders,
         catch_interrupt(),
     ):
         client.status()
