@@ -146,10 +146,7 @@ def build_timeline(
         if not phone.final and next_onset_s - phone.onset_s < _MIN_PHONE_S:
             continue  # revised to almost nothing
         bound_s = next((end for end in quiet_s if phone.onset_s < end < next_onset_s), next_onset_s)
-        end_s = min(phone.onset_s + max(phone.duration_s, _MIN_PHONE_S), bound_s)
-        estimated = live and not phone.final
-        if bound_s - end_s < (_MAX_ERROR_S if estimated else _TOUCHING_S):
-            end_s = bound_s
+        end_s = _end_of(phone, bound_s, is_estimate=live and not phone.final)
         if live and bound_s == np.inf:
             open_phone = OpenPhone(end_s, _is_held(phone.symbol, inventory))
         touching = end_s == next_onset_s
@@ -185,6 +182,13 @@ def build_timeline(
 
 # VisemeParameters row, start and end of the apex in seconds, phone index
 _PlacedViseme: TypeAlias = tuple[int, float, float, int]
+
+
+def _end_of(phone: Phone, bound_s: float, *, is_estimate: bool) -> float:
+    """Return the end of a phone, extended to the next phone or pause at ``bound_s`` if near."""
+    end_s = min(phone.onset_s + max(phone.duration_s, _MIN_PHONE_S), bound_s)
+    max_gap_s = _MAX_ERROR_S if is_estimate else _TOUCHING_S
+    return bound_s if bound_s - end_s < max_gap_s else end_s
 
 
 def _place_visemes(
