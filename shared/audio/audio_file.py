@@ -22,15 +22,10 @@ from kouxing.shared.audio.audio_formats import (
     non_audio_kind,
     read_stated_size,
 )
-from kouxing.shared.audio.media_file import (
-    MediaSound,
-    RawFormat,
-    WavPcm,
-    has_video,
-    pcm_of_wav,
-)
+from kouxing.shared.audio.media_file import MediaSound, has_video
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.audio.phase_cancellation import PhaseCancellationGuard, Samples
+from kouxing.shared.audio.raw_format import RawFormat, WavPcm, pcm_of_wav
 from kouxing.shared.audio.wav_parts import Readable, WavParts, count_parts
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content, open_file

@@ -1,17 +1,15 @@
 """Decodes the audio of files and pipes with FFmpeg, at the timestamps of the container."""
 
-import io
 import re
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, BinaryIO, NamedTuple, cast
+from typing import Any, BinaryIO, cast
 
 import av
 import numpy as np
 
 from kouxing.shared.audio.audio_formats import (
     MAX_OGG_PAGE_BYTES,
-    MIN_UNKNOWN_BYTES,
     codec_of_padded_wav,
     is_cut_ogg,
     is_sound,
@@ -37,28 +35,11 @@ _MAX_GAP_S = 3600.0  # a larger gap is an error in the timestamps
 _MAX_GAP_OF_BROADCAST_S = 10.0  # timestamps of broadcasts may restart at any value
 _MIN_MISSING_S = 0.1  # a track that lacks more is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
-_WAV_TYPES = {"pcm_s16le": "<i2", "pcm_f32le": "<f4"}
 # FFmpeg guesses these from the file's name, and also guesses their rate.
 _RAW_FORMATS = {"alaw", "mulaw", "s8", "u8", "s16le", "s16be", "u16le", "u16be"}
 _TIMES_COUNT_FROM_ZERO = re.compile("mov|matroska")
 # AVI is not in this list, because its duration includes gaps without packets.
 _HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|flv|caf|ape|tta|wv|au|w64")
-
-
-class RawFormat(NamedTuple):
-    """The format of raw samples."""
-
-    sample_rate_hz: int = 16_000
-    num_channels: int = 1
-    dtype: np.dtype[Any] = np.dtype("<i2")
-
-
-class WavPcm(NamedTuple):
-    """The samples in a WAV file."""
-
-    format: RawFormat
-    offset: int  # position of the first sample, bytes
-    num_bytes: int | None  # None: until the end of the file
 
 
 class MediaSound:
@@ -369,35 +350,6 @@ class _GuardedFile:
             except BaseException as failure:
                 self._failure = failure
         return b"" if function is self._read else -1
-
-
-def pcm_of_wav(begin: bytes) -> WavPcm | None:
-    """Find the samples of a WAV stream, if they are 16-bit integers or 32-bit floats.
-
-    None for other encodings and for more than two channels.
-    """
-    if begin[:4] != b"RIFF" or begin[8:12] != b"WAVE" or codec_of_padded_wav(begin):
-        return None
-    try:
-        with av.open(io.BytesIO(begin), mode="r", format="wav") as container:
-            codec: Any = container.streams.audio[0].codec_context
-            if codec is None:
-                return None
-            offset = next(container.demux()).pos
-    except (av.error.FFmpegError, ValueError, IndexError, StopIteration):
-        return None
-    dtype = _WAV_TYPES.get(codec.name)
-    if (
-        dtype is None
-        or codec.channels not in (1, 2)
-        or offset is None
-        or begin[offset - 8 : offset - 4] != b"data"
-    ):
-        return None
-    stated = int.from_bytes(begin[offset - 4 : offset], "little")
-    is_known = 0 < stated < MIN_UNKNOWN_BYTES
-    raw = RawFormat(codec.sample_rate, codec.channels, np.dtype(dtype))
-    return WavPcm(raw, offset, stated if is_known else None)
 
 
 def _describe(stream: Any) -> str:

@@ -11,8 +11,8 @@ from types import ModuleType
 from typing import Any
 
 from kouxing.shared.audio.audio_file import AudioSource, raw_audio
-from kouxing.shared.audio.media_file import RawFormat
 from kouxing.shared.audio.phase_cancellation import Samples
+from kouxing.shared.audio.raw_format import RawFormat
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.audio.audio_file import AudioSource, open_audio, read_audio
 from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, is_sound
-from kouxing.shared.audio.media_file import RawFormat
+from kouxing.shared.audio.raw_format import RawFormat
 from kouxing.shared.errors import UserError
 from tests.system import DEMO
 from tests.unit.media import CODECS, samples_of, write_sound

@@ -96,7 +96,7 @@ def speak(
     from kouxing.services.cli.system.streaming import stream
     from kouxing.services.recognizer.lips.mouth_profile import read_mouth_profile
     from kouxing.shared.audio.audio_file import open_audio
-    from kouxing.shared.audio.media_file import RawFormat
+    from kouxing.shared.audio.raw_format import RawFormat
     from kouxing.shared.audio.sound_devices import open_microphone, open_monitor
 
     profile = b"" if mouth is None else read_mouth_profile(mouth)
