@@ -24,14 +24,13 @@ from functools import partial
 
 import zmq
 
-from kouxing.shared.monitoring.logs import LOG, RateLimit
 from kouxing.shared.monitoring.metrics import trim_heap
 from kouxing.shared.network import kernel_sockets
 from kouxing.shared.network.descriptor_waiter import DescriptorWaiter
-from kouxing.shared.network.kernel_sockets import Traffic
 from kouxing.shared.network.peer_budget import BUDGET, MIN_BUDGET, PeerBudget
+from kouxing.shared.network.peer_connection import PENALTY_S, PeerConnection
 from kouxing.shared.network.peer_quota import PeerQuota
-from kouxing.shared.network.socket_limits import KIB, MAX_QUEUED, SocketLimits
+from kouxing.shared.network.socket_limits import KIB, SocketLimits
 from kouxing.shared.network.tarpit import MAX_HELD, Tarpit
 from kouxing.shared.network.waker import Waker
 
@@ -43,107 +42,16 @@ MAX_UNDELIVERED = 24 * MIB  # limit for all connections together
 MAX_INCOMPLETE = MIB  # limit for all connections together: 16 audio messages on slow links
 SMALL_INCOMPLETE = 4 * KIB  # additional limit for each connection
 MAX_UNREAD = 200_000  # messages queued for all peers; about 100 bytes of memory each
-STALLED_S = 1.0  # a live subscriber that reads nothing for this time is disconnected
 NEW_CHECKS = 20  # checks in which a connection is new; a flood is disconnected earlier
 MAX_ENDED = 1024  # ended connections that a service has not handled yet
 MAX_TOPIC = 128  # bytes of one subscription
 MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS = 192 * KIB  # all connections together; libzmq takes up to 120 times as much memory
-PENALTY_S = 1.0  # a disconnected peer cannot connect again for this time
-LONG_PENALTY_S = 3.0  # after behavior that only hostile peers show
 TRIMS_S = (0.2, 1.0, 3.0)  # delays after a disconnect, because libzmq frees memory later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
 _READABLE = int(zmq.POLLIN)
 _EVENT = struct.Struct("=HI")  # a monitor's event and descriptor
-_WARNINGS = RateLimit()
-
-
-class PeerConnection:
-    """One connection to a bound socket."""
-
-    def __init__(self, descriptor: int, inode: int, socket: LimitedSocket) -> None:
-        self.descriptor = descriptor
-        self.inode = inode  # identifies the connection; the kernel reuses descriptors
-        self.socket = socket
-        self.address = kernel_sockets.get_peer_address(descriptor)
-        self.key = ""  # the peer's key; known when its first message is delivered
-        self.budget = PeerBudget()
-        self.num_delivered = 0  # messages
-        self.num_checks = 0
-        self.topics: set[bytes] = set()
-        self.is_disconnected = False
-        self.undelivered = 0  # bytes since the last delivered message
-        self.incomplete = 0  # minimum number of these bytes that belong to an incomplete message
-        self.unread = 0  # maximum number of messages that may wait for the peer
-        self._delivered_before = 0
-        self._read_before = 0  # bytes, when num_delivered last changed
-        self._mark = (0, 0)  # undelivered bytes and number of polls at an earlier check
-        self._sent_before = socket.num_sent  # when nothing waited for the peer
-        self._acknowledged = 0
-        self._stalled_since_s = 0.0
-        self._had_unsent = False
-
-    @property
-    def owner(self) -> str:
-        """Owner of the connection: the peer's key or, without keys, its address."""
-        return self.key or self.address
-
-    @property
-    def topic_bytes(self) -> int:
-        """Size of all subscriptions."""
-        return sum(map(len, self.topics))
-
-    def spend(self, cost: float) -> None:
-        """Charge the peer for work; disconnect it when its budget is used up."""
-        if not self.is_disconnected:
-            self.budget.spend(cost)
-            if self.budget.left < 0:
-                self.disconnect("it sends too many useless messages", PENALTY_S)
-
-    def update(self, traffic: Traffic, now_s: float) -> None:
-        """Update the figures; disconnect a peer that sends an endless message."""
-        self.num_checks += 1
-        if self.num_delivered != self._delivered_before:
-            self._delivered_before, self._read_before = self.num_delivered, traffic.read
-            self._mark = (0, self.socket.num_polls)
-            self.incomplete = 0
-        self.undelivered = traffic.read - self._read_before
-        if self.socket.num_polls > self._mark[1] + 1:  # a complete message would be delivered
-            self.incomplete = self._mark[0]
-            self._mark = (self.undelivered, self.socket.num_polls)
-        if not traffic.unsent:
-            self._sent_before = self.socket.num_sent
-        self.unread = min(MAX_QUEUED, self.socket.num_sent - self._sent_before)
-        is_waiting = traffic.unsent > 0 and traffic.acknowledged == self._acknowledged
-        if not (is_waiting and self._had_unsent):
-            self._stalled_since_s = now_s
-        self._acknowledged, self._had_unsent = traffic.acknowledged, traffic.unsent > 0
-        limits = self.socket.limits
-        if self.incomplete > limits.message_bytes or self.undelivered > limits.undelivered_bytes:
-            self.disconnect("it sent an endless message", LONG_PENALTY_S)
-
-    def is_stalled(self, now_s: float) -> bool:
-        """Return whether the peer has read nothing for a while, although data is queued for it."""
-        return self.unread > 0 and now_s - self._stalled_since_s > STALLED_S
-
-    def disconnect(
-        self, reason: str, penalty_s: float = 0.0, end: Callable[[int, int], None] | None = None
-    ) -> None:
-        """End the connection, and log the reason. Any thread may call this.
-
-        The peer's key or address cannot connect again for ``penalty_s``. ``end`` is by default
-        ``kernel_sockets.reset``.
-        """
-        if self.is_disconnected:
-            return
-        self.is_disconnected = True
-        if penalty_s:
-            self.budget.block(penalty_s)
-            self.socket.limiter.save_budget(self)
-        (end or kernel_sockets.reset)(self.descriptor, self.inode)
-        if _WARNINGS.allows(reason):
-            LOG.warning("disconnected a peer at %s: %s", self.address or "?", reason)
 
 
 class LimitedSocket:

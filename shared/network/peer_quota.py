@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from kouxing.shared.settings.keys import MAX_KEY_SHARE
 
 if TYPE_CHECKING:
-    from kouxing.shared.network.connection_limits import PeerConnection
+    from kouxing.shared.network.peer_connection import PeerConnection
 
 MAX_CONNECTIONS = 400  # limit for clients; libzmq takes up to 0.1 MB for each
 FILES_PER_CLIENT = 6  # one for the client, one for a service, and four in the tarpit

@@ -17,12 +17,8 @@ from kouxing_client.sockets import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import Record
 from kouxing.shared.name_rules import is_name
-from kouxing.shared.network.connection_limits import (
-    LONG_PENALTY_S,
-    PENALTY_S,
-    LimitedSocket,
-    PeerConnection,
-)
+from kouxing.shared.network.connection_limits import LimitedSocket
+from kouxing.shared.network.peer_connection import LONG_PENALTY_S, PENALTY_S, PeerConnection
 from kouxing.shared.network.socket_limits import KIB
 from kouxing.shared.network.waker import Waker
 from kouxing.shared.network.zap import Zap

@@ -22,7 +22,7 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.service import SynthesizerService
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
-from kouxing.shared.network import connection_limits, sockets
+from kouxing.shared.network import connection_limits, peer_connection, sockets
 from kouxing.shared.network.bus import Bus
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.service.base import Service
@@ -101,8 +101,9 @@ ACTIONS = st.lists(
 def _no_penalties() -> Iterator[None]:
     """Let disconnected peers connect again at once: the honest peer has the same address."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (connection_limits, sockets):
+        for module in (connection_limits, peer_connection, sockets):
             patch.setattr(module, "PENALTY_S", 0.0)
+        for module in (peer_connection, sockets):
             patch.setattr(module, "LONG_PENALTY_S", 0.0)
         yield
 

@@ -11,13 +11,12 @@ from kouxing.shared.network.bus import AUDIO
 from kouxing.shared.network.connection_limits import (
     NEW_CHECKS,
     NUM_ENDED_BEFORE_TRIM,
-    PENALTY_S,
     TRIMS_S,
     ConnectionLimiter,
-    PeerConnection,
 )
 from kouxing.shared.network.kernel_sockets import Traffic
 from kouxing.shared.network.peer_budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, PeerBudget
+from kouxing.shared.network.peer_connection import PENALTY_S, PeerConnection
 from kouxing.shared.network.socket_limits import MAX_QUEUED
 from kouxing.shared.network.tarpit import GAP_S, HOLD_S
 
