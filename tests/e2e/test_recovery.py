@@ -82,14 +82,15 @@ IS_LIVE = f"/live|behind/.test({STATUS}) && window.kouxing.state.voiceToImageMs 
 def browser(system: System, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     folder = tmp_path_factory.mktemp("browser")
     browser = Browser(folder, DEMO / "hello-female.wav", size_px=(320, 240))
-    browser.open(system.page)
-    # Records all notices, including short ones.
-    browser.evaluate(
-        "window.notices = []; const notice = document.getElementById('notice');"
-        "new MutationObserver(() => window.notices.push(notice.textContent))"
-        ".observe(notice, { childList: true, characterData: true, subtree: true })"
-    )
-    yield browser
+    with browser.drawing_seldom():
+        browser.open(system.page)
+        # Records all notices, including short ones.
+        browser.evaluate(
+            "window.notices = []; const notice = document.getElementById('notice');"
+            "new MutationObserver(() => window.notices.push(notice.textContent))"
+            ".observe(notice, { childList: true, characterData: true, subtree: true })"
+        )
+        yield browser
     browser.close()
 
 
