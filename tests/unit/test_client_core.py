@@ -1,5 +1,7 @@
 """A client's core: requests, sessions that move, lost connections; without sockets."""
 
+import gc
+import weakref
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -333,6 +335,19 @@ def test_events_can_be_closed_twice() -> None:
         harness.core.remove_inbox(harness.session, first)
     assert first.is_over
     assert not second.is_over
+
+
+def test_a_session_without_inboxes_is_freed_when_it_is_over() -> None:
+    harness, inbox = CoreHarness(), Inbox(None)
+    harness.core.add_inbox(harness.session, inbox)
+    harness.core.remove_inbox(harness.session, inbox)
+    harness.session.end(None)
+    harness.core.tick()
+    session = weakref.ref(harness.session)
+    del harness.session
+    harness.sockets.connections.clear()
+    gc.collect()
+    assert session() is None
 
 
 @pytest.mark.parametrize(

@@ -136,9 +136,12 @@ class ClientCore:
 
     def remove_inbox(self, session: SessionCore, inbox: Inbox) -> None:
         """Stop passing events to an inbox."""
-        if inbox in self._inboxes[session]:
-            self._inboxes[session].remove(inbox)
+        inboxes = self._inboxes.get(session, [])
+        if inbox in inboxes:
+            inboxes.remove(inbox)
             self._watch(session.name, on=False)
+            if not inboxes:
+                del self._inboxes[session]
         inbox.end(None)
 
     def tick(self) -> None:
