@@ -376,6 +376,9 @@ class ControlService(Service):
             record = self._sessions.restore(start, time.monotonic())
             LOG.info("session restored", extra={"session": record.name})
             self._lifecycle.set_speaking(record, speaking=record.is_speaking)
+            if record.face.settings.listen_to:  # that session may have changed in the meantime
+                listen_to = FaceSettings(listen_to=record.face.settings.listen_to)
+                self._lifecycle.change_face(record, self._sessions.with_listening(listen_to))
             missed_start = self._recovery.observers_that_missed_start(record.name)
             self._lifecycle.send_start(record, record.waiting_for | missed_start)
             if record.lost:

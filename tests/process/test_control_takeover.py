@@ -3,18 +3,19 @@
 import time
 
 import pytest
-from kouxing_client.messages import Speech
+from kouxing_client.messages import Message, Speech
 
 from kouxing.services.control import restart_recovery, session_lifecycle
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.wire.control import (
     Heartbeat,
+    HeartbeatReply,
     SessionProgress,
     SessionStarted,
     StartSession,
 )
-from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,
@@ -58,6 +59,30 @@ def test_control_restores_a_session_unchanged(harness: ControlHarness, client: S
         assert start.opening.face == face
     client.send(CloseSession(session="mine", token="t", request="1"))
     assert harness.receive(client) == [Done(session="mine", request="1")]
+
+
+@pytest.mark.parametrize("reported", [("speaker", "listener"), ("listener", "speaker")])
+@pytest.mark.parametrize("has_speech", [True, False])
+def test_a_restored_face_follows_the_session_that_it_listens_to(
+    harness: ControlHarness, reported: tuple[str, str], has_speech: bool
+) -> None:
+    recognizer, synthesizer = harness.services
+    starts = {
+        "speaker": replace(START, speech_time=5 if has_speech else None),
+        "listener": START.with_face(FaceSettings(listen_to="speaker", listening=not has_speech)),
+    }
+    for name in reported:
+        start = replace(starts[name], session=name, epoch=4, endpoints=PLACED)
+        recognizer.send(SessionStarted(session=name, request="r", start=start))
+    received: list[Message] = []
+    while len(harness.control._sessions) < 2:
+        received += harness.receive(synthesizer)
+    assert harness.control._sessions.find("listener").face.settings.listening == has_speech
+    synthesizer.send(replace(make_heartbeat("synthesizer"), sent_ns=1))
+    while not any(isinstance(item, HeartbeatReply) and item.sent_ns == 1 for item in received):
+        received += harness.receive(synthesizer)
+    changes = [item.face for item in received if isinstance(item, SetFace)]
+    assert changes[-1].listening == has_speech
 
 
 def test_defers_a_request_until_its_session_is_restored(
