@@ -219,9 +219,9 @@ class ServiceRegistry:
         return self._providers.get(endpoint, {})
 
     def lip_models(self) -> list[str]:
-        """Return the lip models of the running synthesizers, sorted; empty if unknown."""
-        synthesizers = self.providers("faps").values()
-        return sorted({name for record in synthesizers for name in record.heartbeat.lip_models})
+        """Return the lip models of the running synthesizers, sorted; empty if some are unknown."""
+        lists = [record.heartbeat.lip_models for record in self.providers("faps").values()]
+        return sorted({name for names in lists for name in names}) if all(lists) else []
 
     def observers(self) -> set[str]:
         """Return the services that take part in every session."""
