@@ -23,7 +23,7 @@ struct Lips {
   int rate_hz;
   int64_t num_in, num_samples; /* at the rate of the input, and at 16 kHz */
   Resampler resampler;
-  float slice[SLICE];
+  float slice[SLICE_SAMPLES];
   int num_in_slice;
   float sound[MEL_WINDOW_SAMPLES]; /* of the next window */
   int num_sound;
@@ -164,7 +164,7 @@ static void process_encoder_frame(Lips *lips) {
 
 /* Add the sound of the current slice to the windows of the encoder. */
 static void analyze_slice(Lips *lips) {
-  for (int i = 0; i < SLICE; i++) {
+  for (int i = 0; i < SLICE_SAMPLES; i++) {
     lips->sound[lips->num_sound++] = lips->slice[i];
     if (lips->num_sound < MEL_WINDOW_SAMPLES) continue;
     log_mel(lips->sound, lips->encoder.features + lips->num_mel_frames++ * MEL_NUM_MELS);
@@ -183,13 +183,13 @@ static double media_time_s(const Lips *lips) { return (double)lips->num_samples 
 /* Process a sample at 16 kHz. After 20 ms, compute the faces that are due. */
 static void process_sample(Lips *lips, float sample) {
   lips->slice[lips->num_in_slice++] = sample;
-  if (lips->num_in_slice < SLICE) return;
+  if (lips->num_in_slice < SLICE_SAMPLES) return;
   double power = 0.0;
-  for (int i = 0; i < SLICE; i++) power += (double)lips->slice[i] * lips->slice[i];
+  for (int i = 0; i < SLICE_SAMPLES; i++) power += (double)lips->slice[i] * lips->slice[i];
   lips->num_in_slice = 0;
   analyze_slice(lips);
-  lips->num_samples += SLICE;
-  const double level_db = fmax(STREAM_SILENT_DB, 10.0 * log10(power / SLICE + 1e-12));
+  lips->num_samples += SLICE_SAMPLES;
+  const double level_db = fmax(STREAM_SILENT_DB, 10.0 * log10(power / SLICE_SAMPLES + 1e-12));
   face_add_level(&lips->face, media_time_s(lips), level_db);
   const int last = (int)floor((media_time_s(lips) - DELAY_S) * FRAME_RATE_HZ + FRAME_ROUNDING);
   for (; lips->next_frame <= last; lips->next_frame++) {

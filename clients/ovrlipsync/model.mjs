@@ -40,7 +40,7 @@ for (const [name, { values, shape }] of Object.entries(model.arrays)) if (ARRAYS
 for (const name of MODULES) for (const [key, value] of Object.entries(model.constants[name])) define(`${name}.${key}`, value);
 for (const [name, value] of Object.entries(model.closureRule)) define(`rule.${name}`, value);
 for (const [name, value] of Object.entries(model.voices)) define(`voice.${name}`, value);
-define("slice", model.constants.pcm.SLICE);
+define("slice_samples", model.constants.pcm.SLICE_SAMPLES);
 define("media_rate_hz", model.constants.clock.MEDIA_RATE_HZ);
 define("frame_rounding", model.constants.animator.ROUNDING);
 define("mouth_faps", model.mouthFaps);

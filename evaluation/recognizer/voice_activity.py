@@ -25,7 +25,7 @@ from kouxing.evaluation.recognizer.disturbances import Disturb, add_sound
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.front_end.slices import SLICE, split_slices
+from kouxing.services.recognizer.front_end.slices import SLICE_SAMPLES, split_slices
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.command.terminal import CONSOLE
@@ -33,7 +33,7 @@ from kouxing.shared.phones.events import Phone, Progress, SpeechChange
 
 Mask = NDArray[np.bool_]  # (slices,)
 
-_SLICE_S = SLICE / SAMPLE_RATE_HZ
+_SLICE_S = SLICE_SAMPLES / SAMPLE_RATE_HZ
 _PAUSE = 2 * SAMPLE_RATE_HZ  # samples of silence before and after a recording of speech
 _SYNTHETIC_S = 60.0
 _SUNG_OVER_MUSIC_DB = 5.0
@@ -80,13 +80,16 @@ def labeled_audio(
 
 def _label_all(kind: str, recordings: Iterable[Samples], *, is_voice: bool) -> LabeledAudio:
     return LabeledAudio(
-        kind, [(samples, np.full(-(-len(samples) // SLICE), is_voice)) for samples in recordings]
+        kind,
+        [(samples, np.full(-(-len(samples) // SLICE_SAMPLES), is_voice)) for samples in recordings],
     )
 
 
 def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
     """Return whether the middle of each slice is in a phone, after the pause."""
-    middle_s = ((np.arange(-(-num_samples // SLICE)) + 0.5) * SLICE - _PAUSE) / SAMPLE_RATE_HZ
+    middle_s = (
+        (np.arange(-(-num_samples // SLICE_SAMPLES)) + 0.5) * SLICE_SAMPLES - _PAUSE
+    ) / SAMPLE_RATE_HZ
     mask = np.zeros(len(middle_s), np.bool_)
     for phone in phones:
         mask |= (phone.onset_s <= middle_s) & (middle_s < phone.onset_s + phone.duration_s)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from kouxing.evaluation.report.lip_tables import display_floor_ms
 from kouxing.evaluation.tables import Figures, Table, format_number, join_values, percent
-from kouxing.services.recognizer.sessions.hop_controller import MAX_HOP
+from kouxing.services.recognizer.sessions.hop_controller import MAX_HOP_BLOCKS
 from kouxing.shared.face.faps import NUM_FAPS
 
 _LOOK_AHEAD_MS, _FRAME_MS = 60, 20
@@ -78,7 +78,7 @@ def _chain_rows(chain: Figures, sizes: Figures) -> Iterator[list[str]]:
 
 def _load_rows(load: Figures, sizes: Figures) -> Iterator[list[str]]:
     summary = load["summary"]
-    floor_cores = sizes.get("floor_cores", {}).get(f"hop {MAX_HOP}")
+    floor_cores = sizes.get("floor_cores", {}).get(f"hop {MAX_HOP_BLOCKS}")
     yield _row(
         f"sessions on {load['cores']} cores, all speaking",
         f"{summary['sessions']:.0f}",

@@ -13,7 +13,7 @@ from kouxing.corpora.options import OptionalClips, Picture
 from kouxing.evaluation.source_tree import SAMPLE
 from kouxing.evaluation.tables import figures_table, show_results
 from kouxing.services.cli.options import Language
-from kouxing.services.recognizer.sessions.hop_controller import MAX_HOP
+from kouxing.services.recognizer.sessions.hop_controller import MAX_HOP_BLOCKS
 from kouxing.shared.command.terminal import CONSOLE, Force, JsonFile, check_output
 
 AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
@@ -93,7 +93,7 @@ def sizes(json_file: JsonFile = None, force: Force = False) -> None:
 
     check_output(json_file, force=force)
     sizes = measure()
-    floors = {f"hop {hop}": sizes.floor_cores(hop) for hop in (1, MAX_HOP)}
+    floors = {f"hop {hop}": sizes.floor_cores(hop) for hop in (1, MAX_HOP_BLOCKS)}
     results = {**asdict(sizes), "floor_cores": floors}
     show_results(json_file, results, system_table(sizes=results), figures_table({"value": results}))
 

@@ -36,7 +36,7 @@ class Sizes:
     def floor_cores(self, hop: int = 1) -> float:
         """Return the cores that the networks would need at the highest rate of products.
 
-        The block network runs once in ``hop`` blocks, up to ``MAX_HOP`` under load.
+        The block network runs once in ``hop`` blocks, up to ``MAX_HOP_BLOCKS`` under load.
         """
         gflop = self.network_gflop_per_s[_BLOCKS] / hop + self.network_gflop_per_s[_ENCODER]
         return gflop / (_INT8_SPEED_UP * self.gemm_gflops)

@@ -90,7 +90,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         nonverbal,
         "_HOLD_S _LEAD_S _LAUGH_EASE_S _LOUDNESS_DB _FORGET_DB_S _BREATH _SMILING _LOUD_NOTE",
     ),
-    "pcm": (slices, "MEDIA_RATE_HZ SLICE"),
+    "pcm": (slices, "MEDIA_RATE_HZ SLICE_SAMPLES"),
     "resample": (resample, "SAMPLE_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA"),
     "rest": (
         resting_lips,

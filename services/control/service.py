@@ -29,7 +29,7 @@ from kouxing.shared.clock import StallDetector, now_ns
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.monitoring.logs import LOG
-from kouxing.shared.network.bus import COMMANDS
+from kouxing.shared.network.bus import COMMAND_LIMITS
 from kouxing.shared.service.base import Service
 from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.settings.endpoints import with_key
@@ -79,7 +79,9 @@ class ControlService(Service):
         self._keys_version = (0, 0)  # version of the key list for which revoked sessions have ended
         self._tick_stall = StallDetector(now_s, MAX_TICK_DELAY_S)
         self._sleep_s = 0.0  # planned time until the next tick
-        self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
+        self._commands = self.bus.bind_router(
+            config.bound_control, "control.control", COMMAND_LIMITS
+        )
         self._events = self.bus.bind_publisher(config.events, "control.events")
         public = self.key.public if self.key else ""
         self.endpoints = {

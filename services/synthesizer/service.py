@@ -31,7 +31,7 @@ from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.monitoring.logs import LOG
-from kouxing.shared.network.bus import PHONES
+from kouxing.shared.network.bus import PHONE_LIMITS
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
@@ -86,7 +86,7 @@ class SynthesizerService(SessionService):
         self._turn = 0  # round robin of sessions with queued events
         self._last_check_s = 0.0  # last check for stopped subscribers and for lateness
         self._input = self.bus.bind_router(
-            config.phone_input, "synthesizer.phone_input", PHONES, role="service"
+            config.phone_input, "synthesizer.phone_input", PHONE_LIMITS, role="service"
         )
         self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps", self._on_subscribe)
         self.endpoints = {

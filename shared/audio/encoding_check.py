@@ -16,7 +16,7 @@ from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]
 
-BLOCK = 2400  # samples per channel that are checked together; a multiple of all sample sizes
+BLOCK_SAMPLES = 2400  # per channel, checked together; a multiple of all sample sizes
 _MAX_BLOCKS = 60  # non-silent blocks after which the check ends
 _MAX_REJECTED_BLOCKS = 2  # blocks that are not PCM after which the data is rejected
 _MIN_SOUND = 3  # blocks of sound that end the check
@@ -105,7 +105,7 @@ class EncodingCheck:
         self._packet_starts.append(message[0] >> 4)
         self._begin += message[: NUM_BEGIN_BYTES - len(self._begin)]
         self._waiting += message
-        num_bytes = 2 * BLOCK * self._num_channels
+        num_bytes = 2 * BLOCK_SAMPLES * self._num_channels
         while len(self._waiting) >= num_bytes and not self._is_done:
             block, self._waiting = self._waiting[:num_bytes], self._waiting[num_bytes:]
             self._judge(np.frombuffer(block, np.uint8))

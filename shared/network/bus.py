@@ -14,7 +14,7 @@ from typing import Self
 import zmq
 from kouxing_client.field_types import MAX_AUDIO_BYTES
 from kouxing_client.keys import Key
-from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER, QUEUE, set_limits
+from kouxing_client.sockets import HANDSHAKE_MS, LIVE_BUFFER_BYTES, QUEUE_MESSAGES, set_limits
 from zmq.utils.monitor import recv_monitor_message
 
 from kouxing.shared.errors import UserError
@@ -27,11 +27,11 @@ from kouxing.shared.settings.endpoints import split_endpoint
 from kouxing.shared.wire.message import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
 
 # Few answers to audio are queued, because not every client reads them.
-AUDIO = SocketLimits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
-COMMANDS = SocketLimits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
-PHONES = SocketLimits(part_bytes=4 * KIB, queue_length=64)
+AUDIO_LIMITS = SocketLimits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
+COMMAND_LIMITS = SocketLimits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
+PHONE_LIMITS = SocketLimits(part_bytes=4 * KIB, queue_length=64)
 # most of the cost is for the handshake
-SUBSCRIPTIONS = SocketLimits(part_bytes=512, queue_length=32, cost=1.0)
+SUBSCRIPTION_LIMITS = SocketLimits(part_bytes=512, queue_length=32, cost=1.0)
 
 
 def _bind_problem(error: zmq.ZMQError) -> str:
@@ -73,7 +73,7 @@ class Bus:
         self.close()
 
     def bind_router(
-        self, endpoint: str, key: str, limits: SocketLimits = AUDIO, *, role: str = ""
+        self, endpoint: str, key: str, limits: SocketLimits = AUDIO_LIMITS, *, role: str = ""
     ) -> Socket:
         """Bind a socket that receives from many peers.
 
@@ -94,7 +94,7 @@ class Bus:
         ``on_subscribe`` is called with the session when the subscriptions of a peer are in effect.
         It returns the messages to publish again.
         """
-        return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS, on_subscribe)
+        return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTION_LIMITS, on_subscribe)
 
     def connect_dealer(self, endpoint: str) -> Socket:
         """Connect to a router. Messages are queued until it is available."""
@@ -107,7 +107,7 @@ class Bus:
         process has little to skip.
         """
         socket = self._connect(zmq.SUB, *endpoints)
-        socket.raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER)
+        socket.raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER_BYTES)
         for endpoint in live:
             socket.connect(endpoint)
         return socket
@@ -197,15 +197,15 @@ class Bus:
             self._key,
             self.zap,
             limited,
-            routes=kind == zmq.ROUTER,
-            publishes=kind == zmq.XPUB,
+            is_router=kind == zmq.ROUTER,
+            is_publisher=kind == zmq.XPUB,
             on_subscribe=on_subscribe,
             endpoint_name=key.rpartition(".")[2],
         )
         self._sockets.append(socket)
         return socket
 
-    def _connect(self, kind: int, *endpoints: str, queue_length: int = QUEUE) -> Socket:
+    def _connect(self, kind: int, *endpoints: str, queue_length: int = QUEUE_MESSAGES) -> Socket:
         raw = self._open(kind, queue_length)
         if kind == zmq.DEALER:  # a router recognizes this peer after a reconnect
             raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))

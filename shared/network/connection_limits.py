@@ -31,22 +31,22 @@ from kouxing.shared.network.peer_budget import BUDGET, MIN_BUDGET, PeerBudget
 from kouxing.shared.network.peer_connection import PENALTY_S, PeerConnection
 from kouxing.shared.network.peer_quota import PeerQuota
 from kouxing.shared.network.socket_limits import KIB, SocketLimits
-from kouxing.shared.network.tarpit import MAX_HELD, Tarpit
+from kouxing.shared.network.tarpit import MAX_HELD_CONNECTIONS, Tarpit
 from kouxing.shared.network.waker import Waker
 
 MIB = 1024 * KIB
 CHECK_INTERVAL_S = 0.05  # interval between checks of all connections while data arrives
 MAX_INTERVAL_S = 1.0  # interval between checks without new data
-RECEIVE_BUFFER = 256 * KIB  # in the kernel, which doubles it
-MAX_UNDELIVERED = 24 * MIB  # limit for all connections together
-MAX_INCOMPLETE = MIB  # limit for all connections together: 16 audio messages on slow links
-SMALL_INCOMPLETE = 4 * KIB  # additional limit for each connection
-MAX_UNREAD = 200_000  # messages queued for all peers; about 100 bytes of memory each
-NEW_CHECKS = 20  # checks in which a connection is new; a flood is disconnected earlier
-MAX_ENDED = 1024  # ended connections that a service has not handled yet
-MAX_TOPIC = 128  # bytes of one subscription
-MAX_TOPICS = 32 * KIB  # bytes of a connection's subscriptions: 64 sessions
-MAX_ALL_TOPICS = 192 * KIB  # all connections together; libzmq takes up to 120 times as much memory
+RECEIVE_BUFFER_BYTES = 256 * KIB  # in the kernel, which doubles it
+MAX_UNDELIVERED_BYTES = 24 * MIB  # limit for all connections together
+MAX_INCOMPLETE_BYTES = MIB  # limit for all connections together: 16 audio messages on slow links
+EXTRA_INCOMPLETE_BYTES = 4 * KIB  # additional limit for each connection
+MAX_UNREAD_MESSAGES = 200_000  # queued for all peers; about 100 bytes of memory each
+NUM_NEW_CHECKS = 20  # checks in which a connection is new; a flood is disconnected earlier
+MAX_ENDED_CONNECTIONS = 1024  # that a service has not handled yet
+MAX_TOPIC_BYTES = 128  # of one subscription
+MAX_TOPICS_BYTES = 32 * KIB  # of a connection's subscriptions: 64 sessions
+MAX_ALL_TOPICS_BYTES = 192 * KIB  # of all connections; libzmq takes up to 120 times as much memory
 TRIMS_S = (0.2, 1.0, 3.0)  # delays after a disconnect, because libzmq frees memory later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
@@ -64,7 +64,7 @@ class LimitedSocket:
         self.port = 0  # 0 until it is bound
         self.num_sent = 0  # messages, to all peers
         self.num_polls = 0  # times that all complete messages had been delivered
-        self.ended: deque[int] = deque(maxlen=MAX_ENDED)  # inodes of ended connections
+        self.ended: deque[int] = deque(maxlen=MAX_ENDED_CONNECTIONS)  # inodes of ended connections
         self.limiter = limiter
         self._monitor = monitor
 
@@ -86,11 +86,11 @@ class LimitedSocket:
 
     def subscribe(self, connection: PeerConnection, topic: bytes) -> None:
         """Add a subscription; disconnect a peer with too many or too long subscriptions."""
-        if len(topic) > MAX_TOPIC:
+        if len(topic) > MAX_TOPIC_BYTES:
             connection.disconnect("a subscription is too long", PENALTY_S)
             return
         connection.topics.add(topic)
-        if connection.topic_bytes > MAX_TOPICS:
+        if connection.topic_bytes > MAX_TOPICS_BYTES:
             connection.disconnect("it has too many subscriptions", PENALTY_S)
         self.limiter.limit_topics(len(topic))
 
@@ -128,7 +128,7 @@ class ConnectionLimiter:
 
     def __init__(self, is_service: Callable[[str], bool], extra_connections: int = 0) -> None:
         self._quota = PeerQuota(extra_connections, is_service)
-        self._tarpit = Tarpit(min(MAX_HELD, 4 * self._quota.max_clients))
+        self._tarpit = Tarpit(min(MAX_HELD_CONNECTIONS, 4 * self._quota.max_clients))
         self._connections: dict[int, PeerConnection] = {}  # by inode; both threads add
         self._budgets: dict[str, PeerBudget] = {}  # budgets of owners whose connections ended
         self._sockets: list[LimitedSocket] = []
@@ -149,7 +149,7 @@ class ConnectionLimiter:
         """Set the limits of a socket that is not bound yet, and watch its connections."""
         raw.setsockopt(zmq.MAXMSGSIZE, limits.part_bytes)
         raw.setsockopt(zmq.RCVHWM, limits.queue_length)
-        raw.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
+        raw.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER_BYTES)
         monitor = raw.get_monitor_socket(_EVENTS)
         self._descriptor_waiter.add(int(monitor.getsockopt(zmq.FD)))
         socket = LimitedSocket(self, limits, monitor)
@@ -194,11 +194,11 @@ class ConnectionLimiter:
     def limit_topics(self, num_bytes: int) -> None:
         """Count a subscription; above the total limit, disconnect the largest subscribers."""
         self._topic_bytes += num_bytes
-        if self._topic_bytes > MAX_ALL_TOPICS:
+        if self._topic_bytes > MAX_ALL_TOPICS_BYTES:
             self._topic_bytes = _disconnect_heaviest(
                 list(self._connections.values()),
                 lambda connection: connection.topic_bytes,
-                MAX_ALL_TOPICS,
+                MAX_ALL_TOPICS_BYTES,
                 "there are too many subscriptions",
             )
 
@@ -247,17 +247,21 @@ class ConnectionLimiter:
         hold = partial(self._tarpit.add, now_s=now_s)
         for connection, reason in self._quota.excess(connections):
             # An older peer may be idle. If it does not reconnect now, its next messages are lost.
-            connection.disconnect(reason, end=hold if connection.num_checks < NEW_CHECKS else None)
+            connection.disconnect(
+                reason, end=hold if connection.num_checks < NUM_NEW_CHECKS else None
+            )
         for connection in connections:
             connection.update(kernel_sockets.get_traffic(connection.descriptor), now_s)
         _disconnect_heaviest(
-            connections, lambda c: c.undelivered, MAX_UNDELIVERED, "too much undelivered data"
+            connections, lambda c: c.undelivered, MAX_UNDELIVERED_BYTES, "too much undelivered data"
         )
-        max_incomplete = MAX_INCOMPLETE + SMALL_INCOMPLETE * len(connections)
+        max_incomplete = MAX_INCOMPLETE_BYTES + EXTRA_INCOMPLETE_BYTES * len(connections)
         _disconnect_heaviest(
             connections, lambda c: c.incomplete, max_incomplete, "too many incomplete messages"
         )
-        _disconnect_heaviest(connections, lambda c: c.unread, MAX_UNREAD, "it reads too little")
+        _disconnect_heaviest(
+            connections, lambda c: c.unread, MAX_UNREAD_MESSAGES, "it reads too little"
+        )
         self._has_undelivered = any(c.undelivered > c.incomplete for c in connections)
         if self.waker is not None and (has_ended or self._has_undelivered):
             self.waker.wake()  # the loop handles complete messages and ended connections

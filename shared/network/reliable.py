@@ -19,7 +19,7 @@ from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 
 RESEND_AFTER_S = 0.5
 MAX_RESENT = 200  # messages resent at a time; more would delay a busy receiver further
-ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
+ACKNOWLEDGE_EVERY_MESSAGES = 32  # a tick acknowledges the rest
 ACKNOWLEDGE_INTERVAL_S = 0.05  # minimum time between acknowledgements by ``tick``
 MAX_UNACKNOWLEDGED_S = 0.1  # limit; usually, another message causes an earlier tick
 
@@ -113,7 +113,7 @@ class ReliableReceiver:
             self.acknowledge()  # reports which messages are missing
             return False
         self._last = message.sequence
-        if self._last - self._acknowledged >= ACKNOWLEDGE_EVERY:
+        if self._last - self._acknowledged >= ACKNOWLEDGE_EVERY_MESSAGES:
             self.acknowledge()
         return True
 

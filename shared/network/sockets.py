@@ -55,8 +55,8 @@ class Socket:
         zap: Zap | None = None,
         limited: LimitedSocket | None = None,
         *,
-        routes: bool = False,
-        publishes: bool = False,
+        is_router: bool = False,
+        is_publisher: bool = False,
         on_subscribe: OnSubscribe | None = None,
         endpoint_name: str | None = None,
     ) -> None:
@@ -64,8 +64,8 @@ class Socket:
         self._key = key
         self._zap = zap  # set if the socket is bound with a key
         self._limited = limited  # if the socket is bound
-        self._routes = routes
-        self._publishes = publishes
+        self._is_router = is_router
+        self._is_publisher = is_publisher
         self._on_subscribe = on_subscribe
         self._endpoint_name = endpoint_name  # set for a publisher
         self._connection: PeerConnection | None = None  # connection of the last message
@@ -91,13 +91,13 @@ class Socket:
 
         An answer to the message that is being handled reduces its sender's budget.
         """
-        if self._publishes and not self._has_subscriber(topic(message.kind, message.session)):
+        if self._is_publisher and not self._has_subscriber(topic(message.kind, message.session)):
             return True
         parts = encode(message)
         if self._connection is not None and to == self._sender:
             cost = ERROR_COST if isinstance(message, Error) else 0.0
             self._connection.spend(cost + ANSWER_COST * len(parts[-1]) / KIB)
-        if self._routes:
+        if self._is_router:
             parts.insert(0, to.address)
         try:
             for part in parts[:-1]:  # faster than send_multipart
@@ -154,11 +154,11 @@ class Socket:
                 grant = None if self._zap is None else self._zap.grants.get(key)
                 if self._zap is not None and grant is None:  # gone or revoked
                     continue
-                if self._publishes:
+                if self._is_publisher:
                     self._on_subscription(parts, grant)
                     continue
                 inode = self._connection.inode if self._connection is not None else 0
-                self._sender = Peer(parts.pop(0), key, inode) if self._routes else NO_PEER
+                self._sender = Peer(parts.pop(0), key, inode) if self._is_router else NO_PEER
                 try:
                     yield ReceivedMessage(decode(parts), self._sender)
                 except BadMessage as error:

@@ -10,7 +10,7 @@ from collections import deque
 
 from kouxing.shared.network import kernel_sockets
 
-MAX_HELD = 1600
+MAX_HELD_CONNECTIONS = 1600
 HOLD_S = 2.0  # minimum time
 GAP_S = 0.005  # interval between resets; peers that are reset together reconnect together
 

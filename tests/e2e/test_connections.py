@@ -11,7 +11,11 @@ from kouxing_client.messages import FapFrame, Message
 
 from kouxing.shared.network import connection_limits, peer_quota, tarpit
 from kouxing.shared.network.bus import Bus
-from kouxing.shared.network.connection_limits import MAX_TOPIC, MAX_TOPICS, ConnectionLimiter
+from kouxing.shared.network.connection_limits import (
+    MAX_TOPIC_BYTES,
+    MAX_TOPICS_BYTES,
+    ConnectionLimiter,
+)
 from kouxing.shared.network.sockets import MAX_DROPPED, Poller, ReceivedMessage, Socket
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.session import AudioChunk
@@ -104,10 +108,10 @@ def test_a_message_may_arrive_in_pieces(bus: Bus) -> None:
 
 def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:
     faps = bus.bind_publisher(LOCAL, "faps")
-    num_topics = MAX_TOPICS // MAX_TOPIC + 100
+    num_topics = MAX_TOPICS_BYTES // MAX_TOPIC_BYTES + 100
     with connect_raw(port_of(faps), "SUB") as subscriber:
         for number in range(num_topics):
-            topic = str(number).rjust(MAX_TOPIC, "x").encode()
+            topic = str(number).rjust(MAX_TOPIC_BYTES, "x").encode()
             subscriber.sendall(frame(b"\x01" + topic) + frame(b"\x00" + topic))
             time.sleep(0.001)
             list(faps.receive())
@@ -132,13 +136,13 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
     honest = bus.connect_subscriber(faps.endpoint)
     honest.subscribe(FapFrame, "s")
     with connect_raw(port_of(faps), "SUB") as hostile:
-        for number in range(MAX_TOPICS // MAX_TOPIC):
-            hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_TOPIC, "x").encode()))
+        for number in range(MAX_TOPICS_BYTES // MAX_TOPIC_BYTES):
+            hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_TOPIC_BYTES, "x").encode()))
         assert not is_soon_disconnected(hostile, faps, num_checks=20)
         hostile.sendall(frame(b"\x01x"))
         assert is_soon_disconnected(hostile, faps)
     with connect_raw(port_of(faps), "SUB") as hostile:
-        hostile.sendall(frame(b"\x01" + bytes(MAX_TOPIC + 1)))
+        hostile.sendall(frame(b"\x01" + bytes(MAX_TOPIC_BYTES + 1)))
         assert is_soon_disconnected(hostile, faps)
     frame_ = FapFrame(session="s", packed_values=b"\0" * 272, mask=b"\0" * 9)
     faps.send(frame_)
@@ -147,7 +151,7 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
 
 def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peer_quota, "MAX_CONNECTIONS", 4)
-    monkeypatch.setattr(connection_limits, "NEW_CHECKS", 10**6)
+    monkeypatch.setattr(connection_limits, "NUM_NEW_CHECKS", 10**6)
     monkeypatch.setattr(tarpit, "HOLD_S", 600.0)
     with contextlib.ExitStack() as stack:
         with Bus() as bus:

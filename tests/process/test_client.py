@@ -29,7 +29,7 @@ from kouxing_client import (
     thread,
 )
 from kouxing_client import client as blocking
-from kouxing_client.base import MAX_LIVE
+from kouxing_client.base import MAX_UNREAD_RESULTS
 from kouxing_client.messages import EndOfFaps, Event
 
 from kouxing.shared.settings.keys import add_key, load_user_key
@@ -268,7 +268,7 @@ def test_a_request_of_another_thread_fails_while_the_client_ends(
 
 
 def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeControl) -> None:
-    published = [frame(number) for number in range(1, 4 * MAX_LIVE)]
+    published = [frame(number) for number in range(1, 4 * MAX_UNREAD_RESULTS)]
 
     async def run() -> list[float]:
         async with AsyncClient(control.address, insecure=True) as client:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import aiohttp
 import pytest
-from kouxing_client.base import MAX_UNACKNOWLEDGED
+from kouxing_client.base import MAX_UNACKNOWLEDGED_MESSAGES
 from kouxing_client.messages import EndOfFaps
 
 from kouxing.shared.wire.control import SessionStarted
@@ -63,7 +63,7 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
     control: FakeControl, gateway: Gateway
 ) -> None:
     control.audio_endpoint = f"tcp://127.0.0.1:{free_port()}"  # not bound yet
-    num_chunks = MAX_UNACKNOWLEDGED + 100
+    num_chunks = MAX_UNACKNOWLEDGED_MESSAGES + 100
     last_pcm = b"\x02\x00" * 320
     async with open_websockets(gateway.page, "microphone") as (microphone,):
         await microphone.send_json({"sample_rate_hz": 16000})
@@ -74,16 +74,18 @@ async def test_dropped_audio_leaves_a_gap_in_media_time(
         # the gateway has then read all chunks
         await wait_until_async(lambda: control.messages_of(FlushSession))
         control.run_job(control.bind_audio)
-        await wait_until_async(lambda: len(control.audio_messages) == MAX_UNACKNOWLEDGED)
+        await wait_until_async(lambda: len(control.audio_messages) == MAX_UNACKNOWLEDGED_MESSAGES)
         await microphone.send_json({"skip": 320})
         await microphone.send_bytes(last_pcm)
-        await wait_until_async(lambda: len(control.audio_messages) > MAX_UNACKNOWLEDGED)
-    *queued, last = control.audio_messages[: MAX_UNACKNOWLEDGED + 1]
-    assert [chunk.media_time for chunk in queued] == [320 * n for n in range(MAX_UNACKNOWLEDGED)]
+        await wait_until_async(lambda: len(control.audio_messages) > MAX_UNACKNOWLEDGED_MESSAGES)
+    *queued, last = control.audio_messages[: MAX_UNACKNOWLEDGED_MESSAGES + 1]
+    assert [chunk.media_time for chunk in queued] == [
+        320 * n for n in range(MAX_UNACKNOWLEDGED_MESSAGES)
+    ]
     assert isinstance(last, AudioChunk)
     assert last.pcm == last_pcm
     assert last.media_time == 320 * (num_chunks + 1)
-    assert last.sequence == MAX_UNACKNOWLEDGED + 1
+    assert last.sequence == MAX_UNACKNOWLEDGED_MESSAGES + 1
 
 
 @async_test

@@ -7,10 +7,10 @@ from unittest import mock
 import pytest
 
 from kouxing.shared.network import connection_limits, kernel_sockets, peer_quota
-from kouxing.shared.network.bus import AUDIO
+from kouxing.shared.network.bus import AUDIO_LIMITS
 from kouxing.shared.network.connection_limits import (
-    NEW_CHECKS,
     NUM_ENDED_BEFORE_TRIM,
+    NUM_NEW_CHECKS,
     TRIMS_S,
     ConnectionLimiter,
 )
@@ -43,7 +43,7 @@ class SocketHarness:
         self.limiter = ConnectionLimiter(is_service=lambda key: key == "service")
         monitor = SimpleNamespace(getsockopt=lambda _option: 10**6)
         raw = SimpleNamespace(setsockopt=lambda *_: None, get_monitor_socket=lambda *_: monitor)
-        self.socket = self.limiter.limit(raw, AUDIO)  # type: ignore[arg-type]
+        self.socket = self.limiter.limit(raw, AUDIO_LIMITS)  # type: ignore[arg-type]
         self.socket.port = 5560
         self.socket.accepted = lambda: iter(())  # type: ignore[method-assign]
         self.enforce_limits = self.limiter.enforce_limits
@@ -105,7 +105,7 @@ def test_does_not_wake_the_loop_for_an_incomplete_message(harness: SocketHarness
 
 
 def test_sheds_the_owner_with_the_most_undelivered_bytes(harness: SocketHarness) -> None:
-    harness.patch.setattr(connection_limits, "MAX_UNDELIVERED", 700_000)
+    harness.patch.setattr(connection_limits, "MAX_UNDELIVERED_BYTES", 700_000)
     many = [harness.deliver(number, "many") for number in (1, 2, 3)]
     single = harness.deliver(4, "single")
     harness.enforce_limits(0.0)
@@ -117,7 +117,7 @@ def test_sheds_the_owner_with_the_most_undelivered_bytes(harness: SocketHarness)
 
 
 def test_peers_that_read_too_little_are_disconnected(harness: SocketHarness) -> None:
-    harness.patch.setattr(connection_limits, "MAX_UNREAD", 3 * MAX_QUEUED)
+    harness.patch.setattr(connection_limits, "MAX_UNREAD_MESSAGES", 3 * MAX_QUEUED)
     silent = [harness.deliver(number, "silent") for number in range(1, 5)]
     other = harness.deliver(5, "other")
     harness.enforce_limits(0.0)
@@ -186,10 +186,10 @@ def test_an_idle_surplus_peer_can_reconnect_at_once(harness: SocketHarness) -> N
     harness.addresses = {number: f"10.0.0.{number}" for number in range(20)}
     for number in range(10):
         harness.limiter.find(number, harness.socket)
-    for look in range(NEW_CHECKS):
+    for look in range(NUM_NEW_CHECKS):
         harness.enforce_limits(float(look))
     harness.deliver(10, "talker")
-    harness.enforce_limits(float(NEW_CHECKS))
+    harness.enforce_limits(float(NUM_NEW_CHECKS))
     assert harness.ended == {0}
     assert not harness.held
 

@@ -35,7 +35,7 @@ def spoken_phones(num_phones: int, num_frames: int) -> tuple[UtteranceGraph, np.
 def test_a_band_finds_the_same_path_past_a_long_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, scores, _ = spoken_phones(num_phones=600, num_frames=6000)
     path, likelihood = viterbi_path(scores, graph.states, graph, HALF, HALF)
-    monkeypatch.setattr(forced_path, "MAX_BAND", 600)  # of 5400 nodes
+    monkeypatch.setattr(forced_path, "MAX_BAND_NODES", 600)  # of 5400 nodes
     in_band, likelihood_in_band = viterbi_path(scores, graph.states, graph, HALF, HALF)
     np.testing.assert_array_equal(in_band, path)
     assert likelihood_in_band == likelihood
@@ -43,7 +43,7 @@ def test_a_band_finds_the_same_path_past_a_long_pause(monkeypatch: pytest.Monkey
 
 def test_a_band_reaches_the_end_of_a_text_that_is_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, scores, _ = spoken_phones(num_phones=600, num_frames=4000)
-    monkeypatch.setattr(forced_path, "MAX_BAND", 600)
+    monkeypatch.setattr(forced_path, "MAX_BAND_NODES", 600)
     for num_frames in (1800, 1900, 2500):  # 3 for each phone are needed
         path, _ = viterbi_path(scores[:num_frames], graph.states, graph, HALF, HALF)
         assert len(path) == num_frames

@@ -152,7 +152,7 @@ def test_the_warp_moves_formants_up_by_its_factor() -> None:
     assert center_hz(int(peak)) / center_hz(20) == pytest.approx(vtln.factor, rel=0.05)
 
 
-RATE_HZ, SLICE = 16_000, 320
+RATE_HZ, SLICE_SAMPLES = 16_000, 320
 
 
 def sung(frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -164,7 +164,7 @@ def sung(frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
 
 def pitches(samples: NDArray[np.float32], num_before: int = 0) -> NDArray[np.float64]:
     pitch = PitchTracker(num_before)
-    return np.array([pitch.track(part) for part in samples.reshape(-1, SLICE)])
+    return np.array([pitch.track(part) for part in samples.reshape(-1, SLICE_SAMPLES)])
 
 
 def noise(num_samples: int) -> NDArray[np.float32]:
@@ -189,5 +189,5 @@ def test_tracks_a_rising_pitch_but_not_noise_or_silence() -> None:
 
 def test_a_tracker_that_starts_later_soon_agrees() -> None:
     samples = sung(np.linspace(150.0, 250.0, 4 * RATE_HZ)) + noise(4 * RATE_HZ)
-    expected, later = pitches(samples), pitches(samples[70 * SLICE :], num_before=70)
+    expected, later = pitches(samples), pitches(samples[70 * SLICE_SAMPLES :], num_before=70)
     np.testing.assert_array_equal(later[80:], expected[150:])

@@ -132,7 +132,7 @@ AT_16_KHZ = {"sample_rate_hz": 16000}
         (parse_command, {"lip_model": 1}, "lip_model is 1; it must be dynamic-visemes or "),
         *(
             (parse_command, {"skip": n}, "skip must be an integer")
-            for n in (-1, 1.5, True, browser_messages.MAX_SKIPPED + 1)
+            for n in (-1, 1.5, True, browser_messages.MAX_SKIPPED_SAMPLES + 1)
         ),
         (parse_face_settings, {"expressions": {"glee": 0.5}}, "glee"),
         (parse_face_settings, {"expressions": {"joy": 2}}, "joy: strength 2"),

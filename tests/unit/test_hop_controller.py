@@ -4,7 +4,7 @@ import pytest
 
 from kouxing.services.recognizer.sessions.hop_controller import (
     HOP_PERIOD_S,
-    MAX_HOP,
+    MAX_HOP_BLOCKS,
     RESTORE_AFTER_S,
     HopController,
     ProcessorTime,
@@ -76,5 +76,5 @@ def test_the_network_runs_less_often_while_a_session_is_behind() -> None:
     recognizer = Recognizer()
     hops = recognizer.run(5.0, others=0.1, network=0.1, is_behind=True)
     assert hops[0] == 1
-    assert hops[-1] == MAX_HOP
+    assert hops[-1] == MAX_HOP_BLOCKS
     assert recognizer.run(2 * RESTORE_AFTER_S, others=0.1, network=0.1)[-1] == 1

@@ -14,7 +14,7 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live.live_decoder import StreamOutput
 from kouxing.services.recognizer.live.recognizer import Recognizer
-from kouxing.services.recognizer.live.stream import MAX_JITTER
+from kouxing.services.recognizer.live.stream import MAX_JITTER_SAMPLES
 from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.recognizer.search import frame_search, path_records
 from kouxing.shared.phones.events import (
@@ -73,7 +73,7 @@ def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
 def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
     alone = of_kind(Phone, recognize_live(model(), SAMPLES))
     stream = LiveStream(model(), **FACE)
-    gap = len(SAMPLES) + MAX_JITTER + 1
+    gap = len(SAMPLES) + MAX_JITTER_SAMPLES + 1
     stream.stream.accept_waveform(SAMPLES, 0)
     outputs = stream.feed(SAMPLES, gap) + stream.finish()
     assert stream.stream.num_gaps == 1
@@ -131,7 +131,9 @@ def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
 
 def test_jitter_is_not_a_gap() -> None:
     stream = LiveStream(model())
-    outputs = stream.feed(SAMPLES[:8000], 0) + stream.feed(SAMPLES[8000:], 8000 + MAX_JITTER)
+    outputs = stream.feed(SAMPLES[:8000], 0) + stream.feed(
+        SAMPLES[8000:], 8000 + MAX_JITTER_SAMPLES
+    )
     assert stream.stream.num_gaps == 0
     expected = recognize_live(model(), SAMPLES)
     assert messages_of(outputs + stream.finish()) == messages_of(expected)
@@ -253,7 +255,7 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
     stream.decode_early()
     stream.hand_over_speech()
     assert stream.can_accept_while_scoring(begin)
-    assert not stream.can_accept_while_scoring(begin + MAX_JITTER + 1)
+    assert not stream.can_accept_while_scoring(begin + MAX_JITTER_SAMPLES + 1)
     stream.take_back_speech()
     assert not stream.can_accept_while_scoring(begin)
 

@@ -39,7 +39,7 @@ export class LipEngine {
     const strength = inRange("feeling", feeling ?? defaults.feeling, 0, 1);
     this.#model = model;
     this.#rateHz = sampleRateHz;
-    this.#slice = new Float32Array(constants.pcm.SLICE);
+    this.#slice = new Float32Array(constants.pcm.SLICE_SAMPLES);
     this.#resampler = new Resampler(sampleRateHz, model);
     this.#segmenter = new SpeechSegmenter(model, delayS, recognizerFor(model));
     this.#face = new Face(model, { delayS, expressiveness: amount, feeling: strength });

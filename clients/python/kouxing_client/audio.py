@@ -20,13 +20,13 @@ _EXPECTED = "audio must be 16-bit integers (array type int16), or floats within 
 MAX_FLOAT = 8.0  # smaller values beyond 1 are clipped
 # Audio before the newest acknowledgement that is kept in case another recognizer needs it
 RESEND_S = 10.0
-MAX_KEPT = 5000  # messages
+MAX_KEPT_MESSAGES = 5000
 # Shortest and longest wait for an acknowledgement before reconnecting
 ANSWER_LIMITS_S = (0.6, 10.0)
 UNPACED_ANSWER_S = 5.0  # shortest wait if audio arrives faster than real time and may queue
 MIN_CONNECT_MS = 50  # shortest limit for making a connection
 QUICK_ANSWER_S = 2.5  # up to this wait, the round trip measured before limits a new connection
-MAX_TIMED = 200  # messages whose send time is remembered
+MAX_TIMED_MESSAGES = 200  # messages whose send time is remembered
 
 
 def check_channels(audio: Any, num_channels: int) -> None:
@@ -119,9 +119,10 @@ class AudioStream:
         self.round_trip_ms: int | None = None  # twice the shortest time to an acknowledgement
         self._sample_rate_hz = sample_rate_hz
         self._num_samples = 0  # in all chunks
-        self._kept: deque[Fields] = deque(maxlen=MAX_KEPT)
+        self._kept: deque[Fields] = deque(maxlen=MAX_KEPT_MESSAGES)
         self._next = 1  # number of the next message for the socket
-        self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED)  # sequence and time
+        # sequence and time
+        self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED_MESSAGES)
         self._progress_s = 0.0  # time of the last acknowledgement, or of the first open message
         self._min_answer_s = ANSWER_LIMITS_S[0] if is_paced else UNPACED_ANSWER_S
         self._answer_s = self._min_answer_s  # how long to wait before reconnecting
@@ -205,5 +206,5 @@ class AudioStream:
     def flush(self) -> None:
         """Forget all audio: none of it is sent, or sent again."""
         self._kept = deque(
-            (message for message in self._kept if "last" in message), maxlen=MAX_KEPT
+            (message for message in self._kept if "last" in message), maxlen=MAX_KEPT_MESSAGES
         )

@@ -19,9 +19,9 @@ from kouxing_client.thread import ClientThread
 
 CONTROL = "tcp://127.0.0.1:5550"
 CHUNK_BYTES = 32_000  # largest chunk in one message
-MAX_LIVE = 100  # unread results of a live session
-MAX_EVENTS = 1000  # unread events of a session
-MAX_UNACKNOWLEDGED = 500  # messages; then the sender waits
+MAX_UNREAD_RESULTS = 100  # of a live session
+MAX_UNREAD_EVENTS = 1000  # of a session
+MAX_UNACKNOWLEDGED_MESSAGES = 500  # then the sender waits
 LAST_ANSWER_S = 2.0  # limit for delivering the end of the audio before a session closes
 
 
@@ -241,7 +241,7 @@ class BaseSession:
         """
         check_results(classes, shape_set)
         thread, core = self._thread, self._core
-        inbox = Inbox(MAX_LIVE if core.is_live and not keep_all else None)
+        inbox = Inbox(MAX_UNREAD_RESULTS if core.is_live and not keep_all else None)
         subscription = Subscription(core, classes, shape_set, inbox, on_result)
         thread.call(lambda: core.subscribe(subscription))
         inbox.errors = core.errors
@@ -266,7 +266,7 @@ class BaseSession:
     def _subscribe_events(self) -> tuple[Inbox, Callable[[], None]]:
         """Return an inbox, and the function that closes it."""
         thread, core = self._thread, self._thread.core
-        inbox = Inbox(MAX_EVENTS)
+        inbox = Inbox(MAX_UNREAD_EVENTS)
         thread.call(lambda: core.add_inbox(self._core, inbox))
         return inbox, lambda: thread.call(lambda: core.remove_inbox(self._core, inbox))
 
@@ -285,7 +285,7 @@ class BaseSession:
             raise self._core.failure or KouxingError("the session is closed")
 
     def _has_room(self) -> bool:
-        return self._num_unacknowledged() < MAX_UNACKNOWLEDGED
+        return self._num_unacknowledged() < MAX_UNACKNOWLEDGED_MESSAGES
 
     def _can_push(self) -> bool:
         return self._core.is_over or bool(self._core.errors) or self._has_room()

@@ -35,7 +35,7 @@ RESUBSCRIBE_S = 1.0  # how long audio waits until subscriptions are in effect ag
 MOVE_TIMEOUT_S = 5.0  # limit for the move of a session whose recognizer is lost
 END_TIMEOUT_S = 5.0  # maximum wait for the last phones after the last frame
 LAST_RESULTS_WAIT_S = 0.5  # wait for the last results of a session that control has closed
-AUDIO_QUEUE = 500  # messages
+AUDIO_QUEUE_MESSAGES = 500
 SILENT_S = 2.0  # without results for this time, a session may have moved or ended
 
 
@@ -222,7 +222,7 @@ class SessionCore:
         if self._audio is not None:
             self.sockets.close_connection(self._audio)
         audio = self.endpoints["audio"]
-        self._audio = self.sockets.connect(audio, self._on_answer, queue=AUDIO_QUEUE)
+        self._audio = self.sockets.connect(audio, self._on_answer, queue=AUDIO_QUEUE_MESSAGES)
 
     def add_audio(self, num_samples: int, fields: Fields) -> None:
         """Send a chunk of ``num_samples`` samples per channel."""

@@ -17,8 +17,8 @@ from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
 from kouxing_client.messages import Decoders, Message, topic
 
-QUEUE = 20_000  # messages: a subscriber to a recording may pause for 400 s
-LIVE_BUFFER = 65_536  # bytes in the kernel: some seconds of FAP frames, over any distance
+QUEUE_MESSAGES = 20_000  # a subscriber to a recording may pause for 400 s
+LIVE_BUFFER_BYTES = 65_536  # in the kernel: some seconds of FAP frames, over any distance
 RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to connect
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
@@ -124,7 +124,7 @@ class Sockets:
         endpoint: str,
         on_message: Callable[[list[bytes]], None],
         *,
-        queue: int = QUEUE,
+        queue: int = QUEUE_MESSAGES,
         on_refused: Callable[[bool], None] | None = None,
     ) -> Connection:
         """Connect to a ROUTER socket, whose public key may follow its address after a space.
@@ -159,10 +159,10 @@ class Sockets:
             if (message := decoders.decode(parts)) is not None:
                 on_message(message)
 
-        raw = self._open(zmq.SUB, QUEUE, decode)
+        raw = self._open(zmq.SUB, QUEUE_MESSAGES, decode)
         for endpoint in sorted(addresses):
             self._connect(raw, endpoint)
-        raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER)
+        raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER_BYTES)
         for endpoint in sorted(live_addresses):
             self._connect(raw, endpoint)
         self.set_topics(raw, [topic(cls.kind, session) for cls in classes], on=True)
@@ -172,7 +172,7 @@ class Sockets:
         self, endpoint: str, on_message: Callable[[list[bytes]], None]
     ) -> Connection:
         """Connect to the socket where control publishes events."""
-        raw = self._open(zmq.SUB, QUEUE, on_message)
+        raw = self._open(zmq.SUB, QUEUE_MESSAGES, on_message)
         self._connect(raw, endpoint)
         return raw
 

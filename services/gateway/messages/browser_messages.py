@@ -37,7 +37,7 @@ REST_TYPE = 3  # payload as for FAP_TYPE: the face while no session moves it
 SHAPES_TYPE = 4  # payload: float32 weights of a shape set, for a frame
 REST_SHAPES_TYPE = 5  # payload: float32 weights of a shape set, for the face at rest
 
-MAX_SKIPPED = 600 * MAX_RATE_HZ  # samples; 10 minutes
+MAX_SKIPPED_SAMPLES = 600 * MAX_RATE_HZ  # 10 minutes
 MAX_SHOWN = 40  # characters of a client's text in an error
 # The face settings that a browser can change; the query of its address selects shapes.
 FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
@@ -91,7 +91,7 @@ class MicrophoneCommand(Struct, frozen=True, kw_only=True):
 
     flush: Any = False  # whether to drop audio whose face is not shown yet
     last: Any = False  # whether no more audio follows
-    skip: Annotated[int, Meta(ge=0, le=MAX_SKIPPED)] = 0  # samples that the client skipped
+    skip: Annotated[int, Meta(ge=0, le=MAX_SKIPPED_SAMPLES)] = 0  # samples that the client skipped
     face: dict[str, Any]  # settings to change
     problem: str = ""  # error about unknown fields, which are ignored
 

@@ -25,7 +25,7 @@ from kouxing.shared.errors import UserError
 
 CONNECT_TIMEOUT_S = 20.0  # limit from the answer to the first sound
 MAX_CONCEALED_SAMPLES = 14_400  # lost samples that are concealed, so that speech continues
-MAX_GAP = 600 * 48_000  # samples; after a longer gap, forward or back, timestamps restart
+MAX_GAP_SAMPLES = 600 * 48_000  # after a longer gap, forward or back, timestamps restart
 _TIMESTAMP_RANGE = 2**32  # RTP timestamps wrap around at this value
 _OPUS = RTCRtpCodecCapability("audio/opus", 48_000, 2)
 _OPUS_LINE = re.compile(r"^a=rtpmap:\d+ opus/48000/2\s*$", re.IGNORECASE | re.MULTILINE)
@@ -115,14 +115,14 @@ class WebRtcPeer:
             if not isinstance(frame, AudioFrame) or frame.pts is None:
                 continue
             lost = 0 if expected is None else (frame.pts - expected) % _TIMESTAMP_RANGE
-            if lost > _TIMESTAMP_RANGE - MAX_GAP:  # the packet is late
+            if lost > _TIMESTAMP_RANGE - MAX_GAP_SAMPLES:  # the packet is late
                 continue
             expected = frame.pts + frame.samples
             if 0 < lost <= MAX_CONCEALED_SAMPLES:
                 yield 0, self._fade_out(pcm, lost), lost
                 lost = 0
             pcm = bytes(frame.planes[0])[: frame.samples * self.num_channels * 2]
-            yield lost if lost <= MAX_GAP else 0, pcm, frame.samples
+            yield lost if lost <= MAX_GAP_SAMPLES else 0, pcm, frame.samples
 
     def _fade_out(self, pcm: bytes, num_samples: int) -> bytes:
         """Return PCM repeated to a number of samples, each repetition half as loud."""

@@ -10,14 +10,14 @@ from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.phones.events import Progress
 
-SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
+SLICE_SAMPLES = 320  # at 16 kHz: 20 ms, one FAP frame
 
 
 def split_slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
     """Split samples, (n,), at multiples of 20 ms of the stream; ``num_before`` samples precede."""
     begin = 0
     while begin < len(samples):
-        end = begin + SLICE - (num_before + begin) % SLICE
+        end = begin + SLICE_SAMPLES - (num_before + begin) % SLICE_SAMPLES
         yield samples[begin:end]
         begin = end
 
@@ -52,7 +52,7 @@ class SliceMeter:
         self.media_time = start  # end of the audio so far
         self._start = start
         self._chunks: list[NDArray[np.float32]] = []  # audio of the incomplete slice
-        self._pitch = PitchTracker(start // SLICE)
+        self._pitch = PitchTracker(start // SLICE_SAMPLES)
 
     def accept_waveform(
         self, samples: NDArray[np.float32]
@@ -61,7 +61,7 @@ class SliceMeter:
         for chunk in split_slices(samples, self.media_time - self._start):
             self.media_time += len(chunk)
             self._chunks.append(chunk)
-            if (self.media_time - self._start) % SLICE:
+            if (self.media_time - self._start) % SLICE_SAMPLES:
                 yield chunk, None
                 continue
             newest = np.concatenate(self._chunks)

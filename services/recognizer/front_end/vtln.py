@@ -69,12 +69,13 @@ _DECIMATION = 4
 _RATE_HZ = SAMPLE_RATE_HZ / _DECIMATION
 _CUTOFF_HZ = 900.0
 _NUM_TAPS = 49
-_WINDOW = 80  # samples at 4 kHz from here on
-_MIN_LAG = 10
-_MAX_LAG = 58
-_SPAN = _WINDOW + _MAX_LAG
-_HOP = round(HOP_S * _RATE_HZ)
-_FRAME = round(WINDOW_S * _RATE_HZ)
+# all at 4 kHz
+_WINDOW_SAMPLES = 80
+_MIN_LAG_SAMPLES = 10
+_MAX_LAG_SAMPLES = 58
+_SPAN_SAMPLES = _WINDOW_SAMPLES + _MAX_LAG_SAMPLES
+_HOP_SAMPLES = round(HOP_S * _RATE_HZ)
+_FRAME_SAMPLES = round(WINDOW_S * _RATE_HZ)
 _ENERGY_FLOOR = 1e-9  # squared energy: below -60 dB of full scale, the strength approaches 0
 _PEAK_RATIO = 0.88  # relative to the highest; the first peak above it is the period, not a multiple
 
@@ -109,7 +110,7 @@ class NccfPitchTracker:
     def __init__(self) -> None:
         # The zeros before the first sample make frame 0 end at its last sample.
         self._samples = np.zeros(_NUM_TAPS - _DECIMATION, dtype=np.float32)
-        self._low = np.zeros(_SPAN - _FRAME)
+        self._low = np.zeros(_SPAN_SAMPLES - _FRAME_SAMPLES)
 
     def accept_waveform(
         self, samples: NDArray[np.float32]
@@ -124,11 +125,11 @@ class NccfPitchTracker:
         _low_pass(self._samples, _TAPS, low)
         self._samples = self._samples[_DECIMATION * len(low) :]
         self._low = np.concatenate([self._low, low])
-        num_ready = max(0, (len(self._low) - _SPAN) // _HOP + 1)
+        num_ready = max(0, (len(self._low) - _SPAN_SAMPLES) // _HOP_SAMPLES + 1)
         pitch_hz = np.empty(num_ready, dtype=np.float32)
         strength = np.empty(num_ready, dtype=np.float32)
         _track(self._low, pitch_hz, strength)
-        self._low = self._low[_HOP * num_ready :]
+        self._low = self._low[_HOP_SAMPLES * num_ready :]
         return pitch_hz, strength
 
 
@@ -196,7 +197,7 @@ def _track(
     low: NDArray[np.float64], pitch_hz: NDArray[np.float32], strength: NDArray[np.float32]
 ) -> None:
     for frame in range(len(pitch_hz)):
-        phi = _correlation(low[_HOP * frame : _HOP * frame + _SPAN])
+        phi = _correlation(low[_HOP_SAMPLES * frame : _HOP_SAMPLES * frame + _SPAN_SAMPLES])
         lag, peak = _period(phi)
         pitch_hz[frame] = np.float32(_RATE_HZ / lag if lag > 0.0 else 0.0)
         strength[frame] = np.float32(peak)
@@ -205,15 +206,15 @@ def _track(
 @numba.njit(cache=True, nogil=True)
 def _correlation(low: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the normalized cross-correlation (Talkin 1995) of the last window at each lag."""
-    num_lags = _MAX_LAG - _MIN_LAG + 1
+    num_lags = _MAX_LAG_SAMPLES - _MIN_LAG_SAMPLES + 1
     low = low - low.mean()  # an offset would look like a pitch
     product = np.zeros(num_lags)
     energy_before = np.zeros(num_lags)
     energy = 0.0
-    for now in range(_MAX_LAG, _SPAN):
+    for now in range(_MAX_LAG_SAMPLES, _SPAN_SAMPLES):
         energy += low[now] * low[now]
         for k in range(num_lags):
-            before = low[now - _MIN_LAG - k]
+            before = low[now - _MIN_LAG_SAMPLES - k]
             product[k] += low[now] * before
             energy_before[k] += before * before
     return product / np.sqrt(energy * energy_before + _ENERGY_FLOOR)
@@ -228,7 +229,7 @@ def _period(phi: NDArray[np.float64]) -> tuple[float, float]:
         if middle >= threshold and middle >= left and middle >= right and middle > 0.0:
             bend = left - 2.0 * middle + right
             offset = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-            return _MIN_LAG + k + offset, middle
+            return _MIN_LAG_SAMPLES + k + offset, middle
     return 0.0, 0.0
 
 

@@ -30,16 +30,16 @@ from kouxing.shared.phones.events import (
     Waveform,
 )
 
-MAX_JITTER = MEDIA_RATE_HZ // 10  # a larger jump of the media time is a gap; samples
+MAX_JITTER_SAMPLES = MEDIA_RATE_HZ // 10  # a larger jump of the media time is a gap
 SILENT_DB = -120.0  # the level after the last sample
 
 
 class SpeechStream:
     """One session's audio and its results; created by ``Recognizer.create_stream``.
 
-    A chunk carries the media time of its first sample. If a chunk starts more than ``MAX_JITTER``
-    after the end of the previous one, there is a gap: the speech before it ends, and recognition
-    starts again after it.
+    A chunk carries the media time of its first sample. If a chunk starts more than
+    ``MAX_JITTER_SAMPLES`` after the end of the previous one, there is a gap: the speech before it
+    ends, and recognition starts again after it.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class SpeechStream:
         return results
 
     def _is_gap_before(self, media_time: int) -> bool:
-        return media_time > self.next_media_time + MAX_JITTER
+        return media_time > self.next_media_time + MAX_JITTER_SAMPLES
 
     def _renumber(self, phone: Phone, segment: _AudioSegment) -> Phone:
         """Continue the phone indices of the previous segments."""

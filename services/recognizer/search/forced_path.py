@@ -23,7 +23,7 @@ _BlockInputs: TypeAlias = tuple[
     NDArray[np.float64],
     NDArray[np.float64],
 ]
-MAX_BAND = 2**15  # nodes: 14 minutes of fluent speech
+MAX_BAND_NODES = 2**15  # 14 minutes of fluent speech
 
 
 @dataclass(slots=True, kw_only=True)
@@ -114,7 +114,7 @@ def viterbi_path(
 
     Memory grows with the square root of the number of frames: only some rows of scores are kept,
     and each block between two of them is computed again to trace the path (Hirschberg 1975). A
-    graph of more than ``MAX_BAND`` nodes is searched in a band around the best node.
+    graph of more than ``MAX_BAND_NODES`` nodes is searched in a band around the best node.
     """
     num_frames, num_nodes = len(scores), len(graph.states)
     num_needed = graph.num_needed
@@ -124,7 +124,7 @@ def viterbi_path(
     leave = log_leave[graph.states].astype(np.float64)
     skip = np.where(graph.skip_from >= 0, leave[graph.skip_from], -np.inf)
     num_skipped = graph.num_last + 1
-    width = min(num_nodes, MAX_BAND)
+    width = min(num_nodes, MAX_BAND_NODES)
     first = np.full(width, -np.inf)
     num_first = int((graph.phone_number == 0).sum())
     for node in (0, num_first):  # the first pause is optional

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MAX_HOP = 6  # blocks; 240 ms
-MAX_LOAD = 0.6  # cores of a recognizer; above it, the network runs less often
-RESTORE_LOAD = 0.5  # expected load at which the network runs more often again
-RESTORE_AFTER_S = 5.0  # time for which the expected load must be below ``RESTORE_LOAD``
+MAX_HOP_BLOCKS = 6  # 240 ms
+MAX_LOAD_CORES = 0.6  # of a recognizer; above it, the network runs less often
+RESTORE_LOAD_CORES = 0.5  # expected load at which the network runs more often again
+RESTORE_AFTER_S = 5.0  # time for which the expected load must be below ``RESTORE_LOAD_CORES``
 HOP_PERIOD_S = 0.5  # the load is measured over this time
 
 
@@ -61,9 +61,9 @@ class HopController:
         newest = work - self._before
         self._since_s, self._before = now_s, work
         network, others = self.hop * newest.network_s / passed_s, newest.other_s / passed_s
-        hop = min(self.hop + self._is_behind, MAX_HOP)
-        self.hop = max(hop, _shortest_hop(network, others, MAX_LOAD))
-        needed = self.hop if self._is_behind else _shortest_hop(network, others, RESTORE_LOAD)
+        hop = min(self.hop + self._is_behind, MAX_HOP_BLOCKS)
+        self.hop = max(hop, _shortest_hop(network, others, MAX_LOAD_CORES))
+        needed = self.hop if self._is_behind else _shortest_hop(network, others, RESTORE_LOAD_CORES)
         self._is_behind = False
         self._needed = max(self._needed, needed)
         if needed >= self.hop:
@@ -78,5 +78,5 @@ def _shortest_hop(network: float, others: float, max_load: float) -> int:
 
     ``network`` is the load of the network at hop 1; ``others`` is the rest.
     """
-    hops = range(1, MAX_HOP)
-    return next((hop for hop in hops if network / hop + others <= max_load), MAX_HOP)
+    hops = range(1, MAX_HOP_BLOCKS)
+    return next((hop for hop in hops if network / hop + others <= max_load), MAX_HOP_BLOCKS)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence, Sized
 from kouxing.services.recognizer.acoustic.blocks import BlockRunner
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.sessions.hop_controller import (
-    MAX_HOP,
+    MAX_HOP_BLOCKS,
     HopController,
     ProcessorTime,
 )
@@ -72,7 +72,7 @@ class LiveBatchDecoder:
         are sent before it finishes. Otherwise, their later audio waits in the queue.
         """
         # Under load, the network runs at the longest hop, and on another core.
-        network_weight = NETWORK_WEIGHT * self._hop_controller.hop / MAX_HOP
+        network_weight = NETWORK_WEIGHT * self._hop_controller.hop / MAX_HOP_BLOCKS
         if decoded := self._network.take_decoded():
             self._load_meter.add(network_weight * self._network.batch_s)
             # speech that the encoder found during the run; sessions with more audio follow below

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import TypeAlias
 
 import numpy as np
-from kouxing_client.audio import MAX_KEPT
+from kouxing_client.audio import MAX_KEPT_MESSAGES
 from kouxing_client.messages import Message
 from numpy.typing import NDArray
 
@@ -42,7 +42,7 @@ class ReplayWindow:
         self.last_droppable_sequence = 0  # last message that a replacement can do without
         self._final = FinalTimeTracker()  # final time of the messages that the synthesizer has
         # (sequence, end) of each message
-        self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_KEPT)
+        self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_KEPT_MESSAGES)
 
     def add(self, sequence: int, end: int) -> None:
         """Add an audio message that ends at a media time in samples."""
