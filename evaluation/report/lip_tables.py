@@ -233,9 +233,9 @@ def disturbed_lips(faces: Figures) -> list[str]:
     return sentences
 
 
-def lookahead_table(faces: Figures) -> Table:
+def delay_table(faces: Figures) -> Table:
     """Return the correlation of the opening and the F1 of closures by delay."""
-    curves = lookahead_curves(faces)
+    curves = delay_curves(faces)
     delays = sorted({delay for points in curves.values() for delay in points})
     rows = []
     for lips, points in curves.items():
@@ -246,12 +246,12 @@ def lookahead_table(faces: Figures) -> Table:
     return Table(("lip model", *(f"{delay} ms" for delay in delays)), rows)
 
 
-def display_floor_ms(look_ahead_ms: int) -> int:
+def display_floor_ms(delay_ms: int) -> int:
     """Return the minimum time from a sound to its image: delay, frame and display tick."""
-    return look_ahead_ms + _FRAME_MS + _TICK_MS
+    return delay_ms + _FRAME_MS + _TICK_MS
 
 
-def lookahead_curves(faces: Figures) -> dict[str, dict[int, dict[str, Any]]]:
+def delay_curves(faces: Figures) -> dict[str, dict[int, dict[str, Any]]]:
     """Return the scores of all clips by lip model and delay, ms."""
     curves: dict[str, dict[int, dict[str, Any]]] = {}
     for face, groups in _clean_scores(faces).items():

@@ -33,13 +33,13 @@ TABLES = {
     ),
     "agreement": ReportTable(("rivals",), lip_tables.agreement_table),
     "closures": ReportTable(("rivals",), lip_tables.closures_table),
-    "lookahead": ReportTable(("lookahead",), lip_tables.lookahead_table),
+    "delay": ReportTable(("delay",), lip_tables.delay_table),
     "motion": ReportTable(("rivals",), lip_tables.motion_table),
     "schemes": ReportTable(("schemes", "schemes-paper-rule"), paper_tables.report_schemes),
     "visemes": ReportTable(("visemes",), paper_tables.viseme_fit_table),
     "ferguson": ReportTable(("ferguson",), paper_tables.ferguson_table),
     "system": ReportTable(
-        ("chain", "load", "busy", "browser", "package", "sizes"), system_tables.system_table
+        ("latency", "load", "busy", "browser", "package", "sizes"), system_tables.system_table
     ),
     "faults": ReportTable(("faults",), system_tables.faults_table),
 }
@@ -67,8 +67,8 @@ def write_page(folder: Path, page: Path) -> None:
     text = _TEMPLATE.read_text("utf-8").replace("[[better]]\n", bullets(lines or ["In no measure"]))
     parts = re.sub(r"\[\[(\w+)\]\]\n", lambda match: _render_table(match[1], steps, results), text)
     page.write_text(parts, encoding="utf-8")
-    if "lookahead" in results:
-        save_figure(_lookahead_figure(results["lookahead"]), page.with_name(PICTURE))
+    if "delay" in results:
+        save_figure(_delay_figure(results["delay"]), page.with_name(PICTURE))
 
 
 def markdown(table: Table) -> str:
@@ -103,11 +103,11 @@ def _describe_measurement(step: Figures) -> str:
     return f"`{commands}`: {measured}, {step['seconds']} s{cpu}, load {step['load']:.1f}"
 
 
-def _lookahead_figure(faces: Figures) -> Any:
+def _delay_figure(faces: Figures) -> Any:
     figure = new_figure(9.0, 3.6)
     axes = figure.subplots(1, 2, sharex=True)
     titles = {"r_opening": "correlation of the opening", "closure_f1": "F1 of closures"}
-    for lips, points in lip_tables.lookahead_curves(faces).items():
+    for lips, points in lip_tables.delay_curves(faces).items():
         for axis, (measure, title) in zip(axes, titles.items(), strict=True):
             delays = sorted(points)
             axis.plot(delays, [points[delay][measure] for delay in delays], "o-", label=lips)

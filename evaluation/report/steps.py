@@ -91,7 +91,7 @@ STEPS: Mapping[str, Step] = {
         _LIP_SCORES_CODE,
         (_LIP_SCORES + " --condition clean",),
     ),
-    "lookahead": Step(
+    "delay": Step(
         (f"{_LIP_SCORES} --condition clean {_DELAYS}",),
         _LIP_SCORES_CODE,
         (),
@@ -116,7 +116,7 @@ STEPS: Mapping[str, Step] = {
     "ferguson": Step(
         ("evaluate ferguson --clips {lips}",), ("evaluation/lips/speaking_rates.py", *_FACES), ()
     ),
-    "chain": Step(
+    "latency": Step(
         (f"bench latency {SAMPLE.relative_to(ROOT)}",),
         (
             *(f"evaluation/system/{name}.py" for name in ("latency", "costs", "page")),

@@ -7,7 +7,7 @@ from kouxing.evaluation.tables import Figures, Table, format_number, join_values
 from kouxing.services.recognizer.sessions.hop_controller import MAX_HOP_BLOCKS
 from kouxing.shared.face.faps import NUM_FAPS
 
-_LOOK_AHEAD_MS, _FRAME_MS = 60, 20
+_DELAY_MS, _FRAME_MS = 60, 20
 _FRAME_BYTES, _FRAMES_PER_S = 4 * NUM_FAPS, 50
 _WEB_MODELS = ("encoder", "lips", "traits", "phone_lm")  # of kouxing-lips
 
@@ -20,7 +20,7 @@ _PACKAGE_FIGURES = {  # lower is better: name, scale and unit
 
 
 def system_table(
-    chain: Figures | None = None,
+    latency: Figures | None = None,
     load: Figures | None = None,
     busy: Figures | None = None,
     browser: Figures | None = None,
@@ -29,7 +29,7 @@ def system_table(
 ) -> Table:
     """Return each figure of the measured steps with its physical floor."""
     steps = (
-        (chain, _chain_rows),
+        (latency, _latency_rows),
         (load, _load_rows),
         (busy, _busy_rows),
         (browser, _browser_rows),
@@ -44,34 +44,34 @@ def _row(figure: str, value: str, floor: str = "", source: str = "") -> list[str
     return [figure, value, floor, source]
 
 
-def _chain_rows(chain: Figures, sizes: Figures) -> Iterator[list[str]]:
+def _latency_rows(latency: Figures, sizes: Figures) -> Iterator[list[str]]:
     floor_cores = sizes.get("floor_cores", {}).get("hop 1")
     yield _row(
         "end of a chunk to its frame, p50 / p95, ms",
-        _format_percentiles(chain["chunk_to_frame_ms"]),
+        _format_percentiles(latency["chunk_to_frame_ms"]),
         "0",
         "computation",
     )
     yield _row(
         "sound to its frame, p50 / p95, ms",
-        _format_percentiles(chain["sound_to_frame_ms"]),
-        str(_LOOK_AHEAD_MS),
+        _format_percentiles(latency["sound_to_frame_ms"]),
+        str(_DELAY_MS),
         "delay of the face",
     )
     yield _row(
         "processor time of all services, s per s of audio",
-        format_number(sum(chain["cpu_s_per_audio_s"].values())),
+        format_number(sum(latency["cpu_s_per_audio_s"].values())),
         format_number(floor_cores),
         "operations of the networks / rate of the matrix product",
     )
-    for name, drawing in chain["page"]["drawings"].items():
+    for name, drawing in latency["page"]["drawings"].items():
         title = f"page in headless Chromium, {name}, images per s"
         yield _row(title, f"{drawing['pictures_per_s']:.0f}", "60", "display")
         if drawing["voice_to_picture_ms"]:
             yield _row(
                 "sound to its image on the page, ms",
                 f"{drawing['voice_to_picture_ms']:.0f}",
-                str(display_floor_ms(_LOOK_AHEAD_MS)),
+                str(display_floor_ms(_DELAY_MS)),
                 "delay + frame + display tick",
             )
 
@@ -108,7 +108,7 @@ def _browser_rows(browser: Figures, sizes: Figures) -> Iterator[list[str]]:
     yield _row(
         "lips in the browser: sound to weights, p50 / p95, ms",
         _format_percentiles(browser["delay_ms"]),
-        f"{_LOOK_AHEAD_MS + _FRAME_MS / 2:.0f}",
+        f"{_DELAY_MS + _FRAME_MS / 2:.0f}",
         "delay + half a frame",
     )
     models = sizes.get("model_bytes", {})

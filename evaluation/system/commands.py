@@ -60,7 +60,9 @@ def measure_latency(
     results["rendering"] = asdict(costs.measure_images())
     drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
     results["page"] = {"drawings": {name: asdict(drawing) for name, drawing in drawings.items()}}
-    show_results(json_file, results, system_table(chain=results), figures_table({"value": results}))
+    show_results(
+        json_file, results, system_table(latency=results), figures_table({"value": results})
+    )
 
 
 @app.command(name="lips-page")

@@ -18,12 +18,15 @@ def phone_errors(result: Any) -> str:
 
 
 FIGURES: list[tuple[str, Callable[[Any], str]]] = [  # step and value of each row
-    ("chain", lambda r: "{p50:.1f} ms (p50), {p95:.1f} ms (p95)".format(**r["chunk_to_frame_ms"])),
-    ("chain", lambda r: f"{sum(r['cpu_s_per_audio_s'].values()):.2f} s"),
+    (
+        "latency",
+        lambda r: "{p50:.1f} ms (p50), {p95:.1f} ms (p95)".format(**r["chunk_to_frame_ms"]),
+    ),
+    ("latency", lambda r: f"{sum(r['cpu_s_per_audio_s'].values()):.2f} s"),
     ("read", phone_errors),
     ("conversation", phone_errors),
     ("rivals", lambda r: f"{r['learned, 60 ms']['clean']['zh']['r_opening']:.2f}"),
-    ("chain", lambda r: f"{r['page']['drawings']['microphone']['pictures_per_s']:.0f}"),
+    ("latency", lambda r: f"{r['page']['drawings']['microphone']['pictures_per_s']:.0f}"),
 ]
 
 
