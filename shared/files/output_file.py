@@ -58,12 +58,15 @@ def _delete(path: Path, locks: list[BinaryIO]) -> None:
 
 
 @contextlib.contextmanager
-def open_output(path: Path, *, keep_on_error: bool = False) -> Iterator[BinaryIO]:
+def open_output(
+    path: Path, *, keep_on_error: bool = False, removes_unfinished: bool = True
+) -> Iterator[BinaryIO]:
     """Open a file for writing. Once it is complete, it gets its name, and replaces an older file.
 
     If an error or Ctrl-C interrupts the writing, an older file stays as it was. Links, devices and
     pipes are written directly. With ``keep_on_error``, files are also written directly, and keep
-    what was written before an error.
+    what was written before an error. With ``removes_unfinished``, the files that killed processes
+    have left for this output are deleted first.
 
     Raises ``UserError`` if the file cannot be written.
     """
@@ -72,7 +75,8 @@ def open_output(path: Path, *, keep_on_error: bool = False) -> Iterator[BinaryIO
             with path.open("wb") as file:
                 yield file
             return
-        remove_unfinished(path.parent, path.name)
+        if removes_unfinished:
+            remove_unfinished(path.parent, path.name)
         unfinished = UnfinishedFile(path)
         try:
             with unfinished.path.open("wb") as file:

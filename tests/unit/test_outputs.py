@@ -19,10 +19,12 @@ from kouxing.services.cli.recordings.animation import FaceMotion
 from kouxing.services.cli.recordings.batch import pair_outputs, process_all
 from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, FrameStream
 from kouxing.services.cli.system.running_system import lock_output_folder
+from kouxing.services.driver.video import video_writer
 from kouxing.services.driver.video.film import TimedFaps
 from kouxing.services.driver.video.video_writer import PictureSequence, check_name
 from kouxing.shared.command.terminal import check_output, write_text
 from kouxing.shared.errors import UserError
+from kouxing.shared.files import output_file
 from kouxing.shared.files.output_file import open_output
 from tests.system import VOWELS_FILE
 
@@ -333,6 +335,20 @@ def test_a_sequence_of_pictures_replaces_a_longer_one(tmp_path: Path) -> None:
     sequence.close()
     assert {path.name for path in tmp_path.iterdir()} == {*others, "face0000.png"}
     assert (tmp_path / "face0000.png").stat().st_size > 0
+
+
+def test_a_sequence_of_pictures_searches_its_folder_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searches: list[Path] = []
+    for module in (output_file, video_writer):
+        monkeypatch.setattr(module, "remove_unfinished", lambda path, *_: searches.append(path))
+    for path, folder in ((tmp_path / "new", tmp_path / "new"), (tmp_path / "%d.png", tmp_path)):
+        sequence = PictureSequence(path)
+        for _ in range(2):
+            sequence.write_image(np.zeros((2, 2, 3), np.uint8))
+        assert searches.pop() == folder
+        assert searches == []
 
 
 def test_a_picture_has_one_number(tmp_path: Path) -> None:

@@ -293,10 +293,14 @@ class PictureSequence:
                 path.mkdir(exist_ok=True)
         except OSError as error:
             raise write_error(path, error) from error
+        remove_unfinished(path.parent if path.suffix == ".png" else path)
 
     def write_image(self, image: UInt8) -> None:
         """Write a picture (H, W, 3) or (H, W, 4), sRGB."""
-        write_picture(picture_name(self._path, self._num_images), image)
+        path = picture_name(self._path, self._num_images)
+        # a search of a folder with many pictures for every picture would be slow
+        with open_output(path, removes_unfinished=False) as file:
+            file.write(picture.encode(image))
         self._num_images += 1
 
     def write_sound(self, samples: Float32) -> None:
