@@ -214,7 +214,7 @@ def test_a_session_is_rejected_if_its_model_cannot_be_loaded(
     assert not service._sessions
 
 
-def test_a_session_is_rejected_if_the_recognizer_cannot_connect_to_its_synthesizer(
+def test_session_is_rejected_without_a_link_to_its_synthesizer(
     service: Recognizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent = list[Message]()

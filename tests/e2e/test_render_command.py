@@ -132,7 +132,7 @@ def test_a_text_that_does_not_fit_is_rendered_with_exit_status_1(
     assert (tmp_path / "a.csv").exists()
 
 
-def test_live_frames_are_those_of_the_live_chain(tmp_path: Path) -> None:
+def test_live_frames_are_those_of_the_live_pipeline(tmp_path: Path) -> None:
     render(SENTENCE, tmp_path / "live.fap", live=True)
     pipeline = LivePipeline(load_model(), load_lip_model())
     samples = read_audio(SENTENCE)[0][:, 0]

@@ -42,7 +42,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
         yield running
 
 
-def frames_of_the_chain(lips: str) -> NDArray[np.float32]:
+def frames_of_the_pipeline(lips: str) -> NDArray[np.float32]:
     pipeline = LivePipeline(load_model(), load_lip_model(name=lips), synthesizer=FACE)
     frames = pipeline.accept_waveform(SAMPLES) + pipeline.input_finished()
     return np.array([faps for _, faps in frames])
@@ -51,7 +51,7 @@ def frames_of_the_chain(lips: str) -> NDArray[np.float32]:
 def test_the_face_has_the_frames_of_the_chain_with_these_settings(system: System) -> None:
     streamed = stream_audio(system.control, SAMPLES, chunk=997)
     np.testing.assert_allclose(np.diff(np.array(streamed.times) / 16000), 1 / 30, atol=1e-4)
-    np.testing.assert_array_equal(streamed.faps, frames_of_the_chain("dynamic-visemes"))
+    np.testing.assert_array_equal(streamed.faps, frames_of_the_pipeline("dynamic-visemes"))
     assert np.abs(streamed.faps[:, 2]).max() > 50.0
 
 
@@ -69,7 +69,7 @@ def test_lips_are_switched_while_a_session_runs(system: System) -> None:
         streamed.send(SAMPLES)
         streamed.finish()
     # the choice may overtake the start of the audio; the face is at rest there
-    np.testing.assert_allclose(streamed.faps, frames_of_the_chain("learned"), atol=0.5)
+    np.testing.assert_allclose(streamed.faps, frames_of_the_pipeline("learned"), atol=0.5)
 
 
 def test_refuses_one_session_too_many_and_the_others_continue(

@@ -139,7 +139,7 @@ def test_stops_unknown_sessions_only_after_the_deadline(harness: ControlHarness)
     assert CloseSession(session="mine") in harness.receive(recognizer, 2)
 
 
-def test_late_speech_of_an_ended_session_does_not_concern_a_new_one_with_its_name(
+def test_late_speech_of_an_ended_session_does_not_affect_its_successor(
     harness: ControlHarness, client: Socket
 ) -> None:
     recognizer, _ = harness.services

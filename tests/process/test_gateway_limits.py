@@ -238,7 +238,7 @@ async def test_a_client_takes_the_place_of_one_without_a_complete_request(
 
 
 @async_test
-async def test_refuses_connections_while_all_places_have_complete_requests(
+async def test_rejects_connections_while_all_slots_have_complete_requests(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with serve(monkeypatch, MAX_CONNECTIONS=6) as server:

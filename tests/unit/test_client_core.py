@@ -272,7 +272,7 @@ def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
 
 
 @pytest.mark.parametrize("reason", ["closed by control", "closed by the program", "last frame"])
-def test_a_failing_function_of_the_program_does_not_keep_other_sessions_open(reason: str) -> None:
+def test_failing_on_result_does_not_keep_other_sessions_open(reason: str) -> None:
     harness = CoreHarness()
 
     def fail(_result: object) -> None:
@@ -353,7 +353,7 @@ def test_a_session_without_inboxes_is_freed_when_it_is_over() -> None:
 @pytest.mark.parametrize(
     ("session_id", "is_same"), [(ID, True), ("an earlier session", False), (None, True)]
 )
-def test_a_late_event_of_an_earlier_session_does_not_concern_a_new_one_with_its_name(
+def test_late_event_of_an_ended_session_does_not_affect_its_successor(
     session_id: str | None, is_same: bool
 ) -> None:
     harness, inbox = CoreHarness(), Inbox(None)

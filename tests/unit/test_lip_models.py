@@ -89,7 +89,7 @@ def test_an_unknown_lip_model_is_an_error() -> None:
         (WRONG_LOAD.replace("object()", "{}['jaw']"), "cannot load the lip model toy .*KeyError"),
     ],
 )
-def test_a_faulty_package_spoils_no_other_lip_model_nor_the_configuration(
+def test_faulty_package_does_not_affect_other_lip_models_or_the_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, error: str
 ) -> None:
     install(tmp_path, "faulty_lips", code)

@@ -102,7 +102,7 @@ def test_the_lost_first_message_of_an_epoch_is_resent() -> None:
     assert link.received == [1, 2, 3, 1, 2, 3]
 
 
-def test_the_last_messages_of_an_ended_session_do_not_hide_a_session_with_its_name() -> None:
+def test_ended_session_does_not_hide_its_successor() -> None:
     ended, link = ReliablePair(), ReliablePair()
     ended.send(5)
     for message in list(ended.dealer.sent)[3:]:

@@ -211,7 +211,7 @@ def test_a_session_moves_to_another_recognizer_and_resumes_where_it_was(cluster:
     assert record.next_sequence == 121, "the new recognizer has no audio yet"
 
 
-def test_a_late_heartbeat_about_an_ended_session_does_not_concern_a_new_one_with_its_name(
+def test_late_heartbeat_of_an_ended_session_does_not_affect_its_successor(
     cluster: Cluster,
 ) -> None:
     ended = cluster.open("demo")
@@ -231,7 +231,7 @@ def test_a_late_heartbeat_about_an_ended_session_does_not_concern_a_new_one_with
         (("synthesizer-1",), 0, "recognizer-1"),
     ],
 )
-def test_the_recognizer_starts_last_and_learns_up_to_where_phones_are_final(
+def test_recognizer_starts_last_and_receives_final_until(
     cluster: Cluster, lost: tuple[str, ...], reported: int, last: str
 ) -> None:
     record = cluster.open()

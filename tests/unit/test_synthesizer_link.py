@@ -70,7 +70,7 @@ def test_a_new_synthesizer_receives_the_newest_frame_and_the_last_messages() -> 
     assert {message.epoch for message in (resume, speech, *rest)} == {2}
 
 
-def test_a_synthesizer_that_restarts_in_the_same_epoch_receives_the_last_messages_again() -> None:
+def test_restarted_synthesizer_receives_the_last_messages_again() -> None:
     link = FakeSynthesizerLink()
     link.send_all(progress(1.0), progress(2.0))
     link.acknowledge_up_to(2, frame=40)

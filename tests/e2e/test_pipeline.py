@@ -1,4 +1,4 @@
-"""Sound through real processes: frames and phones equal those of the chain, for every client."""
+"""Sound through real processes: frames and phones equal those of the pipeline, for every client."""
 
 import csv
 import itertools
