@@ -329,9 +329,11 @@ class FaceAnimator:
     def _add_difference(self, faps: NDArray[np.float32], difference: Faps) -> None:
         """Add the remaining difference of a transition to a frame, in place."""
         if difference.any():
-            free = max(self._expression.free, 1.0 - self._transition_s / _CLOSE_LIPS_AFTER_S)
+            lip_weight = max(
+                self._expression.lip_weight, 1.0 - self._transition_s / _CLOSE_LIPS_AFTER_S
+            )
             jaw = faps[JAW] + difference[JAW]  # the jaw does not open the lips
-            mix_expression(faps, difference.astype(np.float32), free)
+            mix_expression(faps, difference.astype(np.float32), lip_weight)
             faps[JAW] = max(jaw, 0.0)
 
     def _make_target(self, mouth: MouthFrame) -> NDArray[np.float32]:

@@ -38,7 +38,8 @@ UPPER, LOWER = np.array([UPPER_LIP_FAPS, LOWER_LIP_FAPS]) - 1
 
 _VISIBLE = 0.01  # FAP units
 _EASE_S, _FADE_S = 0.09, 0.3  # time constants of each filter pole, at the start and the end
-_FREE_S, _BIND_S = 0.15, 0.04  # time constant of freeing the lips; time for binding them
+_FREE_S = 0.15  # time constant of the rise of the weight on the lips after speech
+_BIND_S = 0.04  # time in which it falls when speech starts
 _ARKIT_EXPRESSIONS = {
     ExpressionName.SMILE: ("mouthSmileLeft", "mouthSmileRight"),
     ExpressionName.BROW_UP: ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"),
@@ -64,7 +65,7 @@ class ExpressionMotion:
         self._goal: NDArray[np.float32] = np.zeros(NUM_FAPS, np.float32)
         self._shown = TwoPoleFilter(self._goal)
         self._remaining_s = 0.0  # time until the expressions fade
-        self._free = 1.0
+        self._lip_weight = 1.0
         self._is_shown = False
 
     def show(self, strengths: Mapping[str, float], hold_s: float) -> None:
@@ -83,31 +84,33 @@ class ExpressionMotion:
         self._goal, self._remaining_s = goal, hold_s
 
     @property
-    def free(self) -> float:
+    def lip_weight(self) -> float:
         """The least weight of the expression on the lips: 1 without speech, 0 in speech."""
-        return self._free
+        return self._lip_weight
 
     def add(self, faps: NDArray[np.float32], step_s: float, *, is_speaking: bool) -> None:
         """Add the expressions to a frame, FAPs (68,), in place."""
         is_held = self._remaining_s > 0.0
         self._remaining_s -= step_s
         if is_speaking:
-            self._free = max(self._free - step_s / _BIND_S, 0.0)
+            self._lip_weight = max(self._lip_weight - step_s / _BIND_S, 0.0)
         else:
-            self._free += (1.0 - self._free) * smoothing_gain(step_s, _FREE_S)
+            self._lip_weight += (1.0 - self._lip_weight) * smoothing_gain(step_s, _FREE_S)
         if is_held or self._is_shown:
             goal = is_held * self._goal
             shown = self._shown.step(goal, step_s, self._ease_s if is_held else _FADE_S)
-            mix_expression(faps, shown, self._free)
+            mix_expression(faps, shown, self._lip_weight)
             self._is_shown = bool(np.abs(shown).max() > _VISIBLE)
 
 
-def mix_expression(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float) -> None:
-    """Add an expression (68,) to a face (68,), in place; ``free`` is the least ``a``, 0 to 1."""
+def mix_expression(
+    faps: NDArray[np.float32], expression: NDArray[np.float32], lip_weight: float
+) -> None:
+    """Add an expression (68,) to a face (68,), in place; ``lip_weight`` is the least ``a``."""
     gap = -(faps[UPPER] + faps[LOWER])
     room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - CLOSED
     room = np.concatenate([np.minimum(room[:3], room[3:])] * 2)  # inner and outer lip
-    apart = np.maximum(room / (OPEN - CLOSED), free)
+    apart = np.maximum(room / (OPEN - CLOSED), lip_weight)
     change = -(expression[UPPER] + expression[LOWER])
     change = np.maximum(apart * change, np.minimum(CLOSED - gap, 0.0))
     change = np.minimum(change, np.maximum(_WIDEST - gap, 0.0))

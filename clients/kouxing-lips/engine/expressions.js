@@ -14,7 +14,7 @@ export class Expressions {
   #shown;
   #isShown = false;
   #remainingS = 0;
-  #free = 1;
+  #lipWeight = 1;
 
   constructor({ arrays, constants, expressionNames, numFaps }, easeS = constants.expression.EASE_S) {
     this.#constants = constants.expression;
@@ -45,8 +45,8 @@ export class Expressions {
     const { FADE_S, FREE_S, BIND_S } = this.#constants;
     const isHeld = this.#remainingS > 0;
     this.#remainingS -= stepS;
-    if (isSpeaking) this.#free = Math.max(this.#free - stepS / BIND_S, 0);
-    else this.#free += (1 - this.#free) * smoothingGain(stepS, FREE_S);
+    if (isSpeaking) this.#lipWeight = Math.max(this.#lipWeight - stepS / BIND_S, 0);
+    else this.#lipWeight += (1 - this.#lipWeight) * smoothingGain(stepS, FREE_S);
     if (!isHeld && !this.#isShown) return;
     const gain = smoothingGain(stepS, isHeld ? this.#easeS : FADE_S);
     this.#halfway = this.#halfway.map((x, i) => x + gain * ((isHeld ? this.#goal[i] : 0) - x));
@@ -62,7 +62,7 @@ export class Expressions {
     const rooms = gaps.map((gap, i) => Math.min(gap, -faps[LOWER[i]], OPEN) - CLOSED);
     const half = rooms.length / 2; // inner lips first, then outer
     const apart = rooms.map((_, i) =>
-      Math.max(Math.min(rooms[i % half], rooms[(i % half) + half]) / (OPEN - CLOSED), this.#free),
+      Math.max(Math.min(rooms[i % half], rooms[(i % half) + half]) / (OPEN - CLOSED), this.#lipWeight),
     );
     UPPER.forEach((upper, i) => {
       const lower = LOWER[i];

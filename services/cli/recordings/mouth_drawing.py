@@ -95,7 +95,7 @@ class _MouthMotion:
         return times_s, openings, self.widths_at(times_s)
 
     @property
-    def symbols(self) -> list[LabelSpan]:
+    def phone_labels(self) -> list[LabelSpan]:
         """The phones as labels."""
         return [
             (phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in self.phones
@@ -264,7 +264,9 @@ def _write_picture(output: Path, mouth: _MouthMotion) -> str:
 def _write_video(output: Path, mouth: _MouthMotion) -> str:
     labels = _syllable_labels(mouth)
     write = mouth.inventory.write
-    symbols = [(start_s, end_s, write(symbol)) for start_s, end_s, symbol in mouth.symbols]
+    phone_labels = [
+        (start_s, end_s, write(symbol)) for start_s, end_s, symbol in mouth.phone_labels
+    ]
     frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))
     with (
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,
@@ -276,7 +278,7 @@ def _write_video(output: Path, mouth: _MouthMotion) -> str:
             writer.write_sound(mouth.samples[num_sent:end])
             num_sent = end
             moment = drawing.LabeledMouth(
-                time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels), width
+                time_s, opening, _label_at(time_s, phone_labels), _label_at(time_s, labels), width
             )
             writer.write_image(drawing.rasterize(drawing.draw_image(moment, *_VIDEO_SIZE_PX)))
     return f"{plural(len(frames), 'image')}, {plural(len(mouth.phones), 'phone')}"
@@ -290,7 +292,7 @@ def _label_at(time_s: float, spans: Sequence[LabelSpan]) -> str:
 
 def _write_csv(output: Path, mouth: _MouthMotion) -> str:
     times_s, openings, widths = mouth.sample()
-    symbols = mouth.symbols
+    phone_labels = mouth.phone_labels
     with open_output(output) as file, open_progress() as progress:
         table = csv.writer(codecs.getwriter("utf-8")(file), lineterminator="\n")
         table.writerow(CSV_COLUMNS)
@@ -301,7 +303,7 @@ def _write_csv(output: Path, mouth: _MouthMotion) -> str:
             for time_s, opening, lines in zip(
                 times_s[block], openings[block], contours, strict=True
             ):
-                time, phone = f"{time_s:.3f}", _label_at(time_s, symbols)
+                time, phone = f"{time_s:.3f}", _label_at(time_s, phone_labels)
                 table.writerows(
                     (time, f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}", phone)
                     for name, line in zip(LINES, lines, strict=True)

@@ -15,9 +15,9 @@ const ADJUST_EVERY_MS = 500;
 const MAX_GLIDE = 0.005; // change of speed; a twelfth of a semitone, which is inaudible
 const WINDOW_MS = 10000; // window of the percentiles; long enough to ignore a single hiccup
 const MIN_FRAMES = 20; // number of frames after which the percentile is used
-const JUMP_MS = 300; // a stream that is late or early by more than this is restarted …
-const LATE_MS = 100; // … after it was late for this long; less than the delay, so that no sound is lost
-const EARLY_MS = 300; // … or early for this long
+const RESTART_ERROR_MS = 300; // a stream that is late or early by more than this is restarted …
+const RESTART_LATE_FOR_MS = 100; // … after it was late for this long; less than the delay, so that no sound is lost
+const RESTART_EARLY_FOR_MS = 300; // … or early for this long
 const START_MS = 300; // time at the start in which the earliest arrival sets the offset
 const MAX_BEHIND_MS = 3000; // restart immediately if media time jumps ahead by more than this
 const MAX_FRAMES = 1000;
@@ -106,8 +106,8 @@ export class Playout {
   frameArrived(nowMs, mediaTime) {
     const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const outputMs = Math.max(this.imageDelayMs, this.outputLatencyMs);
-    const isEarly = this.offsetMs !== null && latenessMs + outputMs < this.offsetMs - JUMP_MS;
-    if (this.#earlyFrames.update(nowMs, isEarly) > EARLY_MS) this.reset(); // the others were delayed
+    const isEarly = this.offsetMs !== null && latenessMs + outputMs < this.offsetMs - RESTART_ERROR_MS;
+    if (this.#earlyFrames.update(nowMs, isEarly) > RESTART_EARLY_FOR_MS) this.reset(); // the others were delayed
     if (this.#isLate(nowMs, latenessMs, this.#lateFrames)) return;
     this.#start(nowMs, latenessMs + FIRST_DELAY_MS / 2);
     this.frames.add(nowMs, latenessMs);
@@ -165,8 +165,8 @@ export class Playout {
   #isLate(nowMs, latenessMs, streak) {
     if (this.offsetMs === null) return false;
     const lateMs = latenessMs - this.offsetMs;
-    const lateForMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : JUMP_MS));
-    if (lateForMs > LATE_MS || lateMs < -MAX_BEHIND_MS) this.reset();
+    const lateForMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : RESTART_ERROR_MS));
+    if (lateForMs > RESTART_LATE_FOR_MS || lateMs < -MAX_BEHIND_MS) this.reset();
     return this.offsetMs !== null && streak.holds;
   }
 }
