@@ -340,7 +340,7 @@ class ControlService(Service):
             return
         if not record.is_announced:  # it is about an earlier session with this name
             return
-        if (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
+        if instance != record.workers["audio"] or speech.epoch < record.recognizer_epoch:
             return
         if not record.is_speaking:  # a new recognizer repeats the start of speech
             record.speech_time = speech.media_time

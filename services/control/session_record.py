@@ -38,6 +38,7 @@ class SessionRecord:
     rejected_by: set[str] = field(default_factory=set)  # workers that rejected the current move
     started: set[str] = field(default_factory=set)  # instances that have started the session
     epoch: int = 1
+    recognizer_epoch: int = 1  # the first epoch of the current recognizer
     is_announced: bool = False  # whether the client has the endpoints
     has_unannounced_move: bool = False  # placed again, and the client has not been notified
     restored_epoch: int = 0  # its epoch when an earlier control process stopped; 0: not restored

@@ -188,6 +188,7 @@ class SessionTable:
             waiting_for=running,
             lost={*workers.values()} - running,
             epoch=start.epoch,
+            recognizer_epoch=start.epoch,
             is_announced=True,
             restored_epoch=start.epoch,
             final_until=start.final_until,
@@ -286,14 +287,15 @@ class SessionTable:
         except Rejected:
             return False
         record.deferred = {workers["audio"]}
+        record.epoch += 1
         if "audio" not in remaining:
             record.resume_sequence = record.next_sequence
+            record.recognizer_epoch = record.epoch
         record.lost = set()
         self._set_workers(record, workers, now_s)
         record.endpoints = self._registry.endpoints(workers)
         facts = self._registry.facts(workers.values())
         record.facts = replace(facts, language=record.facts.language)
-        record.epoch += 1
         record.has_unannounced_move = True
         record.started_s = now_s
         record.waiting_for = self.participants(record)

@@ -182,6 +182,24 @@ def test_repeats_session_moved_to_the_client(
     assert others == [first, first]
 
 
+def test_speech_may_end_while_a_session_moves_to_another_synthesizer(
+    harness: ControlHarness, client: Socket
+) -> None:
+    recognizer, _ = harness.services
+    other = harness.buses[1].connect_dealer(harness.control.endpoints["commands"])
+    heartbeat = make_heartbeat("synthesizer", "tcp://127.0.0.1:10")
+    other.send(replace(heartbeat, instance="synthesizer-2"))
+    harness.receive(other)
+    client.send(OpenSession(session="mine", request="1"))
+    harness.step_until(lambda: client.wait(0.0))
+    record = harness.control._sessions.find("mine")
+    record.is_speaking = True
+    harness.control._on_service_lost("synthesizer", "no heartbeat")
+    assert record.epoch == 2  # the recognizer does not have this epoch yet
+    recognizer.send(Speech(session="mine", epoch=1, sequence=1, active=False))
+    harness.step_until(lambda: not record.is_speaking)
+
+
 @pytest.mark.parametrize("num_free", [1, 2])
 def test_a_session_leaves_a_worker_that_rejects_its_move(
     harness: ControlHarness, client: Socket, num_free: int

@@ -316,6 +316,19 @@ def test_a_heartbeat_without_sessions_may_be_older(cluster: Cluster) -> None:
     assert cluster.registry.overdue_services(3.8) == ["synthesizer-1"]
 
 
+def test_a_session_that_returns_to_a_recognizer_starts_a_new_epoch_there(cluster: Cluster) -> None:
+    record = cluster.open("demo")
+    cluster.lose("synthesizer-1")
+    cluster.add(worker("synthesizer", "synthesizer-2"))
+    assert cluster.sessions.move(record, 1.0)
+    assert (record.epoch, record.recognizer_epoch) == (2, 1)
+    for lost, other in (("1", "2"), ("2", "1")):
+        cluster.lose(f"recognizer-{lost}")
+        cluster.add(worker("recognizer", f"recognizer-{other}"))
+        assert cluster.sessions.move(record, 1.0)
+    assert (record.epoch, record.recognizer_epoch) == (4, 4)
+
+
 def test_restores_a_session_from_its_newest_recognizer(cluster: Cluster) -> None:
     record = cluster.open("demo")
     stalled = record.start_message(0.0)
