@@ -67,7 +67,7 @@ class Socket:
         self._is_router = is_router
         self._is_publisher = is_publisher
         self._on_subscribe = on_subscribe
-        self._endpoint_name = endpoint_name  # set for a publisher
+        self._endpoint_name = endpoint_name  # set if the socket is bound, such as "faps"
         self._connection: PeerConnection | None = None  # connection of the last message
         self._sender = NO_PEER  # sender of the last message
         self._has_unread_parts = False  # unread parts of the last message remain

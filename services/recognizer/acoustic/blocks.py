@@ -288,9 +288,8 @@ class BlockStream(AcousticStream):
         sizes, num_complete = self._sizes, self._num_encoder_frames
         num_encoder_frames = min(num_complete, self._num_due)
         max_encoder_frames = min(sizes.length, MAX_POSITIONS - self._row)
-        if (
-            num_encoder_frames < max_encoder_frames
-        ):  # one run replaces several runs that settle nothing
+        if num_encoder_frames < max_encoder_frames:
+            # one run replaces several runs that settle nothing
             num_more = min(num_complete, max_encoder_frames) - num_encoder_frames
             num_encoder_frames += num_more // sizes.block * sizes.block
         is_last = self._row + num_encoder_frames == MAX_POSITIONS or (

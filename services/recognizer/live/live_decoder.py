@@ -66,9 +66,8 @@ class LiveDecoder:
         self._inventory = topology.inventory
         self._silence = self._inventory.index[self._inventory.silence]
         self._settled = Decoder(topology)  # the search over settled scores
-        self._provisional_decoder: Decoder | None = (
-            None  # its continuation over provisional scores, if any
-        )
+        # continuation of that search over provisional scores, if any
+        self._provisional_decoder: Decoder | None = None
         self._rule = OutputRule(rule, last_emitted=self._silence)
         self._num_final = 0
         self._start_speech(0)
@@ -97,9 +96,8 @@ class LiveDecoder:
         self._start_frame = frame
         self._final_end_frame = 0  # the decoder's frame up to which phones are final
         self._num_checked = 0  # frames that the output rule has processed
-        self._confidence = np.empty(
-            0
-        )  # confidence of the settled frames from ``_final_end_frame`` on
+        # confidence of the settled frames from ``_final_end_frame`` on
+        self._confidence = np.empty(0)
         self._provisional = empty_scores(self._topology.num_states)  # scores of the last search
         self._settled.reset()
         self._decoder = self._settled
