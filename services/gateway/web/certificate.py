@@ -46,8 +46,14 @@ def load_tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
 
 
 def find_validity_problem(pem: bytes, now: datetime.datetime) -> str:
-    """Return why browsers reject a certificate at this time; empty if it is valid."""
-    certificate = x509.load_pem_x509_certificate(pem)
+    """Return why browsers reject a certificate at this time; empty if it is valid or unreadable.
+
+    OpenSSL, which serves the certificate, reads more formats, such as TRUSTED CERTIFICATE.
+    """
+    try:
+        certificate = x509.load_pem_x509_certificate(pem)
+    except ValueError:
+        return ""
     start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     if start <= now <= end:
         return ""
