@@ -127,3 +127,12 @@ test("a file continues in another session if the connection is interrupted", asy
   t.mock.timers.tick(1000);
   assert.equal(states.at(-1), "off");
 });
+
+test("the browser's reason has no period of its own", async () => {
+  navigator.mediaDevices.getUserMedia = async () => {
+    throw new Error("The object can not be found here.");
+  };
+  const { microphone, states } = makeMicrophone();
+  await microphone.start();
+  assert.ok(states.some((text) => text.includes("not be found here. Close other programs")));
+});

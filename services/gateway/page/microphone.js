@@ -182,7 +182,7 @@ export class Microphone {
 function problemText(error) {
   if (error instanceof UserError) return error.message;
   if (error.name === "NotAllowedError") return translate("microphoneForbidden");
-  return translate("microphoneFailed", { reason: error.message });
+  return translate("microphoneFailed", { reason: error.message.replace(/\.$/, "") }); // Firefox writes a period
 }
 
 function release({ stream, context }) {
