@@ -188,7 +188,7 @@ static double ajar_amount_at(Rest *rest, double time_s) {
   }
   if (starts_soon) set_goal(rest, 1.0, REST_PART_S);
   else if (rest->stays_closed || next_s <= time_s + REST_YIELD_S) set_goal(rest, 0.0, REST_YIELD_S);
-  else if (time_s < rest->start_s + REST_START_S || closes_for_onset(rest, time_s)) set_goal(rest, 0.0, REST_ONSET_CLOSE_S);
+  else if (closes_for_onset(rest, time_s)) set_goal(rest, 0.0, REST_ONSET_CLOSE_S);
   else if (time_s > rest->sound_s + REST_HOLD_S) set_goal(rest, 0.0, REST_CLOSE_S);
   else if (!rest->is_voice || fmin(next_s, rest->known_s) >= rest->sound_s + REST_MIN_PAUSE_S) set_goal(rest, 1.0, REST_PART_S);
   rest->elapsed_s += fmax(time_s - rest->time_s, 0.0);
@@ -405,7 +405,6 @@ void face_init(Face *face) {
   memset(face, 0, sizeof *face);
   face->rest.loudest_db = face->rest.known_s = face->rest.sound_s = face->rest.onset_until_s = -INFINITY;
   face->rest.time_s = INFINITY;
-  face->rest.start_s = INFINITY;
   face->rest.background_db = NAN;
   face->rest.duration_s = 1.0;
 }
@@ -422,8 +421,8 @@ void face_change_speech(Face *face, double time_s, bool is_active) {
 
 void face_add_level(Face *face, double time_s, double level_db) {
   Rest *rest = &face->rest;
+  if (isinf(rest->known_s)) rest->sound_s = time_s;
   if (rest->num_levels < MAX_LEVELS) rest->levels[rest->num_levels++] = (Level){time_s, level_db};
   rest->loudest_db = fmax(level_db, rest->loudest_db - REST_FADE_DB);
   rest->known_s = time_s;
-  if (isinf(rest->start_s)) rest->start_s = rest->sound_s = time_s;
 }

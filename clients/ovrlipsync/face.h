@@ -40,7 +40,7 @@ typedef struct {
   SpeechChange changes[MAX_CHANGES]; /* of future frames */
   int num_changes;
   bool is_voice, has_spoken, stays_closed;
-  double loudest_db, start_s, known_s, sound_s, time_s;
+  double loudest_db, known_s, sound_s, time_s;
   double background_db, onset_until_s; /* NAN: no background yet */
   double goal, start, velocity, duration_s, elapsed_s; /* of the way to the goal */
 } Rest;

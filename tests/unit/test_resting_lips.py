@@ -110,17 +110,17 @@ def test_lips_part_before_a_sound_as_early_as_it_is_known() -> None:
 @pytest.mark.parametrize("level_db", [QUIET_DB, LOUD_DB])
 def test_without_voice_lips_part_at_the_start_and_then_stay_closed(level_db: float) -> None:
     amounts = ajar_amounts(lambda _: level_db, 2.0, voice=())
-    assert at(amounts, 0.04) == 0.0
-    assert at(amounts, 0.24) == 1.0
+    assert at(amounts, 0.0) < 0.1
+    assert at(amounts, PART_S + FRAME_S) == 1.0
     assert at(amounts, HOLD_S - FRAME_S) == 1.0
     assert not amounts[round((HOLD_S + CLOSE_S + 2 * FRAME_S) / FRAME_S) :].any()
 
 
-@pytest.mark.parametrize("rise_db", [9.0, 11.0])
+@pytest.mark.parametrize("rise_db", [7.0, 9.0])
 def test_an_onset_before_voice_activity_closes_the_lips(rise_db: float) -> None:
     amounts = ajar_amounts(lambda t: -40.0 + rise_db * (t >= 0.6), 0.8, voice=())
     assert at(amounts, 0.52) == 1.0
-    assert (at(amounts, 0.6) == 0.0) == (rise_db == 11.0)
+    assert (at(amounts, 0.6) == 0.0) == (rise_db == 9.0)
 
 
 def test_an_onset_after_voice_activity_does_not_close_the_lips() -> None:

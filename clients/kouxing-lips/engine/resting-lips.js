@@ -13,7 +13,6 @@ export class RestingLips {
   #loudestDb = -Infinity;
   #backgroundDb = null;
   #onsetUntilS = -Infinity;
-  #startS = Infinity;
   #knownS = -Infinity;
   #soundS = -Infinity;
   #staysClosed = false;
@@ -29,10 +28,10 @@ export class RestingLips {
 
   addEvent(event) {
     if (event.type === "progress") {
+      if (this.#knownS === -Infinity) this.#soundS = event.timeS;
       this.#levels.push([event.timeS, event.levelDb]);
       this.#loudestDb = Math.max(event.levelDb, this.#loudestDb - this.#constants.FADE_DB);
       this.#knownS = event.timeS;
-      if (this.#startS === Infinity) this.#startS = this.#soundS = event.timeS;
     } else if (event.type === "speech") this.#changes.push(event);
     else if (event.type === "end") this.#hasEnded = true;
   }
@@ -75,7 +74,7 @@ export class RestingLips {
     if (this.#hasEnded) this.#setGoal(0, c.END_S);
     else if (this.#changes.some((change) => change.active && change.timeS <= timeS + c.LEAD_S)) this.#setGoal(1, c.PART_S);
     else if (this.#isClosedByPhone || this.#staysClosed || nextS <= timeS + c.YIELD_S) this.#setGoal(0, c.YIELD_S);
-    else if (timeS < this.#startS + c.START_S || this.#closesForOnset(timeS)) this.#setGoal(0, c.ONSET_CLOSE_S);
+    else if (this.#closesForOnset(timeS)) this.#setGoal(0, c.ONSET_CLOSE_S);
     else if (timeS > this.#soundS + c.HOLD_S) this.#setGoal(0, c.CLOSE_S);
     else if (!this.#isVoice || Math.min(nextS, this.#knownS) >= this.#soundS + c.MIN_PAUSE_S) this.#setGoal(1, c.PART_S);
     this.#elapsedS += Math.max(timeS - this.#timeS, 0);

@@ -11,7 +11,7 @@ s       0 for the predicted mouth, 1 for a slightly open mouth   1
 ======  =======================================================  ====
 
     goal of s = 1  from the start of a pause for at most HOLD_S,
-                   from START_S after the start of the audio for at most HOLD_S,
+                   from the start of the audio for at most HOLD_S,
                    and from LEAD_S before voice activity to its first sound
                 0  otherwise, and at an onset before the first voice activity
 
@@ -37,7 +37,6 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import EndOfSound, Progress, SoundEvent, SpeechChange
 
 HOLD_S = 0.85  # lips stay ajar until this time after the last sound, or the start of the audio
-START_S = 0.06  # lips stay closed for this time after the start of the audio
 LEAD_S = 0.36  # lips open this long before voice activity, if known
 PART_S, CLOSE_S = 0.15, 0.4  # time to open the mouth slightly, and to close it if the pause lasts
 CERTAIN = 0.98  # probability from which the lip predictor closes lips in a pause
@@ -50,7 +49,7 @@ _FADE_DB = 0.2  # decay of the loudest level per level, so that a bang counts on
 _LAST_SOUND_S = 0.03  # silence until this long after lip positions makes their closure doubtful
 _LIKELY_BEFORE_S, _LIKELY = 0.15, 0.8  # time before a sound, and the probability that counts then
 _DOUBT = 3.0  # log odds
-_ONSET_DB = 10.0  # an onset's minimum level above the background
+_ONSET_DB = 8.0  # an onset's minimum level above the background
 _ONSET_LEAD_S, _ONSET_CLOSE_S = 0.065, 0.05  # lips start to close before an onset; closing time
 _ONSET_S = 0.15  # time from the start of this closing for which the goal stays 0
 _MIN_BACKGROUND_DB = -75.0  # quieter audio counts as this level
@@ -81,7 +80,6 @@ class RestingLips:
         self._loudest_db = -math.inf
         self._background_db: float | None = None
         self._onset_until_s = -math.inf  # the last onset closes the lips until this time
-        self._start_s = math.inf  # start of the audio
         self._known_s = -math.inf  # the levels are known up to here
         self._sound_s = -math.inf  # last sound, start of voice activity or start of the audio
         self._stays_closed = False  # whether the lips stay closed until the next sound
@@ -94,11 +92,11 @@ class RestingLips:
         """Add a level, a change of voice activity, or the end of the audio."""
         match event:
             case Progress():
+                if self._known_s == -math.inf:
+                    self._sound_s = event.time_s
                 self._levels.append((event.time_s, event.level_db))
                 self._loudest_db = max(event.level_db, self._loudest_db - _FADE_DB)
                 self._known_s = event.time_s
-                if self._start_s == math.inf:
-                    self._start_s = self._sound_s = event.time_s
             case SpeechChange():
                 self._speech_changes.append(event)
             case EndOfSound():
@@ -152,7 +150,7 @@ class RestingLips:
             self._set_goal(1.0, PART_S)
         elif self._is_closed_by_phone or self._stays_closed or next_s <= time_s + _YIELD_S:
             self._set_goal(0.0, _YIELD_S)
-        elif time_s < self._start_s + START_S or self._closes_for_onset(time_s):
+        elif self._closes_for_onset(time_s):
             self._set_goal(0.0, _ONSET_CLOSE_S)
         elif time_s > self._sound_s + HOLD_S:
             self._set_goal(0.0, CLOSE_S)
