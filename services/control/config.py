@@ -24,8 +24,8 @@ class ControlConfig(ServiceConfig):
     max_sessions: Annotated[int, Field(ge=1, le=1_000_000)] = 64
     """Maximum number of open sessions. One key can open at most three quarters of them."""
     max_load: Annotated[float, Field(ge=0.1, le=1000)] = 0.8
-    """Fraction of a worker's time that new sessions can use; the rest is reserved for moves. 1000
-    admits all sessions."""
+    """Control rejects new sessions that would keep a worker busy for more than this fraction of the
+    time. The rest is for sessions that move. 1000 admits all sessions."""
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which control closes a session."""
     lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9

@@ -2,7 +2,7 @@
 
 A heartbeat states the fraction of the last two seconds in which a worker's loop was busy. Sessions
 that were placed or ended since then count with the cost of one session: the highest cost measured
-recently. Every session is expected to need this cost, because a silent client may start to speak
+recently. Every session is expected to cost this much, because a silent client may start to speak
 at any moment. A worker processes the audio of all sessions together, so each of many sessions
 costs less. While most sessions speak, the cost falls quickly to the load divided by their number.
 While they are silent, it does not fall below this value.

@@ -53,8 +53,9 @@ MAX_DELAY_S = 1.5  # at most 0.3 live; a viseme further ahead has no visible wei
 REST_S = 0.3  # duration of the return to rest after the end of the sound
 _RECENT_S = 2.0  # events that a new lip model receives
 _WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
-# Duration for which a resumed face is rehearsed. The first rehearsed frame receives all earlier
-# audio levels at once. Any brow or head motion they trigger must end before frames are shown.
+# When a face resumes, this much of the past is computed again without being shown. Its first frame
+# receives all earlier audio levels at once. Any brow or head motion that they trigger must end
+# before frames are shown.
 _REHEARSAL_S = 1.6
 _MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # durations for mouth FAPs and for other FAPs
 _CLOSE_LIPS_AFTER_S = 0.04  # from this time of a transition, lips close fully for speech

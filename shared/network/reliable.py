@@ -40,7 +40,7 @@ class ReliableSender:
     def send(self, message: Message, now_s: float) -> None:
         """Send a message with the next number.
 
-        Results wait for the following ``progress``, because only a ``progress`` makes a frame.
+        Results are sent with the next ``progress``: the synthesizer makes no frame before it.
         """
         numbered = replace(message, session=self.session, epoch=self.epoch, sequence=self._next)
         self._next += 1

@@ -13,7 +13,7 @@ MAX_WAIT_S = 0.02  # limit for waiting for more sessions, to save processor time
 
 
 class NetworkThread:
-    """Decodes sessions whose next audio is due for the block network (``waits_for_network``).
+    """Decodes sessions with enough audio for the next run of the block network.
 
     While a session is on the thread (``is_scoring``), other threads may only use its stream as
     ``SpeechStream.hand_over_speech`` describes, so that lips do not wait for the network. The
