@@ -1,9 +1,6 @@
 """The gateway service: shows sessions in browsers, and streams microphones into sessions.
 
-Receives start-session, close-session, flush-session and set-face from control,
-fap-frame and end-of-faps from synthesizers, sound, phone and speech from recognizers, and the
-browsers' messages. Sends set-face to control, messages to browsers, and
-audio-chunk to recognizers, as any client does.
+It streams audio to recognizers as any client does.
 """
 
 import asyncio
@@ -351,7 +348,7 @@ class GatewayService(SessionService):
         message = browser_messages.encode_json(
             "speech", active=speech.active, media_time=speech.media_time
         )
-        self._viewers.forward(speech.session, MessageKind.TEXT, message)
+        self._viewers.forward(speech.session, MessageKind.SPEECH, message)
 
     def _on_acoustic(self, acoustic: Acoustic) -> None:
         self._viewers.announce_acoustic_model(acoustic.session, acoustic.model)
@@ -359,4 +356,4 @@ class GatewayService(SessionService):
     def _on_end(self, end: EndOfFaps) -> None:
         self._audio_client.on_last_frame(end.session)
         message = browser_messages.encode_json("end", media_time=end.media_time)
-        self._viewers.forward(end.session, MessageKind.TEXT, message)
+        self._viewers.forward(end.session, MessageKind.END, message)

@@ -13,7 +13,10 @@ from kouxing.services.gateway.audio.sample_sentence import SampleSentence
 from kouxing.services.gateway.messages import browser_messages
 from kouxing.services.gateway.messages.browser_messages import parse_face_settings
 from kouxing.services.gateway.messages.pcm_format import PcmFormat
-from kouxing.services.gateway.messages.shape_messages import make_avatar_encoder
+from kouxing.services.gateway.messages.shape_messages import (
+    make_avatar_encoder,
+    parse_shape_query,
+)
 from kouxing.services.gateway.viewers.viewer_handler import PAUSE_S, Viewer, ViewerHandler
 from kouxing.services.gateway.viewers.viewer_queue import (
     MAX_QUEUED,
@@ -126,9 +129,13 @@ AT_16_KHZ = {"sample_rate_hz": 16000}
         ),
         (parse_hello, AT_16_KHZ | {"encoding": "opus"}, "encoding must be s16le or f32le"),
         (parse_hello, AT_16_KHZ | {"language": 1}, "language must be a string, not an integer"),
+        (parse_hello, AT_16_KHZ | {"ahead": "false"}, "ahead must be true or false, not a string"),
         (parse_hello, AT_16_KHZ | {"mouth_profile": "no base64!"}, "mouth_profile"),
         (parse_hello, AT_16_KHZ | {"mouth_profile": LONG_PROFILE}, "mouth_profile"),
         (parse_hello, [1], "object"),
+        (parse_command, {"flush": "no"}, "flush must be true or false, not a string"),
+        (parse_command, {"last": [0]}, "last must be true or false, not a list"),
+        (parse_command, {"eof": 2}, "last must be true or false, not an integer"),
         (parse_command, {"lip_model": 1}, "lip_model is 1; it must be dynamic-visemes or "),
         *(
             (parse_command, {"skip": n}, "skip must be an integer")
@@ -272,9 +279,9 @@ def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
         assert binary_types(viewer) == [browser_messages.REST_TYPE]
 
 
-def test_drops_sound_and_old_frames_but_not_text() -> None:
+def test_drops_sound_and_old_frames_but_not_the_session() -> None:
     queue = ViewerQueue()
-    queue.put(MessageKind.TEXT, "session")
+    queue.put(MessageKind.SESSION, "session")
     num_dropped = 0
     for number in range(MAX_QUEUED):
         kind = MessageKind.SOUND if number % 2 else MessageKind.FRAME
@@ -285,6 +292,35 @@ def test_drops_sound_and_old_frames_but_not_text() -> None:
     assert len(left) == 1 + NUM_FRAMES_KEPT
     assert left[-1] == b"%d" % (MAX_QUEUED - 2)  # the newest frame
     assert num_dropped == MAX_QUEUED - NUM_FRAMES_KEPT
+
+
+def test_a_slow_viewer_gets_the_newest_state_among_many_phones() -> None:
+    viewers = make_viewers()
+    viewers.announce_missing_services(())
+    with viewers.connect_viewer("", parse_shape_query({"shapes": "arkit"})) as viewer:
+        viewers.add_session("talk", 1, FaceSettings(), "zh")
+        viewers.change_face("talk", FaceSettings(feeling=0.5))
+        viewers.announce_acoustic_model("talk", "light")
+        viewers.forward("talk", MessageKind.SPEECH, '{"type": "speech"}')
+        viewers.forward("talk", MessageKind.END, '{"type": "end"}')
+        for _ in range(2 * MAX_QUEUED):
+            viewers.forward("talk", MessageKind.TEXT, '{"type": "phone"}')
+            assert len(viewer.queue) <= MAX_QUEUED
+        messages = [json.loads(message) for message in drain(viewer.queue)]
+    types = [message["type"] for message in messages if message["type"] != "phone"]
+    assert types == ["status", "shapes", "session", "face", "acoustic", "speech", "end"]
+
+
+def test_weights_of_an_earlier_avatar_are_dropped_with_its_names() -> None:
+    queue = ViewerQueue()
+    queue.put(MessageKind.SHAPE_NAMES, "old names")
+    queue.put(MessageKind.SHAPES, b"old weights")
+    queue.put(MessageKind.SHAPE_NAMES, "new names")
+    queue.put(MessageKind.SHAPES, b"new weights")
+    for _ in range(MAX_QUEUED):
+        queue.put(MessageKind.SOUND, b"")
+    left = [message for message in drain(queue) if message]
+    assert left == ["new names", b"new weights"]
 
 
 def test_text_cannot_exceed_the_limit() -> None:

@@ -41,6 +41,7 @@ MAX_SKIPPED_SAMPLES = 600 * MAX_RATE_HZ  # 10 minutes
 MAX_SHOWN = 40  # characters of a client's text in an error
 # The face settings that a browser can change; the query of its address selects shapes.
 FACE_SETTINGS = tuple(name for name in FaceSettings.__struct_fields__ if name != "shapes")
+_FLAGS = ("ahead", "flush", "last")  # true or false; 1 and 0 too, as in version 0.1.0
 _FORMAT_FIELDS = PcmFormat.__struct_fields__
 COMMANDS = ("skip", "flush", "last", *FACE_SETTINGS)  # that a microphone client may send
 CHANNEL_COMMANDS = ("flush", *FACE_SETTINGS)  # that a WebRTC client may send
@@ -69,7 +70,7 @@ def encode_error(reason: str, code: str = "refused", retry_after_s: float = 0.0)
 class MicrophoneOptions(PcmFormat, frozen=True, kw_only=True):
     """The first message of a microphone."""
 
-    ahead: Any = False  # whether audio may arrive faster than real time
+    ahead: bool = False  # whether audio may arrive faster than real time
     mouth_profile: MouthProfile = b""  # profile of the speaker; empty: average speaker
     language: Annotated[str, Meta(max_length=64)] = ""  # empty: language of the recognizer
 
@@ -83,14 +84,14 @@ def parse_microphone_options(message: str) -> tuple[MicrophoneOptions, str]:
     problem = find_unknown(fields, MicrophoneOptions.__struct_fields__)
     if fields.get("sample_rate_hz") is None:
         raise UserError("; ".join(filter(None, ("sample_rate_hz is missing", problem))))
-    return _convert(fields, MicrophoneOptions), problem
+    return _convert(_with_flags(fields), MicrophoneOptions), problem
 
 
 class MicrophoneCommand(Struct, frozen=True, kw_only=True):
     """A command between the chunks of a browser's microphone."""
 
-    flush: Any = False  # whether to drop audio whose face is not shown yet
-    last: Any = False  # whether no more audio follows
+    flush: bool = False  # whether to drop audio whose face is not shown yet
+    last: bool = False  # whether no more audio follows
     skip: Annotated[int, Meta(ge=0, le=MAX_SKIPPED_SAMPLES)] = 0  # samples that the client skipped
     face: dict[str, Any]  # settings to change
     problem: str = ""  # error about unknown fields, which are ignored
@@ -112,7 +113,16 @@ def parse_command(
     problem = find_unknown([name for name in fields if name not in _FORMAT_FIELDS], known)
     settings = parse_face_settings(fields)
     face = {name: getattr(settings, name) for name in FACE_SETTINGS} if settings else {}
-    return _convert({**fields, "face": face, "problem": problem}, MicrophoneCommand)
+    fields = {**_with_flags(fields), "face": face, "problem": problem}
+    return _convert(fields, MicrophoneCommand)
+
+
+def _with_flags(fields: Mapping[str, object]) -> dict[str, object]:
+    """Return the fields of a message, in which 1 and 0 of a flag are replaced by true and false."""
+    return {
+        name: bool(value) if name in _FLAGS and value in (0, 1) else value
+        for name, value in fields.items()
+    }
 
 
 class ViewerCommand(Struct, frozen=True, kw_only=True):

@@ -98,7 +98,7 @@ class ViewerHandler:
             settings = _shown_settings(shown_session.face)
             if settings != before:
                 self.forward(
-                    session, MessageKind.TEXT, browser_messages.encode_json("face", **settings)
+                    session, MessageKind.FACE, browser_messages.encode_json("face", **settings)
                 )
 
     def announce_acoustic_model(self, session: str, model: str) -> None:
@@ -107,7 +107,9 @@ class ViewerHandler:
         if shown_session is not None and shown_session.acoustic != model:
             shown_session.acoustic = model
             self.forward(
-                session, MessageKind.TEXT, browser_messages.encode_json("acoustic", acoustic=model)
+                session,
+                MessageKind.ACOUSTIC,
+                browser_messages.encode_json("acoustic", acoustic=model),
             )
 
     def remove_session(self, session: str) -> None:
@@ -120,7 +122,7 @@ class ViewerHandler:
         if missing != self._missing:
             self._missing = missing
             for viewer in self._viewers:
-                self._put(viewer, MessageKind.TEXT, self._status())
+                self._put(viewer, MessageKind.STATUS, self._status())
 
     def forward(self, session: str, kind: MessageKind, message: str | bytes) -> None:
         """Send a message to the viewers of a session."""
@@ -185,9 +187,9 @@ class ViewerHandler:
         self._viewers.add(viewer)
         self._on_connected()
         try:
-            self._put(viewer, MessageKind.TEXT, self._status())
+            self._put(viewer, MessageKind.STATUS, self._status())
             if shape_encoder is not None:
-                self._put(viewer, MessageKind.TEXT, shape_encoder.header_message())
+                self._put(viewer, MessageKind.SHAPE_NAMES, shape_encoder.header_message())
             self._notify_viewer(viewer)
             yield viewer
         finally:
@@ -236,7 +238,7 @@ class ViewerHandler:
             viewer.chosen_session = command.follow
         elif command.avatar is not None:
             viewer.shape_encoder = make_avatar_encoder(command.avatar, command.format)
-            self._put(viewer, MessageKind.TEXT, viewer.shape_encoder.header_message())
+            self._put(viewer, MessageKind.SHAPE_NAMES, viewer.shape_encoder.header_message())
         elif not command.problem:
             names = ", ".join(VIEWER_COMMANDS)
             raise UserError(f"the message contains no command; send one of {names}")
@@ -275,7 +277,7 @@ class ViewerHandler:
                 sample=session is not None
                 and name == viewer.chosen_session == self._sample.session,
             )
-            self._put(viewer, MessageKind.TEXT, message)
+            self._put(viewer, MessageKind.SESSION, message)
 
     def _viewers_of(self, session: str) -> list[Viewer]:
         return [v for v in self._viewers if v.shown_session and v.shown_session[0] == session]

@@ -15,7 +15,14 @@ NUM_TEXTS_KEPT = 50
 class MessageKind(Enum):
     """Kind of a queued message; determines how many old messages are kept."""
 
-    TEXT = "text"
+    STATUS = "status"  # this kind and the next six describe a state: the newest always arrives
+    SHAPE_NAMES = "shape names"  # what the weights of the following shapes mean
+    SESSION = "session"
+    FACE = "face"
+    ACOUSTIC = "acoustic"
+    SPEECH = "speech"
+    END = "end"
+    TEXT = "text"  # phones, syllables and errors
     FRAME = "frame"
     SHAPES = "shapes"  # blendshapes of a frame
     REST = "rest"  # the face while no session moves it
@@ -24,6 +31,13 @@ class MessageKind(Enum):
 
 
 _NUM_KEPT = {
+    MessageKind.STATUS: 1,
+    MessageKind.SHAPE_NAMES: 1,
+    MessageKind.SESSION: 1,
+    MessageKind.FACE: 1,
+    MessageKind.ACOUSTIC: 1,
+    MessageKind.SPEECH: 1,
+    MessageKind.END: 1,
     MessageKind.SOUND: 0,
     MessageKind.FRAME: NUM_FRAMES_KEPT,
     MessageKind.SHAPES: NUM_FRAMES_KEPT,
@@ -57,8 +71,8 @@ class ViewerQueue:
         return self._messages.popleft()[1]
 
     def _drop_old(self) -> int:
-        # Sound that is seconds late is useless, and so are the frames of that sound. Text (the
-        # session's name, errors) keeps its order relative to the remaining frames.
+        # Sound that is seconds late is useless, and so are the frames of that sound. The remaining
+        # messages keep their order.
         num_before = len(self._messages)
         num_left = dict(_NUM_KEPT)
         remaining: deque[tuple[MessageKind, str | bytes]] = deque()
@@ -66,5 +80,7 @@ class ViewerQueue:
             if num_left[kind] > 0:
                 num_left[kind] -= 1
                 remaining.appendleft((kind, message))
+            if kind is MessageKind.SHAPE_NAMES:  # older weights have other names
+                num_left[MessageKind.SHAPES] = num_left[MessageKind.REST_SHAPES] = 0
         self._messages = remaining
         return num_before - len(remaining)
