@@ -161,7 +161,14 @@ class Supervisor:
                 self._check_process(service, service.process, now_s)
             if service.process is None and now_s >= service.restart_at_s:
                 service.is_restarting = True
-                self._start(service)
+                try:
+                    self._start(service)
+                except OSError as error:  # such as too many processes or open files
+                    service.restart_at_s = now_s + MAX_BACKOFF_S
+                    self._warn(
+                        f"{service.name} cannot start: {error.strerror}; trying again in"
+                        f" {MAX_BACKOFF_S:g} s"
+                    )
 
     def process(self, name: str) -> ServiceProcess:
         """Return the process of a service; raises ``KeyError`` if it does not run."""
