@@ -27,7 +27,8 @@ class PendingSessions:
     def add(self, start: StartSession) -> bool:
         """Queue a session whose model is not loaded yet; return whether it was queued.
 
-        Raises ``StartFailure`` if no model has the language.
+        Raises ``StartFailure`` if no model has the language, or its model cannot be loaded. The
+        next session with this language tries again.
         """
         language = start.facts.language
         if language in (None, self._language):
@@ -40,7 +41,13 @@ class PendingSessions:
             try:
                 self._models[language].result()
             except UserError as error:
+                del self._models[language]
                 raise StartFailure(ErrorCode.BAD_LANGUAGE, str(error)) from error
+            except (OSError, MemoryError) as error:
+                del self._models[language]
+                reason = str(error) or "not enough memory"
+                text = f"the acoustic model for {language} cannot be loaded: {reason}"
+                raise StartFailure(ErrorCode.NO_SERVICE, text) from error
             return False
         self._starts[start.session] = start
         return True
@@ -55,12 +62,12 @@ class PendingSessions:
             self._starts[session] = start.with_face(start.opening.face.merged_with(face))
 
     def take_ready(self) -> list[StartSession]:
-        """Remove and return the sessions whose model is loaded."""
-        ready = [
-            start
-            for start in self._starts.values()
-            if self._models[start.facts.language or self._language].done()
-        ]
+        """Remove and return the sessions whose model is loaded, or could not be loaded."""
+        ready = [start for start in self._starts.values() if not self._is_loading(start)]
         for start in ready:
             del self._starts[start.session]
         return ready
+
+    def _is_loading(self, start: StartSession) -> bool:
+        loading = self._models.get(start.facts.language or self._language)
+        return loading is not None and not loading.done()
