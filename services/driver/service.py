@@ -1,9 +1,4 @@
-"""The driver service: shows FAP frames in a window, or writes a video.
-
-Reacts to: start-session, close-session (control), fap-frame, end-of-faps (synthesizer), sound
-(recognizer).
-Emits: session-started, recorded, error (control).
-"""
+"""The driver service: shows FAP frames in a window, or writes a video."""
 
 import math
 import time
