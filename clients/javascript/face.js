@@ -141,7 +141,13 @@ export class KouxingFace extends HTMLElement {
   /** The local lip sync: a promise of a LipSync of kouxing-lips. Its sources move the model. */
   get lips() {
     if (!this.hasAttribute("local")) throw new Error("<kouxing-face> needs the attribute local; add it");
-    this.#lips ??= this.#loadLips();
+    if (this.#lips === null) {
+      const loading = this.#loadLips();
+      this.#lips = loading;
+      loading.catch(() => {
+        if (this.#lips === loading) this.#lips = null; // the next call tries again
+      });
+    }
     return this.#lips;
   }
 

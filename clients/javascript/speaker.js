@@ -129,6 +129,7 @@ export class Speaker {
 }
 
 function toPcm(audio, encoding) {
+  // instanceof would not know the types of an iframe.
   const type = Object.prototype.toString.call(audio).slice("[object ".length, -1);
   if (!AUDIO_TYPES.includes(type)) {
     throw new TypeError(`audio must be an Int16Array, a Float32Array or bytes, not ${type}`);
@@ -136,9 +137,9 @@ function toPcm(audio, encoding) {
   if (type === "Float32Array" && !audio.every((value) => Math.abs(value) <= MAX_FLOAT)) {
     throw new RangeError("samples of a Float32Array must be from -1 to 1; divide integers by 32768");
   }
-  if (encoding === "s16le" && audio instanceof Float32Array) {
+  if (encoding === "s16le" && type === "Float32Array") {
     audio = Int16Array.from(audio, (value) => Math.round(32767 * Math.max(-1, Math.min(1, value))));
-  } else if (encoding === "f32le" && audio instanceof Int16Array) {
+  } else if (encoding === "f32le" && type === "Int16Array") {
     audio = Float32Array.from(audio, (value) => value / 32767);
   }
   return ArrayBuffer.isView(audio)

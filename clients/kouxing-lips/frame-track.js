@@ -7,7 +7,7 @@ export class FrameTrack {
 
   /** Append frames { timeS, faps, ... } of the engine. */
   push(frames) {
-    this.#frames.push(...frames);
+    for (const frame of frames) this.#frames.push(frame); // may be too many for spread arguments
     const first = this.#frames.findIndex(({ timeS }) => timeS >= this.#frames.at(-1).timeS - MAX_S);
     this.#frames.splice(0, first);
   }

@@ -35,7 +35,7 @@ export class LipSync extends EventTarget {
   #choice = 0; // number of the newest choice of a source, or of none
   #startS = null; // start of the session on the context's clock; null before the first sound, and for push()
   #isPlayed = false; // whether the page plays the sound
-  #pending = null; // the request that the worker has not answered: { answer, resolve, reject }
+  #pending = null; // the request that the worker has not answered: { message, answer, resolve, reject }
   #isSpeaking = false;
   #isLaughing = false;
   #mayBeSlow = false; // with final phones
@@ -62,7 +62,12 @@ export class LipSync extends EventTarget {
     const lips = new LipSync(worker, context, { shapes, ...options });
     lips.#mayBeSlow = phones === "final";
     worker.onerror = () => lips.#fail("cannot start the worker; serve the package from the page's own origin");
-    await lips.#request("loaded", { type: "load", models: new URL(models, location.href).href, phones });
+    try {
+      await lips.#request("loaded", { type: "load", models: new URL(models, location.href).href, phones });
+    } catch (error) {
+      lips.close();
+      throw error;
+    }
     return lips;
   }
 
@@ -241,7 +246,7 @@ export class LipSync extends EventTarget {
   #request(answer, message, transfer = []) {
     this.#supersede();
     return new Promise((resolve, reject) => {
-      this.#pending = { answer, resolve, reject };
+      this.#pending = { message, answer, resolve, reject };
       this.#worker.postMessage(message, transfer);
     });
   }
@@ -261,7 +266,9 @@ export class LipSync extends EventTarget {
 
   #onMessage({ type, ...data }) {
     if (type === "error") {
-      this.#fail(data.text);
+      const { message } = this.#pending ?? {};
+      if (data.request === message?.type && data.session === message.session) this.#fail(data.text);
+      else this.#report(data.text);
       return;
     }
     if (type !== "loaded" && data.session !== this.#session) return;

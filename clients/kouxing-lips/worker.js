@@ -12,7 +12,7 @@ self.onmessage = async ({ data: { type, ...data } }) => {
     if (NEED_SESSION.includes(type) && !engine) throw new Error("no sound is open; call open() or listenTo() first");
     await HANDLERS[type](data);
   } catch (error) {
-    self.postMessage({ type: "error", text: error.message });
+    self.postMessage({ type: "error", request: type, session: data.session, text: error.message });
   }
 };
 

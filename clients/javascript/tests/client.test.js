@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import test from "node:test";
+import { runInNewContext } from "node:vm";
 import { Speaker, Viewer, readRecording } from "kouxing-client";
 
 const { GATEWAY, SPEECH } = process.env;
@@ -68,6 +69,15 @@ test("wrong options, addresses and audio are rejected", async () => {
   await assert.rejects(speaker.finish(), /looks like the start of a WAV file/);
 });
 
+test("samples of another realm, such as an iframe, are converted too", async () => {
+  const sent = [];
+  const socket = { readyState: WebSocket.OPEN, bufferedAmount: 0, send: (pcm) => sent.push(pcm.byteLength) };
+  for (const [encoding, samples] of [["s16le", "new Float32Array(4)"], ["f32le", "new Int16Array(4)"]]) {
+    await new Speaker(socket, "voice", encoding, () => {}, () => {}).push(runInNewContext(samples));
+  }
+  assert.deepEqual(sent, [8, 16]);
+});
+
 test("a rejected session reports the reason", async () => {
   await assert.rejects(Speaker.open(GATEWAY, { sampleRateHz: 1000 }), /sample_rate_hz must be/);
   await assert.rejects(Speaker.open("http://127.0.0.1:1"), /no gateway at .*kouxing run/);
@@ -120,6 +130,34 @@ test("a session continues after an error, unless the gateway closes the connecti
     assert.equal(texts.at(-1), null);
   } finally {
     globalThis.WebSocket = WebSocket;
+  }
+});
+
+test("after a failed load, <kouxing-face> loads local lip sync again", async () => {
+  class FakeElement {
+    style = {};
+    append() {}
+    attachShadow = () => this;
+    hasAttribute = () => true;
+    getAttribute = () => "";
+  }
+  const names = ["HTMLElement", "ResizeObserver", "customElements", "document"];
+  Object.assign(globalThis, {
+    HTMLElement: FakeElement,
+    ResizeObserver: class {},
+    customElements: { define() {} },
+    document: { createElement: () => new FakeElement() },
+  });
+  try {
+    const { KouxingFace } = await import("kouxing-client/face");
+    const face = new KouxingFace();
+    const first = face.lips;
+    assert.equal(face.lips, first);
+    await assert.rejects(first); // Node has no Worker for it
+    assert.notEqual(face.lips, first);
+    await assert.rejects(face.lips);
+  } finally {
+    for (const name of names) delete globalThis[name];
   }
 });
 

@@ -24,3 +24,10 @@ test("frames of the last minute are kept", () => {
   track.push([frame(70, 3)]);
   assert.equal(track.at(0).faps[0], 2);
 });
+
+test("frames of an hour can come at once", () => {
+  const track = new FrameTrack();
+  track.push(Array.from({ length: 180000 }, (_, number) => frame(number / 50, number)));
+  assert.equal(track.endS, 179999 / 50);
+  assert.equal(track.at(0).timeS, 179999 / 50 - 60);
+});

@@ -7,6 +7,8 @@ import { LipSync } from "../index.js";
 class FakeWorker {
   static newest = null;
   static count = 0;
+  static error = null; // answer to the request to load
+  isTerminated = false;
   messages = [];
   constructor() {
     FakeWorker.newest = this;
@@ -14,14 +16,21 @@ class FakeWorker {
   }
   postMessage(message) {
     this.messages.push(message);
-    if (message.type === "load") this.answer("loaded");
+    if (message.type !== "load") return;
+    if (FakeWorker.error) queueMicrotask(() => this.fail("load", FakeWorker.error));
+    else this.answer("loaded");
   }
   /** Answer the newest request after the current call. */
   answer(type) {
     const { session } = this.messages.at(-1);
     queueMicrotask(() => this.onmessage({ data: { type, session, names: {} } }));
   }
-  terminate() {}
+  fail(request, text, session) {
+    this.onmessage({ data: { type: "error", request, session, text } });
+  }
+  terminate() {
+    this.isTerminated = true;
+  }
 }
 
 class FakeNode {
@@ -65,6 +74,7 @@ let context;
 
 test.beforeEach(() => {
   FakeWorker.count = 0;
+  FakeWorker.error = null;
   stream = new FakeStream();
   context = new FakeContext();
   const getUserMedia = () => new Promise((resolve) => (answerPrompt = () => resolve(stream)));
@@ -100,6 +110,41 @@ async function open() {
 test("unknown options are rejected before the worker starts", async () => {
   await assert.rejects(LipSync.create({ shape: ["arkit"] }), /unknown option shape; use models, .*shapes/);
   assert.equal(FakeWorker.newest, null);
+});
+
+test("a failed load ends the worker", async () => {
+  FakeWorker.error = "the model cannot be loaded";
+  await assert.rejects(LipSync.create({ context }), /the model cannot be loaded/);
+  assert.ok(FakeWorker.newest.isTerminated);
+});
+
+test("an error of another call does not reject open()", async () => {
+  const lips = await LipSync.create();
+  const notices = [];
+  lips.addEventListener("notice", ({ detail }) => notices.push(detail));
+  lips.express({ joy: 1 });
+  const result = lips.open(16000);
+  FakeWorker.newest.fail("express", "no sound is open");
+  FakeWorker.newest.answer("opened");
+  await result;
+  assert.deepEqual(notices, ["no sound is open"]);
+});
+
+test("an error of open() rejects it", async () => {
+  const lips = await LipSync.create();
+  const result = lips.open(0);
+  FakeWorker.newest.fail("open", "wrong rate", 1);
+  await assert.rejects(result, /wrong rate/);
+});
+
+test("the worker names the request that failed", async () => {
+  const messages = [];
+  globalThis.self = { postMessage: (message) => messages.push(message) };
+  await import("../worker.js");
+  await globalThis.self.onmessage({ data: { type: "finish", session: 7 } });
+  delete globalThis.self;
+  const [{ type, request, session }] = messages;
+  assert.deepEqual([type, request, session], ["error", "finish", 7]);
 });
 
 const aborted = { name: "AbortError" };
