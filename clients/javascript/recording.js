@@ -1,5 +1,5 @@
 // Reads the .csv and .jsonl files of `kouxing listen -o` and `kouxing render`, with FAPs or shapes,
-// and takes (.csv) of the app Live Link Face.
+// and takes (.csv) of the app Live Link Face. Frames of a take without a face, with a count of 0, are left out.
 
 const RATE_HZ = 16000;
 // A time code counts frames, but the file does not name their rate. It is the lowest of these above
@@ -12,11 +12,12 @@ const DAY_S = 86400;
  *
  * @param {string} text content of the file
  * @returns { names: of the shapes, or null for the 68 FAPs, frames: [[media time, Float32Array]] }
- * @throws {Error} if the table has no times, or a value is not a number
+ * @throws {Error} if the table has no times or no frames, or a value is not a number
  */
 export function readRecording(text) {
   const lines = text.replace(/^\uFEFF/, "").trim().split(/\r?\n/);
   const recording = lines[0].startsWith("{") ? readJsonLines(lines) : readCsv(lines);
+  if (recording.frames.length === 0) throw new Error("the recording has no frames with a face; record it again");
   const wrong = recording.frames.findIndex(
     ([time, values]) => !Number.isFinite(time) || !values.every(Number.isFinite),
   );
@@ -48,7 +49,8 @@ function readCsv([header, ...lines]) {
   const names = columns.map((column) =>
     isTake ? titles[column][0].toLowerCase() + titles[column].slice(1) : titles[column],
   );
-  const rows = lines.map((line) => line.split(","));
+  const countColumn = titles.findIndex((title) => /^blendshapecount$/i.test(title));
+  const rows = lines.map((line) => line.split(",")).filter((row) => row[countColumn]?.trim() !== "0");
   const times = rows.map((row) => row[timeColumn]);
   const timesS = isTake ? readTimeCodes(times) : times.map(Number);
   return {
@@ -60,9 +62,9 @@ function readCsv([header, ...lines]) {
   };
 }
 
-/** Return the seconds since the first of the time codes HH:MM:SS:FF.fff. */
+/** Return the seconds since the first of the time codes HH:MM:SS:FF.fff, or HH:MM:SS;FF.fff if frames are dropped. */
 function readTimeCodes(codes) {
-  const fields = codes.map((code) => code.split(":").map(Number));
+  const fields = codes.map((code) => code.split(/[:;]/).map(Number));
   const crossesSecond = fields.some(([, , second]) => second !== fields[0][2]);
   const lastFrame = fields.reduce((last, [, , , frame]) => Math.max(last, frame), 0);
   const lowestHz = crossesSecond ? lastFrame : Math.max(59, lastFrame);
