@@ -1,5 +1,6 @@
 // <kouxing-face>: a GLB or VRM model that a session, a recording or local lip sync moves.
 
+import { VRMUtils } from "@pixiv/three-vrm";
 import * as THREE from "three";
 import { Blinks } from "./blinks.js";
 import { DrawRate, ImageQueue, drawsInSoftware } from "./page/draw-rate.js";
@@ -79,6 +80,8 @@ export class KouxingFace extends HTMLElement {
     this.#disconnect();
     this.#closeLips();
     this.#sound.close();
+    this.#removeAvatar();
+    this.#images?.close();
     this.#renderer?.dispose();
     this.#renderer = null;
   }
@@ -174,8 +177,7 @@ export class KouxingFace extends HTMLElement {
   async #load() {
     const [loadId, url] = [++this.#loadId, this.getAttribute("src")];
     this.#disconnect();
-    if (this.#avatar) this.#scene.remove(this.#avatar.scene);
-    this.#avatar = null;
+    this.#removeAvatar();
     if (!url) return;
     try {
       const avatar = await loadPuppet(url);
@@ -195,6 +197,13 @@ export class KouxingFace extends HTMLElement {
     this.#camera.lookAt(view.target);
     this.dispatchEvent(new Event("load"));
     this.#connect();
+  }
+
+  #removeAvatar() {
+    if (this.#avatar === null) return;
+    this.#scene.remove(this.#avatar.scene);
+    VRMUtils.deepDispose(this.#avatar.scene); // otherwise it stays in the graphics card's memory
+    this.#avatar = null;
   }
 
   #showError(error, message) {

@@ -277,6 +277,19 @@ def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser
     assert right == pytest.approx([0.0, -12.3], abs=0.01)
 
 
+def test_the_web_component_frees_the_memory_of_a_model_that_it_no_longer_shows(
+    faces: Browser,
+) -> None:
+    faces.steady_image()  # the models are in the graphics card's memory
+    faces.evaluate(
+        "window.numFreed = 0; const { deleteBuffer } = WebGL2RenderingContext.prototype;"
+        "WebGL2RenderingContext.prototype.deleteBuffer = function (buffer) {"
+        " window.numFreed++; return deleteBuffer.call(this, buffer); }; 1"
+    )
+    assert faces.evaluate("arkit.setAttribute('src', 'own.glb'); numFreed") > 0
+    assert faces.evaluate("window.numFreed = 0; vrm.remove(); numFreed") > 0
+
+
 @contextlib.contextmanager
 def speaking_session(system: System) -> Iterator[None]:
     """Speak in the session that the faces show."""

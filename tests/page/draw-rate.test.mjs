@@ -87,6 +87,9 @@ test("images of a page that was hidden in the meantime do not count", (t) => {
   assert.equal(numVisible, 20);
   show(1900, false);
   assert.ok(drawRate.visibleDelayMs >= 1900, `${drawRate.visibleDelayMs}`);
+  queue.close();
+  show(40, true);
+  assert.equal(numVisible, 22); // it no longer follows whether the page is hidden
 });
 
 test("images that take very long get fewer pixels within seconds", () => {

@@ -120,7 +120,12 @@ export class ImageQueue {
   constructor(gl, drawRate) {
     this.#gl = gl;
     this.#drawRate = drawRate;
-    document.addEventListener("visibilitychange", () => (this.#hiddenMs = performance.now()));
+    document.addEventListener("visibilitychange", this.#onVisibility);
+  }
+
+  /** Stop following whether the page is hidden. */
+  close() {
+    document.removeEventListener("visibilitychange", this.#onVisibility);
   }
 
   /**
@@ -152,6 +157,8 @@ export class ImageQueue {
       });
     });
   }
+
+  #onVisibility = () => (this.#hiddenMs = performance.now());
 
   #whenDone(callback) {
     const gl = this.#gl;
