@@ -10,6 +10,7 @@ import threading
 from array import array
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,38 @@ def test_a_session_streams_audio_and_receives_results(control: FakeControl, clie
     assert control.sessions_of(CloseSession) == ["s"]
     with pytest.raises(KouxingError, match="closed"):
         session.push(CHUNK)
+
+
+def test_on_result_cannot_call_methods_that_wait(control: FakeControl, client: Client) -> None:
+    session = client.open_session("s")
+    errors: list[str] = []
+
+    def on_result(_frame: FapFrame) -> None:
+        for method in (
+            client.close,
+            client.status,
+            partial(client.open_session, "t"),
+            partial(client.follow, "s"),
+            partial(session.push, CHUNK),
+            session.flush,
+            session.set_face,
+            session.frames,
+            session.close,
+        ):
+            with pytest.raises(KouxingError) as raised:
+                method()
+            errors.append(str(raised.value))
+        session.try_push(CHUNK)
+        session.finish()
+
+    session.results(FapFrame, on_result=on_result)
+    control.publish(control.faps, frame(1))
+    wait_until(lambda: len(control.audio_messages) == 2)
+    assert len(errors) == 9
+    assert {error.partition(";")[0] for error in errors} == {
+        "on_result cannot call a method that waits for an answer"
+    }
+    assert not client.is_closed
 
 
 def test_refusals_of_requests_and_of_audio_are_reported(
@@ -258,7 +291,7 @@ def test_a_request_of_another_thread_fails_while_the_client_ends(
 
     def close_late(failure: KouxingError) -> None:
         close(failure)
-        answers.append(thread.submit(lambda core: core.request("status-request")))
+        answers.append(thread.start(lambda core: core.request("status-request")))
 
     monkeypatch.setattr(thread.core, "close", close_late)
     client.close()

@@ -85,7 +85,9 @@ class BaseClient:
                 closed.set_result(None)
                 return
             core = opened.result()
-            answer = BaseSession(self._thread, core, None)._close()
+            answer = self._thread.start(
+                lambda client: client.request("close-session", core.name, token=core.token)
+            )
             answer.add_done_callback(lambda _: closed.set_result(None))
             self._thread.forget(core)
 

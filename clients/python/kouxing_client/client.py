@@ -42,6 +42,7 @@ class Client(BaseClient):
 
         After a minute, control closes other sessions that are still open.
         """
+        self._thread.check_may_wait()
         try:
             wait(tuple(self._unused), LAST_ANSWER_S)
         finally:
@@ -111,6 +112,7 @@ class Session(BaseSession):
             If the audio is not valid or has ended, the session has ended, another program opened
             it, or the wait timed out.
         """
+        self._thread.check_may_wait()
         for pcm, num_samples in self._chunks(audio):
             if not self._signal.wait(self._can_push, timeout_s):
                 raise KouxingError(
@@ -136,6 +138,7 @@ class Session(BaseSession):
         """Close the connections of the session, and the session if this program opened it."""
         if self._core.is_over:
             return
+        self._thread.check_may_wait()
         try:
             if self._options is not None:
                 self._signal.wait(self._is_delivered, LAST_ANSWER_S)
@@ -176,6 +179,8 @@ class Session(BaseSession):
             Keep all unread results of a live session instead of the newest 100.
         on_result
             Function that the client's thread calls with each result. Results are then not stored.
+            The function must not wait. Of this client, it may call ``try_push``, ``skip``,
+            ``finish`` and ``take_errors``; methods that wait for an answer raise ``KouxingError``.
         """
         return self._join(classes, shapes, keep_all, on_result)
 
@@ -190,6 +195,7 @@ class Session(BaseSession):
         keep_all: bool = False,
         on_result: Callable[[Any], None] | None = None,
     ) -> Results[Any]:
+        self._thread.check_may_wait()
         inbox, close, joined = self._subscribe(classes, shape_set, keep_all, on_result)
         try:
             joined.result(self._thread.timeout_s)

@@ -64,7 +64,19 @@ class ClientThread:
         if self._has_ended:
             self._sockets.run_calls()
 
+    def check_may_wait(self) -> None:
+        """Raise ``KouxingError`` in ``on_result``, where the thread would wait for itself."""
+        if threading.current_thread() is self._thread:
+            raise KouxingError(
+                "on_result cannot call a method that waits for an answer; call it in another thread"
+            )
+
     def submit(self, function: Callable[[ClientCore], Future[T]]) -> Future[T]:
+        """Let the thread call a function; return a future that the caller may wait for."""
+        self.check_may_wait()
+        return self.start(function)
+
+    def start(self, function: Callable[[ClientCore], Future[T]]) -> Future[T]:
         """Let the thread call a function; return the future that this function returns."""
         if not self.is_running:
             raise KouxingError("the client is closed")
