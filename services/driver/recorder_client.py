@@ -57,8 +57,9 @@ class _RecorderProcess:
 class RecorderClient:
     """Passes each session's frames and sound to its video.
 
-    ``on_written`` receives the start of the session and its video's path. ``on_failed`` receives
-    the start and the reason why its video is incomplete or missing.
+    ``on_written`` receives the start of the session and its video's path. ``on_short`` receives
+    the start and the reason why its video ends early; ``on_written`` follows. ``on_failed``
+    receives the start and the reason why no complete video exists.
     """
 
     def __init__(
@@ -66,11 +67,13 @@ class RecorderClient:
         config: DriverConfig,
         *,
         on_written: Callable[[StartSession, Path], None],
+        on_short: Callable[[StartSession, str], None],
         on_failed: Callable[[StartSession, str], None],
         on_image: Callable[[], None],
     ) -> None:
         self._config = config
         self._on_written = on_written
+        self._on_short = on_short
         self._on_failed = on_failed
         self._on_image = on_image
         self._numbers = count()
@@ -189,6 +192,8 @@ class RecorderClient:
             del self._open[start.session]
         if kind == "written":
             self._on_written(start, detail)
+        elif kind == "short":
+            self._on_short(start, detail)
         else:
             self._on_failed(start, detail)
 

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,8 @@ class DriverService(SessionService):
         self.recorder = RecorderClient(
             config,
             on_written=self._report_written,
-            on_failed=self._report_failure,
+            on_short=partial(self._report_error, ErrorCode.SHORT_VIDEO),
+            on_failed=partial(self._report_error, ErrorCode.NO_VIDEO),
             on_image=lambda: self.metrics.count("video_ms", round(1000 / config.frame_rate_hz)),
         )
 
@@ -194,6 +196,6 @@ class DriverService(SessionService):
         LOG.info("wrote %s", path, extra={"session": start.session})
         self.publish_event(EventName.RECORDED, start, str(path))
 
-    def _report_failure(self, start: StartSession, reason: str) -> None:
+    def _report_error(self, code: ErrorCode, start: StartSession, reason: str) -> None:
         LOG.error(reason, extra={"session": start.session})
-        self.publish_event(EventName.ERROR, start, f"{ErrorCode.NO_VIDEO}: {reason}")
+        self.publish_event(EventName.ERROR, start, f"{code}: {reason}")

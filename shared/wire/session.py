@@ -44,6 +44,7 @@ class ErrorCode(StrEnum):
     NO_VIDEO = "no-video"
     NOT_ALLOWED = "not-allowed"
     SESSION_EXISTS = "session-exists"
+    SHORT_VIDEO = "short-video"
     TIMEOUT = "timeout"
     TOO_MANY_SERVICES = "too-many-services"
     TOO_MANY_SESSIONS = "too-many-sessions"

@@ -166,6 +166,18 @@ def test_reports_an_unwritable_video_to_control(tmp_path: Path, harness: DriverH
     assert harness.events("error")[0].detail.startswith("no-video: ")
 
 
+def test_reports_a_video_that_ends_early_before_it_is_written(harness: DriverHarness) -> None:
+    harness.start("film", record=True)
+    harness.publish("film", 0, 100.0)
+    harness.step_until(harness.unfinished)
+    videos = harness.driver.recorder
+    number = videos._open["film"]
+    videos._send("film", "end")
+    videos._on_report("short", number, "too many frames")
+    harness.step_until(partial(harness.has_recorded, 1))
+    assert [event.detail for event in harness.events("error")] == ["short-video: too many frames"]
+
+
 def test_refuses_more_videos_than_the_limit(harness: DriverHarness) -> None:
     for number in range(4):
         harness.start(f"film-{number}", record=True)

@@ -96,7 +96,8 @@ class _Streamer:
         self._session = session
         self._source = source
         self._console = console
-        self._is_recorded = is_recorded
+        self._awaits_video = is_recorded
+        self._video = ""  # path of the written video
         self._duration_s = self._clipped = self._peak = 0.0  # statistics of the sent audio
         self._num_phones = 0
         self._events = session.events()
@@ -115,7 +116,7 @@ class _Streamer:
     def summarize(self, drawn_before_s: float) -> StreamSummary:
         """Wait for the video, if any; print warnings, and return the summary."""
         source = self._source
-        video = self._wait_for_video(drawn_before_s) if self._is_recorded else ""
+        self._wait_for_video(drawn_before_s)
         if not self._num_phones:
             reason = "; it is silent" if self._peak < QUIET_PEAK else ""
             self._warn(f"{source.name}: no speech was found{reason}")
@@ -123,7 +124,7 @@ class _Streamer:
             self._warn(missed_warning(self._phones.num_missed, "phone"))
         for warning in (*source.warnings, *clipping_warnings(source.name, self._clipped)):
             self._warn(warning)
-        return StreamSummary(self._session.name, self._duration_s, self._num_phones, video)
+        return StreamSummary(self._session.name, self._duration_s, self._num_phones, self._video)
 
     def _update(self, timeout_s: float) -> None:
         """Process received results, waiting up to the timeout for a phone."""
@@ -179,28 +180,29 @@ class _Streamer:
             self._warn(str(error))
             if error.code in ("unknown-session", "bad-token", "finished"):
                 raise UserError("the session was lost; run the command again")
-        for event in self._events.available():
-            if event.name == "error":
-                self._warn(event.detail)
-                self._is_recorded &= not event.detail.startswith("no-video")
+        self._read_events(0.0)
 
-    def _wait_for_video(self, drawn_before_s: float) -> str:
-        """Wait for the driver's video; return its path, or an empty string."""
+    def _read_events(self, timeout_s: float) -> None:
+        """Print the errors among the events, and keep the path of the video."""
+        for event in self._events.available(timeout_s):
+            if event.name == "recorded":
+                self._video, self._awaits_video = event.detail, False
+            elif event.name == "error":
+                self._warn(event.detail)
+                self._awaits_video &= not event.detail.startswith("no-video")
+
+    def _wait_for_video(self, drawn_before_s: float) -> None:
+        """Wait for the driver's video, unless it is written or has failed."""
         with _new_progress(self._console) as progress:
             task = progress.add_task("writing the video", total=self._duration_s)
             newest_s = drawn_before_s
-            while True:
+            while self._awaits_video:
                 drawn_s = _drawn_s(self._client, DRIVER_TIMEOUT_S)
                 if drawn_s < newest_s:
                     raise UserError("the driver restarted, so the video is incomplete; try again")
                 newest_s = drawn_s
                 progress.update(task, completed=drawn_s - drawn_before_s)
-                for event in self._events.available(STATUS_S):
-                    if event.name == "recorded":
-                        return event.detail
-                    if event.detail.startswith("no-video"):
-                        self._warn(event.detail)
-                        return ""
+                self._read_events(STATUS_S)
 
     def _warn(self, text: str) -> None:
         _warn(self._console, text)

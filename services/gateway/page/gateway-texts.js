@@ -143,6 +143,7 @@ const REASONS = {
   "no-video": "无法录制视频，请查看驱动服务的日志",
   "not-allowed": "网关的密钥没有权限，见 kouxing keys list",
   "session-exists": "同名会话已存在",
+  "short-video": "视频提前结束",
   timeout: "服务没有及时应答，请重试",
   "too-many-services": "服务太多，请先停止一些",
   "too-many-sessions": "会话太多，请先关闭一些",
