@@ -31,7 +31,7 @@ ERROR_COST = 4.0  # cost for the sender's budget of a message that is answered w
 ANSWER_COST = 0.25  # cost per KiB of an answer: the longest status report is 15 MB
 MAX_PARTS = 4
 MAX_DROPPED = 20_000  # parts of one message that are dropped before the next socket
-MAX_SUBSCRIPTIONS = 4096  # subscriptions; with more, every message is encoded
+MAX_SUBSCRIPTIONS = 4096  # to different topics; with more, every message is encoded
 MAX_BATCH = 200  # messages from one socket before the next socket
 OnSubscribe = Callable[[str], Sequence[Message]]  # a session to the messages to publish again
 T = TypeVar("T", int, str)
@@ -75,6 +75,7 @@ class Socket:
         self._name = secrets.token_hex(8)
         self._subscribed_topics: set[bytes] = set()  # subscriptions, now or before
         self._prefixes: tuple[bytes, ...] = ()  # prefixes that are not a whole topic
+        self._max_topics = MAX_SUBSCRIPTIONS  # then ended subscriptions are forgotten
 
     @property
     def endpoint(self) -> str:
@@ -115,12 +116,24 @@ class Socket:
 
     def _add_subscription(self, subscription: bytes) -> None:
         """Record that a subscription, a topic or a prefix of topics, is in effect."""
-        if len(self._subscribed_topics) == MAX_SUBSCRIPTIONS:
-            self._prefixes = (b"",)
-        elif subscription not in self._subscribed_topics:
+        if len(self._subscribed_topics) >= self._max_topics:
+            self._forget_ended_subscriptions()
+        if subscription not in self._subscribed_topics:
             self._subscribed_topics.add(subscription)
-            if subscription.count(b"/") < 2:  # not a whole topic
+            if not _is_whole_topic(subscription):
                 self._prefixes += (subscription,)
+
+    def _forget_ended_subscriptions(self) -> None:
+        """Keep only the subscriptions of open connections."""
+        if self._limited is None:
+            return
+        connections = self._limited.limiter.connections_to(self._limited)
+        topics = {label for connection in connections for label in connection.topics}
+        is_full = len(topics) >= MAX_SUBSCRIPTIONS
+        prefixes = (label for label in topics if not _is_whole_topic(label))
+        self._prefixes = (b"",) if is_full else tuple(prefixes)
+        self._subscribed_topics = topics
+        self._max_topics = max(MAX_SUBSCRIPTIONS, 2 * len(topics))
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:
         """Subscribe to a kind of message, of one session or of all (None)."""
@@ -280,6 +293,10 @@ class Socket:
             )
             for message in repeated:
                 self.send(message)
+
+
+def _is_whole_topic(subscription: bytes) -> bool:
+    return subscription.count(b"/") >= 2
 
 
 def _property(frame: zmq.Frame, name: int | str, default: T) -> T:

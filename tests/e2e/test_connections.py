@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from kouxing_client.field_types import MAX_AUDIO_BYTES
-from kouxing_client.messages import FapFrame, Message
+from kouxing_client.messages import EndOfFaps, FapFrame, Message
 
-from kouxing.shared.network import connection_limits, peer_quota, tarpit
+from kouxing.shared.network import connection_limits, peer_quota, sockets, tarpit
 from kouxing.shared.network.bus import Bus
 from kouxing.shared.network.connection_limits import (
     MAX_TOPIC_BYTES,
@@ -21,6 +21,7 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.session import AudioChunk
 from kouxing.shared.wire.speech import Progress
 from tests.raw_bytes import connect_raw, frame
+from tests.samples import fap_frame
 from tests.system import LIMIT_S, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -126,6 +127,27 @@ def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:
             return b"joined/s/" in answer
 
         wait_until(has_joined)
+
+
+def test_ended_subscriptions_do_not_make_a_publisher_encode_every_message(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sockets, "MAX_SUBSCRIPTIONS", 8)
+    faps = bus.bind_publisher(LOCAL, "faps")
+    limited = faps._limited
+    assert limited is not None
+    with connect_raw(port_of(faps), "SUB") as subscriber:
+        subscriber.sendall(frame(b"\x01fap-frame/kept/") + frame(b"\x01end-of-faps/"))
+        for number in range(20):
+            topic = f"fap-frame/{number}/".encode()
+            subscriber.sendall(frame(b"\x01" + topic) + frame(b"\x00" + topic))
+        subscriber.sendall(frame(b"\x01joined/s/"))
+        wait_until(lambda: limited.num_sent == 1, step=lambda: [*faps.receive()])
+        faps.send(fap_frame("nobody", 0, bytes(272)))
+        assert limited.num_sent == 1
+        faps.send(fap_frame("kept", 0, bytes(272)))
+        faps.send(EndOfFaps(session="any", epoch=1))
+        assert limited.num_sent == 3
 
 
 def test_disconnects_a_peer_with_too_many_subscriptions(
