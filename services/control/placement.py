@@ -52,12 +52,13 @@ class Placement:
         return workers
 
     def missing_kinds(self) -> list[str]:
-        """Return the kinds of worker that every session needs and that do not run."""
+        """Return the kinds of worker that every session needs but that are not running."""
         missing = {
             PROVIDERS[endpoint]
             for endpoint in CLIENT_NEEDS
             if not any(
-                record.state == "ready" for record in self._registry.providers(endpoint).values()
+                _can_serve(record, language=None)
+                for record in self._registry.providers(endpoint).values()
             )
         }
         return sorted(missing)
