@@ -22,7 +22,7 @@ class Table:
 
 
 def show_results(json_file: Path | None, results: object, *tables: Table) -> None:
-    """Print the tables of a command. If there is a JSON file, write the results to it."""
+    """Print the tables of a command, and write its results to a JSON file (None: no file)."""
     console = Console()
     for table in tables:
         print_table(console, table.columns, table.rows, title=table.title)

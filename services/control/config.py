@@ -25,7 +25,8 @@ class ControlConfig(ServiceConfig):
     """Maximum number of open sessions. One key can open at most three quarters of them."""
     max_load: Annotated[float, Field(ge=0.1, le=1000)] = 0.8
     """Control rejects new sessions that would keep a worker busy for more than this fraction of the
-    time. The rest is for sessions that move. 1000 admits all sessions."""
+    time. The rest is reserved for sessions that move from another worker. 1000 admits all
+    sessions."""
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which control closes a session."""
     lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9

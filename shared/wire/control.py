@@ -98,7 +98,7 @@ class HeartbeatReply(RegisteredMessage, frozen=True, kw_only=True):
     keys: Annotated[dict[Name, AllowedKey], Meta(max_length=MAX_KEYS)] | None = (
         None  # keys that may connect to the worker, by public key; None: as before
     )
-    # kinds of worker that every session needs and that do not run
+    # kinds of worker that every session needs but that are not running
     missing: Annotated[list[Name], Meta(max_length=16)] = field(default_factory=list)
 
 

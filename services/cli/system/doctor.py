@@ -147,7 +147,7 @@ def _check_service(
 def _concerns_host(
     service: str, name: str, endpoint: str, keys: Collection[str], *, is_one_host: bool
 ) -> bool:
-    """Return whether programs of this host provide an endpoint or connect to it.
+    """Return whether programs of this host provide or use an endpoint.
 
     ``keys`` are the names of this host's keys. A service's key has the name of the service.
     """
