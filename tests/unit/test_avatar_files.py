@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import DracoPy
+import meshopt
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -118,11 +119,36 @@ def draco(document: dict[str, Any], binary: bytearray) -> None:
     document["extensionsRequired"] = ["KHR_draco_mesh_compression"]
 
 
+def compress_with_meshopt(document: dict[str, Any], binary: bytearray) -> None:
+    """Compress the positions and triangles of the first mesh, the skin."""
+    primitive = document["meshes"][0]["primitives"][0]
+    for number, kind, mode in (
+        (primitive["attributes"]["POSITION"], "<f4", "ATTRIBUTES"),
+        (primitive["indices"], "<u4", "TRIANGLES"),
+    ):
+        place, array = content(document, binary, number, kind)
+        binary[place] = bytes(array.nbytes)
+        encoded = meshopt.encode_gltf_buffer(array, mode)
+        view = document["bufferViews"][document["accessors"][number]["bufferView"]]
+        view["extensions"] = {
+            "EXT_meshopt_compression": {
+                "buffer": 0,
+                "byteOffset": len(binary),
+                "byteLength": len(encoded),
+                "byteStride": array.strides[0] if mode == "ATTRIBUTES" else array.itemsize,
+                "count": len(array) if mode == "ATTRIBUTES" else array.size,
+                "mode": mode,
+            }
+        }
+        binary += encoded + b"\0" * (-len(encoded) % 4)
+    document["extensionsRequired"] = ["EXT_meshopt_compression"]
+
+
 @pytest.mark.parametrize(
     "change",
     [
         *(names_in_primitives, names_in_accessors, one_eye_mirrored, lights),
-        *(texture_of_an_extension, null_binds, data_uri, draco),
+        *(texture_of_an_extension, null_binds, data_uri, draco, compress_with_meshopt),
         *(partial(transform, kind) for kind in TRANSFORMS),
     ],
 )
@@ -136,6 +162,20 @@ def test_reads_files_of_other_programs(
     for part in ("skin", "eye_right"):  # the triangles face outwards
         normals, wanted = (model.normals[model.part(part).vertices] for model in (head, ORIGINAL))
         assert (normals * wanted).sum(axis=1).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"byteLength": 20}, {"count": -1}, {"byteStride": 0}, {"mode": "X"}]
+)
+def test_rejects_damaged_compressed_data(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    def change(document: dict[str, Any], binary: bytearray) -> None:
+        compress_with_meshopt(document, binary)
+        for view in document["bufferViews"]:
+            view.get("extensions", {}).get("EXT_meshopt_compression", {}).update(wrong)
+
+    path = edit(write_glb(tmp_path / "my.glb", meshes({"jawOpen": SHAPES["jawOpen"]})), change)
+    with pytest.raises(UserError, match=r"my\.glb: the file is damaged"):
+        read_glb(path)
 
 
 def test_applies_default_weights_of_other_shapes_only(tmp_path: Path) -> None:

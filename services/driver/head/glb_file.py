@@ -138,11 +138,16 @@ class GlbFile:
         return self._decompressed(index) if is_compressed else self._slice(view)
 
     def _decompress(self, index: object) -> bytes:
-        from kouxing.services.driver.head.meshopt import decode_view  # noqa: PLC0415 - slow
+        import meshopt  # noqa: PLC0415 - few files need it
 
         compressed = self.item("bufferViews", index)["extensions"][_MESHOPT]
-        self._allow(int(compressed["count"]) * int(compressed["byteStride"]))
-        return decode_view(self._slice(compressed), compressed)
+        count, stride = int(compressed["count"]), int(compressed["byteStride"])
+        self._allow(count * stride)
+        mode, kind = str(compressed["mode"]), str(compressed.get("filter", "NONE"))
+        data: NDArray[Any] = meshopt.decode_gltf_buffer(
+            self._slice(compressed), count, stride, mode, kind
+        )
+        return data.tobytes()
 
     def _slice(self, view: dict[str, Any]) -> bytes:
         start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
