@@ -126,6 +126,21 @@ def test_prediction_and_phone_decide_a_closure_together(
     assert height < 10.0 if shuts else height > 190.0
 
 
+@pytest.mark.parametrize("is_flushed", [True, False])
+def test_lips_do_not_pass_through_each_other_after_an_interrupted_closure(
+    is_flushed: bool,
+) -> None:
+    face = speaking_face()
+    closing = run(face, 0.0, 0.56, closing_lips(0.95))
+    assert -400.0 < closing[-1][1][3] + closing[-1][1][4] < -100.0
+    if is_flushed:
+        face.flush()
+        after = run(face, 0.56, 0.8, lip_positions)
+    else:
+        after = face.relax(10)
+    assert all(faps[3] + faps[4] <= 0.0 for _, faps in after)
+
+
 def test_a_phone_that_is_known_too_late_closes_nothing() -> None:
     sound = closing_lips(0.1, end_s=0.7)
     frames = run(speaking_face(), 0.0, 1.0, sound, [(0.64, phone("p", 0.46))])

@@ -240,6 +240,7 @@ class LearnedStream:
 
     def _frame(self, articulation: Articulation) -> MouthFrame:
         faps = self._mouth.value.copy()
+        separate_lips(faps)  # an interrupted closing movement overshoots
         blend_with_ajar(faps, self._ajar)
         faps[_UNTRACKED] = self._tongue[_UNTRACKED]
         return MouthFrame(faps, articulation)
