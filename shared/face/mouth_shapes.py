@@ -97,6 +97,6 @@ def _cues(
         mouth = mouth_of(time_s, faps)
         if mouth != shown and (mouth == candidate or mouth in at_once or not shown):
             yield (since_s if mouth == candidate else time_s), mouth
-            shown = mouth
+            shown = candidate = mouth
         elif mouth != candidate:
             candidate, since_s = mouth, time_s

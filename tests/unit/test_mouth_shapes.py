@@ -64,6 +64,11 @@ def test_one_frame_is_too_short_except_for_a_closure() -> None:
     assert letters == ["C", "A", "C"]
 
 
+def test_a_closure_between_equal_mouths_keeps_the_order_of_cues() -> None:
+    frames = [OPEN, OPEN, WIDE, REST, WIDE, WIDE]
+    assert list(mouth_cues(enumerate(frames))) == [(0, "C"), (3, "A"), (4, "D")]
+
+
 def test_oculus_visemes_are_found_again() -> None:
     names = [name for _, name in oculus_cues(enumerate(np.repeat(MPEG4_VISEMES, 2, axis=0)))]
     assert names == list(OCULUS.names)
