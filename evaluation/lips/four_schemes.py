@@ -157,6 +157,7 @@ def make_frames(
         delay_s=config.delay_ms / 1e3,
         idle_motion=config.idle_motion,
         expressiveness=config.expressiveness,
+        feeling=config.feeling,
     )
     return animate_live(face, face_input(condition, output))
 

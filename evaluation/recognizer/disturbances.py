@@ -116,13 +116,16 @@ def change_speed(samples: Samples, factor: float) -> Samples:
     """Change the speed of speech at constant pitch."""
     hop, search = 160, 120  # 10 and 7.5 ms; segments are two hops long
     window = np.hanning(2 * hop + 1)[: 2 * hop]
-    padded = np.pad(samples.astype(np.float64), (search, 3 * hop + 2 * search))
+    # the middle of segment n is at n hops in the result, and near n hops * factor in the samples
+    padded = np.pad(samples.astype(np.float64), (hop + search, 3 * hop + 2 * search))
     num_segments = int(len(samples) / (hop * factor))
     out = np.zeros((num_segments + 1) * hop)
     source = 0  # start of the last segment
     for number in range(num_segments):
         position = round(number * hop * factor)
-        if number:
+        if number == 0:
+            position = search
+        else:
             continuation = padded[source + hop : source + 3 * hop]  # the natural continuation
             near = padded[position : position + 2 * search + 2 * hop]
             energy = np.convolve(near**2, np.ones(2 * hop), "valid")

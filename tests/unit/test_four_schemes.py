@@ -2,14 +2,28 @@
 
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import soundfile
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
-from kouxing.evaluation.lips.four_schemes import delay_by_one_phone, without_corrections
+from kouxing.evaluation.lips.four_schemes import LIVE as LIVE_SCHEME
+from kouxing.evaluation.lips.four_schemes import (
+    RECOGNIZED,
+    Condition,
+    RecognizedSentence,
+    RecognizerOutput,
+    delay_by_one_phone,
+    make_frames,
+    without_corrections,
+)
+from kouxing.services.lip_models import lip_model_info
+from kouxing.services.recording_pipeline import AnalyzedRecording
+from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio.audio_file import check_video
+from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.corpora import write_manifest
 from tests.lips import phone
@@ -66,6 +80,25 @@ def test_scheme_4_delays_each_phone_by_one() -> None:
         Progress(time_s=0.1, level_db=-20.0),
     ]
     assert isinstance(changed[-1], SpeechChange)
+
+
+@pytest.mark.parametrize("scheme", [RECOGNIZED, LIVE_SCHEME])
+def test_every_scheme_shows_the_feeling_of_the_voice(scheme: int) -> None:
+    events: list[SoundEvent] = [SpeechChange(active=True, time_s=0.0)]
+    events += [Progress(time_s=0.02 * k, level_db=-20.0, arousal=1.0) for k in range(1, 50)]
+    delay_s = lip_model_info("learned").delay_ms / 1e3
+    offline = AnalyzedRecording(duration_s=1.0, events=events, is_text_known=False)
+    output = RecognizerOutput(offline, {delay_s: events}, uses_paper_rule=False)
+    sentence = RecognizedSentence(Mock(), None, {"blocks": output})
+
+    def brow(feeling: float) -> float:
+        config = SynthesizerConfig(idle_motion=False, feeling=feeling)
+        frames = make_frames(Condition(scheme, "learned", "blocks"), sentence, config)
+        assert frames is not None
+        return max(float(faps[FAP_NUMBER["raise_l_m_eyebrow"] - 1]) for _, faps in frames)
+
+    assert brow(0.0) == 0.0
+    assert brow(1.0) > 20.0
 
 
 def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:

@@ -6,7 +6,11 @@ import pytest
 
 from kouxing.corpora.scoring import align_symbols
 from kouxing.evaluation.recognizer.aligned_corpus import align_corpus
-from kouxing.evaluation.recognizer.disturbances import check_conditions, disturbances_for
+from kouxing.evaluation.recognizer.disturbances import (
+    change_speed,
+    check_conditions,
+    disturbances_for,
+)
 from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
 from kouxing.evaluation.recognizer.synthetic_sounds import varying_noise as noise
 from kouxing.evaluation.report.recognition_table import speech_table
@@ -84,3 +88,12 @@ def test_a_corpus_with_bad_rows_is_evaluated(
         UserError, match="unknown condition 'rain'; choose from: clean, noise 10 dB"
     ):
         check_conditions(["clean", "rain"])
+
+
+@pytest.mark.parametrize("speed", [0.8, 2.0])
+def test_a_change_of_speed_moves_sounds_to_their_new_times(speed: float) -> None:
+    time_s = np.arange(32_000) / 16_000
+    burst = noise(2.0) * np.exp(-(((time_s - 1.0) / 0.1) ** 2))
+    power = change_speed(burst.astype(np.float32), speed) ** 2
+    middle_s = float(np.sum(np.arange(len(power)) * power) / np.sum(power)) / 16_000
+    assert middle_s == pytest.approx(1.0 / speed, abs=0.003)
