@@ -1,4 +1,7 @@
 // Reads ONNX files: the fields of Protocol Buffers that a graph needs (onnx.proto3).
+//
+// No package is used, because pages load these modules without a bundler. `kouxing export web` cannot convert the
+// files instead: the package onnx is not among the dependencies of kouxing.
 
 import { halfToFloat } from "./math.js";
 

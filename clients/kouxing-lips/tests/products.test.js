@@ -1,9 +1,10 @@
 import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import test from "node:test";
-import wabt from "wabt";
+import asc from "assemblyscript/asc";
 import { BINARY, ProductMemory } from "../engine/products.js";
 
+const ENGINE = new URL("../engine/", import.meta.url);
 const MEMORY_BYTES = 1 << 20;
 
 let seed = 1;
@@ -18,10 +19,15 @@ function stored(memory, Type, values) {
   return array;
 }
 
-test("the binary code equals products.wat", async () => {
-  const text = await readFile(new URL("../engine/products.wat", import.meta.url), "utf8");
-  const { buffer } = (await wabt()).parseWat("products.wat", text, { simd: true }).toBinary({});
-  assert.equal(Buffer.from(buffer).toString("base64"), BINARY);
+test("the binary code equals products.ts", async () => {
+  let binary;
+  const options = ["products.ts", "--outFile", "binary", "--runtime", "stub", "--importMemory", "--noExportMemory", "--enable", "simd", "-O3"];
+  const { error, stderr } = await asc.main(options, {
+    readFile: (name) => readFile(new URL(name, ENGINE), "utf8").catch(() => null),
+    writeFile: (_name, content) => (binary = content),
+  });
+  assert.equal(error, null, stderr.toString());
+  assert.equal(Buffer.from(binary).toString("base64"), BINARY);
 });
 
 for (const [rows, size, columns] of [
