@@ -38,7 +38,7 @@ def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator
         while results:
             yield results.popleft().result()
     except BaseException:
-        for process in [*pool._processes.values()]:
+        for process in [*pool._processes.values()]:  # kill_workers() needs Python 3.14
             process.kill()
         raise
     finally:

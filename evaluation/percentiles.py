@@ -3,12 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.monitoring.metrics import percentile
-
 
 def percentiles(values: NDArray[np.float64]) -> dict[str, float]:
     """Return the 50th and the 95th percentile, ``p50`` and ``p95``; empty without values."""
     if not values.size:
         return {}
-    ordered = sorted(values.tolist())
-    return {f"p{percent}": percentile(ordered, percent) for percent in (50, 95)}
+    return {f"p{percent}": float(np.percentile(values, percent)) for percent in (50, 95)}

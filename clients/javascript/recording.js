@@ -1,5 +1,6 @@
 // Reads the .csv and .jsonl files of `kouxing listen -o` and `kouxing render`, with FAPs or shapes,
 // and takes (.csv) of the app Live Link Face. Frames of a take without a face, with a count of 0, are left out.
+// The values of these tables are numbers, times and names without commas or quotes, so no CSV package is needed.
 
 const RATE_HZ = 16000;
 // A time code counts frames, but the file does not name their rate. It is the lowest of these above

@@ -1,4 +1,7 @@
-"""A headless Chromium with one page, driven by the Chrome DevTools Protocol."""
+"""A headless Chromium with one page, driven by the Chrome DevTools Protocol.
+
+Playwright is not used: its package has 53 MB, because it contains Node.
+"""
 
 import asyncio
 import contextlib

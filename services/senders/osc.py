@@ -10,6 +10,10 @@ address                 types  value
 
 ``?prefix=`` replaces ``/kouxing/``. The messages of a frame are sent as bundles for immediate
 display. Each bundle fits in one Ethernet frame.
+
+python-osc encodes each address once. Its bundle builder would need 1.1 ms instead of 0.1 ms for the
+54 messages of a frame. Its parser would need 1.6 ms instead of 0.6 ms for 115 messages of a
+tracker.
 """
 
 import math

@@ -1,4 +1,8 @@
-"""Recognizes the formats of audio and other files by their first bytes."""
+"""Recognizes the formats of audio and other files by their first bytes.
+
+puremagic 2.2 is not used: it does not recognize 9 of 28 formats that FFmpeg writes, such as MP2 and
+MPEG transport streams.
+"""
 
 import codecs
 import re

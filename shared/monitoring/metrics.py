@@ -75,7 +75,10 @@ class Metrics:
 
 
 def percentile(ordered: Sequence[float], percent: int) -> float:
-    """Return a percentile of sorted, non-empty values, interpolated between the nearest two."""
+    """Return a percentile of sorted, non-empty values, interpolated between the nearest two.
+
+    ``statistics.quantiles`` is not used, because it rejects a single value before Python 3.13.
+    """
     index, hundredths = divmod(percent * (len(ordered) - 1), 100)
     lower, upper = ordered[index], ordered[min(index + 1, len(ordered) - 1)]
     return lower + hundredths / 100 * (upper - lower)

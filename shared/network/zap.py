@@ -1,4 +1,8 @@
-"""The ZAP handler (ZeroMQ RFC 27), which checks the key of each new connection."""
+"""The ZAP handler (ZeroMQ RFC 27), which checks the key of each new connection.
+
+pyzmq's ``zmq.auth`` is not used: it always rejects with status 400, after which a peer does not
+retry.
+"""
 
 import threading
 from collections.abc import Callable, Collection

@@ -13,7 +13,7 @@ stay constant, and fall to 0 at the end.
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -27,7 +27,6 @@ MIN_SAVE_S = 30.0  # between two saves
 _MEAN_EXPONENT = 8
 
 N = TypeVar("N", bound=nn.Module)
-_Tensors: TypeAlias = tuple[Tensor, ...] | list[Tensor]
 
 
 def optimize(
@@ -50,7 +49,7 @@ def optimize(
     steps, at the end. Each step has its own random state. The state is saved in ``checkpoint``, and
     training resumes from this file if it exists.
     """
-    averaged = AveragedModel(network, multi_avg_fn=_average)
+    averaged = AveragedModel(network, avg_fn=_average)
     averaged.eval()
     adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
     rates = [group["lr"] for group in adam.param_groups]
@@ -107,7 +106,7 @@ def _load(checkpoint: Path, parts: dict[str, Any]) -> int:
     return int(state["num_steps"])
 
 
-def _average(means: _Tensors, weights: _Tensors, num_before: Tensor | int) -> None:
+def _average(mean: Tensor, weight: Tensor, num_before: Tensor | int) -> Tensor:
     # a tensor stays on its device
     factor: Any = (_MEAN_EXPONENT + 1) / (num_before + _MEAN_EXPONENT + 2)
-    torch._foreach_lerp_(means, weights, [factor] * len(means))
+    return torch.lerp(mean, weight, factor)

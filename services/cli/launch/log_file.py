@@ -1,4 +1,8 @@
-"""The log file of one service: private, limited in size, and harmless when the disk is full."""
+"""The log file of one service: private, limited in size, and harmless when the disk is full.
+
+``RotatingFileHandler`` of ``logging`` is not used: it follows symbolic links, and leaves incomplete
+lines on a full disk.
+"""
 
 import contextlib
 import errno

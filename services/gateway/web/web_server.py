@@ -91,7 +91,11 @@ class _ErrorResponse(web.Response):
 
 
 class _Connection(web.RequestHandler):
-    """One connection. Answers errors that no handler has caught, without a traceback."""
+    """One connection. Answers errors that no handler has caught, without a traceback.
+
+    aiohttp limits each of up to 128 headers to 8 KiB, but not their sum, and queues up to 32
+    requests. ``data_received`` limits both, for which it reads private members of aiohttp.
+    """
 
     def __init__(self, server: web.Server, address: str, log_limit: RateLimit) -> None:
         super().__init__(server, loop=asyncio.get_running_loop(), **_OPTIONS)

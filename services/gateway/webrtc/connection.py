@@ -33,7 +33,10 @@ _NOT_OPUS = "expected an offer that sends an audio track in Opus (opus/48000/2)"
 
 
 def use_addresses(addresses: Sequence[str]) -> None:
-    """Restrict all connections of this process to these addresses of the machine."""
+    """Restrict all connections of this process to these addresses of the machine.
+
+    aiortc and aioice have no option for this.
+    """
     aioice.ice.get_host_addresses = lambda use_ipv4, use_ipv6: [*addresses]
 
 
@@ -41,7 +44,7 @@ class _NoJitterBuffer(JitterBuffer):
     """Passes each packet on when it arrives. An Opus packet is a whole frame.
 
     aiortc's buffer holds 80 ms of audio; after a lost packet, 0.32 s. If the client stops sending
-    in pauses, it holds the end of the speech until the next packets arrive.
+    in pauses, it holds the end of the speech until the next packets arrive. It has no option.
     """
 
     def add(self, packet: RtpPacket) -> tuple[bool, JitterFrame | None]:
