@@ -115,6 +115,7 @@ def test_opaque_videos_declare_their_colors(tmp_path: Path, name: str, codec: st
     [
         ("frames", ["frames/00000.png", "frames/00001.png"]),
         ("face%03d.png", ["face000.png", "face001.png"]),
+        ("face%03d.PNG", ["face000.PNG", "face001.PNG"]),
     ],
 )
 def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) -> None:
@@ -123,9 +124,18 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) 
         writer.write_image(PICTURE)
         writer.write_sound(np.zeros(640, np.float32))
     writer.close()
-    files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png"))
+    files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*"))
     assert files == names
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / files[1])), PICTURE)
+
+
+@pytest.mark.parametrize(("name", "codec"), [("OUT.MP4", "h264"), ("Out.WebM", "vp9")])
+def test_the_case_of_a_suffix_does_not_matter(tmp_path: Path, name: str, codec: str) -> None:
+    writer = open_writer(tmp_path / name, (64, 48), 25.0, 16000)
+    writer.write_image(PICTURE[..., :3])
+    writer.close()
+    with av.open(str(tmp_path / name)) as container:
+        assert container.streams.video[0].codec_context.name == codec
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ class PictureExporter:
     def __init__(self, output: Path, options: ExportOptions) -> None:
         self._output = output
         self._options = options
-        self._size_px = _parse_size(options.size, even=output.suffix in VIDEO_SUFFIXES)
+        self._size_px = _parse_size(options.size, even=output.suffix.lower() in VIDEO_SUFFIXES)
         self._renderer = _make_renderer(output, options, self._size_px)
 
     def export(self, motion: FaceMotion, progress: Progress) -> int:
@@ -152,7 +152,7 @@ def _make_renderer(
     if width_px % num_faces:
         raise UserError(f"--size {options.size}: choose a width that is a multiple of {num_faces}")
     background = scene.parse_background(options.background)
-    if background is None and output.suffix == ".mp4":
+    if background is None and output.suffix.lower() == ".mp4":
         raise UserError("MP4 has no transparency; write .mov, .webm or pictures (.png)")
     head = scene.load_head(options.head)
     camera = scene.place_camera(head, options.camera)

@@ -94,7 +94,7 @@ class Head:
         Raises ``UserError`` if the head does not exist, or the file is not a head.
         """
         file = Path(path)
-        if file.suffix != ".npz":
+        if file.suffix.lower() != ".npz":
             file = ASSETS / f"{path}.npz"
         if "\0" in str(path) or len(file.name) > 255 or not file.is_file():
             raise UserError(

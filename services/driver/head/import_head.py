@@ -49,7 +49,7 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
 
     Raises ``UserError`` if a file cannot be read or written, or the mesh and points are not a face.
     """
-    if output.suffix != ".npz":
+    if output.suffix.lower() != ".npz":
         raise UserError(f"{output}: use a name that ends in .npz")
     pieces = read_mesh(mesh)
     count = sum(len(piece.vertices) for piece in pieces)

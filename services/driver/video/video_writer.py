@@ -99,7 +99,7 @@ def open_writer(
     Raises ``UserError`` if the path is not a valid output, or cannot be written.
     """
     check_name(path)
-    if path.suffix in _FORMATS:
+    if path.suffix.lower() in _FORMATS:
         return VideoWriter(
             path, *size, frame_rate_hz, sample_rate_hz,
             transparent=transparent, overwrite=overwrite,
@@ -109,7 +109,7 @@ def open_writer(
 
 def check_name(path: Path) -> None:
     """Raise ``UserError`` if a path is not a valid output in an existing folder."""
-    if path.suffix not in _FORMATS and (
+    if path.suffix.lower() not in _FORMATS and (
         not is_sequence(path) or len(_NUMBER_FIELD.findall(path.name)) > 1
     ):
         raise UserError(
@@ -122,14 +122,14 @@ def check_name(path: Path) -> None:
 
 def is_sequence(path: Path) -> bool:
     """Return whether a path names a sequence of pictures, one per frame."""
-    if path.suffix == ".png":
+    if path.suffix.lower() == ".png":
         return _NUMBER_FIELD.search(path.name) is not None
     return path.is_dir() or not path.suffix
 
 
 def picture_name(path: Path, number: int) -> Path:
     """Return the file of a picture in a sequence: a folder, or a name such as ``face%05d.png``."""
-    if path.suffix != ".png":
+    if path.suffix.lower() != ".png":
         path /= "%05d.png"
     return path.with_name(_NUMBER_FIELD.sub(lambda match: match[0] % number, path.name, count=1))
 
@@ -138,7 +138,7 @@ def existing_pictures(path: Path) -> list[Path]:
     """Return the existing files of a sequence, in the order of their names."""
     first = picture_name(path, 0)
     before, after = _NUMBER_FIELD.split(
-        path.name if path.suffix == ".png" else "%05d.png", maxsplit=1
+        path.name if path.suffix.lower() == ".png" else "%05d.png", maxsplit=1
     )
     name = re.compile(f"{re.escape(before)} *([0-9]+){re.escape(after)}")
     files = sorted(first.parent.iterdir()) if first.parent.is_dir() else []
@@ -170,7 +170,8 @@ class VideoWriter:
     ) -> None:
         self._path = Path(path)
         self._overwrite = overwrite
-        form = _FORMATS.get(self._path.suffix, _FORMATS[".mp4"])
+        suffix = self._path.suffix.lower()
+        form = _FORMATS.get(suffix, _FORMATS[".mp4"])
         codec = form.transparent if transparent else form.opaque
         if codec is None:
             raise UserError(
@@ -185,7 +186,7 @@ class VideoWriter:
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
             remove_unfinished(self._path.parent)
             self._unfinished = UnfinishedFile(self._path)
-            container = self._path.suffix.removeprefix(".") or "mp4"
+            container = suffix.removeprefix(".") or "mp4"
             self._container = av.open(
                 str(self._unfinished.path), "w", format=container, options=form.options
             )
@@ -289,11 +290,11 @@ class PictureSequence:
         self._path = path
         self._num_images = 0
         try:
-            if path.suffix != ".png":
+            if path.suffix.lower() != ".png":
                 path.mkdir(exist_ok=True)
         except OSError as error:
             raise write_error(path, error) from error
-        remove_unfinished(path.parent if path.suffix == ".png" else path)
+        remove_unfinished(path.parent if path.suffix.lower() == ".png" else path)
 
     def write_image(self, image: UInt8) -> None:
         """Write a picture (H, W, 3) or (H, W, 4), sRGB."""
