@@ -51,6 +51,7 @@ class DatagramConnection(TargetConnection):
         self._last_refused_s = -_ASSUME_LISTENING_AFTER_S
         self._newest_frame: FaceFrame | None = None
         self._tracker_input: tuple[asyncio.DatagramTransport, TrackerInput] | None = None
+        self._tracker_problem = ""  # shown while the target itself has no problem
 
     @abstractmethod
     def encode(self, frame: FaceFrame) -> Iterable[bytes]:
@@ -71,7 +72,7 @@ class DatagramConnection(TargetConnection):
                 if self._socket is None:
                     try:
                         self._socket = await self._open()
-                        self.problem = ""
+                        self.problem = self._tracker_problem
                     except OSError as error:
                         self.problem = f"cannot reach {self.target.host}: {error.strerror}"
                 if self._tracker_input is None and self.target.tracker_address is not None:
@@ -85,8 +86,10 @@ class DatagramConnection(TargetConnection):
     async def _open_tracker_input(self, host: str, port: int) -> None:
         try:
             self._tracker_input = await open_tracker_input(host, port, self._forward)
+            self._tracker_problem = ""
         except OSError as error:
-            self.problem = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
+            reason = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
+            self._tracker_problem = reason
 
     def _forward(self, packet: bytes) -> bool:
         if self._newest_frame is None:
@@ -123,7 +126,7 @@ class DatagramConnection(TargetConnection):
             return False
         if now_s - self._last_refused_s < _ASSUME_LISTENING_AFTER_S:
             return False
-        self.problem = ""
+        self.problem = self._tracker_problem
         return True
 
     def _close(self) -> None:

@@ -248,3 +248,19 @@ def test_a_tracker_passes_through_with_the_mouth_of_the_session(
     assert fields["values"][LIVE_LINK_ORDER.index("jawOpen")] > 0.3
     blink = SHAPE_SETS["arkit"].names[0]
     assert fields["values"][LIVE_LINK_ORDER.index(blink)] == pytest.approx(1.0, abs=0.05)
+
+
+def test_an_occupied_tracker_port_is_reported_once(
+    senders: SenderPool, receiver: socket.socket, reports: list[tuple[str, str]]
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        camera = other.getsockname()[1]
+        url = f"vmc://127.0.0.1:{receiver.getsockname()[1]}?camera={camera}"
+        senders.start(parse_target(url))
+        wait_until(lambda: f"cannot receive from a tracker on 127.0.0.1:{camera}" in str(reports))
+        for _ in range(20):  # packets of the face at rest, during many attempts to open the port
+            receiver.recv(2048)
+    wait_until(lambda: not problem_of(senders, url))
+    wait_until(lambda: not reports[-1][1])
+    assert len(reports) == 2
