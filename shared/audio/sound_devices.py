@@ -1,11 +1,12 @@
 """Records live audio from microphones, and from outputs and programs of this machine."""
 
+import contextlib
 import json
 import queue
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -17,7 +18,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
 _LATENCY_MS = 20  # latency of recordings of outputs and programs
-_TIMEOUT_S = 5.0
+_TIMEOUT_S = 5.0  # for an answer of the sound server, and for the next block of a microphone
 _NO_SOUND_SERVER = (
     "recording what this machine plays needs PulseAudio or PipeWire, which does not answer; type: "
     "sudo apt install pulseaudio-utils. On macOS or Windows install a loopback device, such as "
@@ -34,26 +35,27 @@ class SoundDevice:
     target: str = ""  # parec's option for the device; empty for a microphone
 
 
-def list_sound_devices() -> list[SoundDevice]:
-    """Return all devices, without kinds that this machine does not support."""
+def list_sound_devices(report: Callable[[str], None]) -> list[SoundDevice]:
+    """Return all devices; call ``report`` with the reason why a kind cannot be listed."""
     devices: list[SoundDevice] = []
     for list_kind in (_microphones, _monitors):
         try:
             devices += list_kind()
-        except UserError:
-            continue
+        except UserError as error:
+            report(str(error))
     return devices
 
 
 def open_microphone(name: str) -> AudioSource:
     """Read the microphone whose name contains ``name`` until interrupted. Empty: the default one.
 
-    Raises ``UserError`` if the sound library or the microphone is missing.
+    Raises ``UserError`` if the sound library or the microphone is missing. The blocks raise it if
+    the microphone stops, for example because it is unplugged.
     """
     sounddevice = _sound_library()
     if name:
         name = _choose(name, _microphones()).name
-    recorded: queue.SimpleQueue[Samples] = queue.SimpleQueue()
+    recorded: queue.SimpleQueue[Samples | None] = queue.SimpleQueue()  # None: it stopped
     try:
         stream = sounddevice.InputStream(
             device=name or None,
@@ -62,6 +64,7 @@ def open_microphone(name: str) -> AudioSource:
             dtype="float32",
             blocksize=MEDIA_RATE_HZ // 50,
             callback=lambda data, *_: recorded.put(data.copy()),
+            finished_callback=lambda: recorded.put(None),
         )
     except (sounddevice.PortAudioError, ValueError) as error:
         raise UserError(
@@ -69,9 +72,15 @@ def open_microphone(name: str) -> AudioSource:
         ) from None
 
     def blocks() -> Iterator[Samples]:
-        with stream:
-            while True:
-                yield recorded.get()
+        try:
+            with contextlib.suppress(queue.Empty), stream:
+                while (block := recorded.get(timeout=_TIMEOUT_S)) is not None:
+                    yield block
+        except sounddevice.PortAudioError as error:
+            raise UserError(f"cannot record the microphone: {error}") from None
+        raise UserError(
+            "the microphone sends no more audio; reconnect it, and run the command again"
+        )
 
     return AudioSource(name or "microphone", MEDIA_RATE_HZ, 1, None, blocks(), is_live=True)
 

@@ -143,12 +143,12 @@ def devices() -> None:
     """List the devices for 'kouxing speak mic' and 'kouxing speak monitor'."""
     from kouxing.shared.audio.sound_devices import list_sound_devices
 
-    devices = list_sound_devices()
-    if not devices:
-        print_message(
-            "no microphone and no sound server were found; connect a microphone, or start"
-            " PulseAudio or PipeWire"
-        )
+    problems: list[str] = []
+    devices = list_sound_devices(problems.append)
+    for problem in problems:
+        print_message(problem)
+    if not devices and not problems:
+        print_message("no microphone and no output were found; connect a microphone")
     for device in devices:
         source = "mic" if device.kind == "mic" else "monitor"
         typer.echo(f"{device.kind}: {device.name}")
