@@ -28,6 +28,7 @@ def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator
         yield from map(function, items)
         return
     results: deque[Future[R]] = deque()
+    others = multiprocessing.active_children()
     context = multiprocessing.get_context("fork")
     pool = ProcessPoolExecutor(num_cores, context, _start_worker, (function,))
     try:
@@ -38,8 +39,8 @@ def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator
         while results:
             yield results.popleft().result()
     except BaseException:
-        for process in [*pool._processes.values()]:  # kill_workers() needs Python 3.14
-            process.kill()
+        for process in {*multiprocessing.active_children()} - {*others}:
+            process.kill()  # the pool's own kill_workers() needs Python 3.14
         raise
     finally:
         pool.shutdown(cancel_futures=True)

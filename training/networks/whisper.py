@@ -21,7 +21,8 @@ arrays          name, rank, sizes, kind, number of bytes, the bytes         stri
 =============== =========================================================== ==================
 
 A string is its length in 2 bytes, then its bytes and a zero. Quantized models cannot be read. The
-file is not trusted, so every size in it is checked.
+file is not trusted, so every size in it is checked. The package ctranslate2 is not used: its
+version 4.8 has no function that returns the arrays of a model.
 """
 
 import math
