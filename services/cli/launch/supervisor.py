@@ -1,4 +1,7 @@
-"""Runs all services on one machine, and restarts a service that crashes or hangs."""
+"""Runs all services on one machine, and restarts a service that crashes or hangs.
+
+The packages supervisor and honcho are not used, because they do not detect a process that hangs.
+"""
 
 import contextlib
 import json

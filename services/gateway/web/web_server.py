@@ -1,4 +1,8 @@
-"""The gateway's HTTP server: limits connections, closes idle ones, and answers errors."""
+"""The gateway's HTTP server: limits connections, closes idle ones, and answers errors.
+
+It replaces aiohttp's ``TCPSite``, which limits neither the number of connections nor the time of a
+request.
+"""
 
 import asyncio
 import errno
