@@ -119,36 +119,49 @@ def draco(document: dict[str, Any], binary: bytearray) -> None:
     document["extensionsRequired"] = ["KHR_draco_mesh_compression"]
 
 
-def compress_with_meshopt(document: dict[str, Any], binary: bytearray) -> None:
-    """Compress the positions and triangles of the first mesh, the skin."""
+def compress_with_meshopt(
+    kind: str, indices: str, document: dict[str, Any], binary: bytearray
+) -> None:
+    """Compress the positions and triangles of the first mesh, the skin, with a filter or none."""
     primitive = document["meshes"][0]["primitives"][0]
-    for number, kind, mode in (
-        (primitive["attributes"]["POSITION"], "<f4", "ATTRIBUTES"),
-        (primitive["indices"], "<u4", "TRIANGLES"),
-    ):
-        place, array = content(document, binary, number, kind)
-        binary[place] = bytes(array.nbytes)
-        encoded = meshopt.encode_gltf_buffer(array, mode)
-        view = document["bufferViews"][document["accessors"][number]["bufferView"]]
-        view["extensions"] = {
-            "EXT_meshopt_compression": {
-                "buffer": 0,
-                "byteOffset": len(binary),
-                "byteLength": len(encoded),
-                "byteStride": array.strides[0] if mode == "ATTRIBUTES" else array.itemsize,
-                "count": len(array) if mode == "ATTRIBUTES" else array.size,
-                "mode": mode,
-            }
-        }
-        binary += encoded + b"\0" * (-len(encoded) % 4)
+    place, positions = content(document, binary, primitive["attributes"]["POSITION"], "<f4")
+    indices_place, triangles = content(document, binary, primitive["indices"], "<u4")
+    rows = positions if kind == "NONE" else meshopt.encode_filter_exp(positions, 20)
+    _replace_by_compressed(document, binary, place, rows, {"mode": "ATTRIBUTES", "filter": kind})
+    _replace_by_compressed(document, binary, indices_place, triangles.ravel(), {"mode": indices})
     document["extensionsRequired"] = ["EXT_meshopt_compression"]
+
+
+def _replace_by_compressed(
+    document: dict[str, Any],
+    binary: bytearray,
+    place: slice,
+    rows: NDArray[Any],
+    description: dict[str, str],
+) -> None:
+    encoded = meshopt.encode_gltf_buffer(rows, description["mode"])
+    binary[place] = bytes(place.stop - place.start)
+    view = next(view for view in document["bufferViews"] if view["byteOffset"] == place.start)
+    view["extensions"] = {
+        "EXT_meshopt_compression": {
+            "buffer": 0,
+            "byteOffset": len(binary),
+            "byteLength": len(encoded),
+            "byteStride": rows.strides[0],
+            "count": len(rows),
+            **description,
+        }
+    }
+    binary += encoded + b"\0" * (-len(encoded) % 4)
 
 
 @pytest.mark.parametrize(
     "change",
     [
         *(names_in_primitives, names_in_accessors, one_eye_mirrored, lights),
-        *(texture_of_an_extension, null_binds, data_uri, draco, compress_with_meshopt),
+        *(texture_of_an_extension, null_binds, data_uri, draco),
+        partial(compress_with_meshopt, "NONE", "TRIANGLES"),
+        partial(compress_with_meshopt, "EXPONENTIAL", "INDICES"),
         *(partial(transform, kind) for kind in TRANSFORMS),
     ],
 )
@@ -169,7 +182,7 @@ def test_reads_files_of_other_programs(
 )
 def test_rejects_damaged_compressed_data(tmp_path: Path, wrong: dict[str, Any]) -> None:
     def change(document: dict[str, Any], binary: bytearray) -> None:
-        compress_with_meshopt(document, binary)
+        compress_with_meshopt("NONE", "TRIANGLES", document, binary)
         for view in document["bufferViews"]:
             view.get("extensions", {}).get("EXT_meshopt_compression", {}).update(wrong)
 
