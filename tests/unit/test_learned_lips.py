@@ -157,6 +157,20 @@ def test_dynamic_visemes_move_the_mouth_without_lip_positions() -> None:
     assert np.corrcoef(values(learned, JAW), values(visemes, JAW))[0, 1] > 0.99
 
 
+@pytest.mark.parametrize("interruption", ["lip positions", "stall"])
+def test_dynamic_visemes_move_the_mouth_continuously(interruption: str) -> None:
+    face = FaceAnimator(LearnedLips(LIPS), frame_rate_hz=240.0, delay_s=DELAY_S)
+    face.process(SpeechChange(active=True, time_s=0.0))
+    phones = [(0.1, phone("d", 0.05, index=0)), (0.2, phone("a", 0.12, index=1))]
+    frames = run(face, 0.0, 0.4, no_lip_positions, phones)
+    assert values(frames, JAW)[-1] > 200.0
+    if interruption == "stall":
+        frames += face.relax(40) + run(face, 0.4, 0.6, no_lip_positions)
+    else:
+        frames += run(face, 0.4, 0.6, lambda time_s: lip_positions(time_s, opening=0.0))
+    assert np.abs(np.diff(values(frames, JAW))).max() < 50.0
+
+
 @pytest.mark.parametrize("to_learned", [True, False])
 def test_changing_the_lip_model_is_continuous(to_learned: bool) -> None:
     models = (LIPS, LearnedLips(LIPS))

@@ -166,9 +166,7 @@ class LearnedStream:
         if self._has_lip_positions:
             self._update_mouth(time_s)
         else:
-            step_s = max(time_s - self._time_s, 1e-3)
-            self._mouth = FapState(visemes.faps, (visemes.faps - self._mouth.value) / step_s)
-            self._rest = None
+            self._follow_visemes(visemes.faps, max(time_s - self._time_s, 1e-3))
         self._ajar = self._resting.amount_at(time_s)
         self._time_s = time_s
         return self._frame(visemes.articulation)
@@ -178,10 +176,18 @@ class LearnedStream:
         visemes = self._visemes.relax(step_s)
         self._tongue = visemes.faps
         self._ajar = self._resting.relax(step_s)
+        if not self._has_lip_positions:
+            self._follow_visemes(visemes.faps, step_s)
+            return self._frame(visemes.articulation)
         if self._rest is None:
             self._rest = RestTransition(self._mouth, self._neutral, _REST_S)
         self._mouth = self._rest.step(step_s)
         return self._frame(visemes.articulation)
+
+    def _follow_visemes(self, faps: Array, step_s: float) -> None:
+        """Move like the dynamic visemes; the first lip positions start a transition from here."""
+        self._mouth = FapState(faps, (faps - self._mouth.value) / step_s)
+        self._on_track = self._mouth
 
     def _update_mouth(self, time_s: float) -> None:
         continues = self._track.end_s >= self._time_s
