@@ -8,7 +8,10 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
 from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
-from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
+from kouxing.services.synthesizer.modifiers.expressiveness import (
+    ExpressivenessModifier,
+    scale_mouth,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import ExpressionName, check_expressions
 from kouxing.shared.face.faps import NUM_FAPS
@@ -98,6 +101,19 @@ def test_the_mouth_opens_further_up_to_a_limit(viseme: str) -> None:
     assert middle[3] > 1.1 * middle[2]
     assert middle[-1] < 900.0
     assert opened[-1][JAW] < 500.0
+
+
+def test_a_change_of_the_expressiveness_is_smooth() -> None:
+    modifier = ExpressivenessModifier(0.5)
+    jaws = []
+    for k in range(60):
+        modifier.amount = 0.5 if k < 5 else 2.0
+        faps = viseme_faps("a")
+        modifier.apply(faps, frame_context(k * FRAME_S))
+        jaws.append(float(faps[JAW]))
+    assert jaws[0] == expressed(viseme_faps("a"), 0.5)[JAW]
+    assert jaws[-1] == pytest.approx(expressed(viseme_faps("a"), 2.0)[JAW])
+    assert np.diff(jaws).max() < 0.2 * (jaws[-1] - jaws[0])
 
 
 def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[float]:

@@ -27,12 +27,14 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.expression_motion import CLOSED, JAW, LOWER, OPEN, UPPER
 from kouxing.shared.face.faps import MOUTH_WIDTH_FAPS
+from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _WIDEST = 900.0  # openings of this size or more do not grow
 _USUAL_WIDTH = -40.0  # FAP of a mouth corner in speech, from the dynamic visemes
 _USUAL_PUSH = 40.0
 _SIDEWAYS = 2.0
 _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
+_EASE_S = 0.05  # time constant of each filter pole after a change of the amount
 
 _LIPS = [*zip(UPPER.tolist(), LOWER.tolist(), strict=True)]  # the middle of the inner lips first
 _WIDTH = tuple(fap - 1 for fap in MOUTH_WIDTH_FAPS)
@@ -40,15 +42,15 @@ _PUSH = (15, 16)  # FAP 16 and 17; positive is forward
 
 
 class ExpressivenessModifier:
-    """Scales mouth movements by ``amount``, 0.5 to 2; 1 changes nothing."""
+    """Scales mouth movements by ``amount``, 0.5 to 2; 1 changes nothing. Changes are smooth."""
 
     def __init__(self, amount: float) -> None:
         self.amount = amount
+        self._shown = TwoPoleFilter(amount)
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Scale the mouth of a frame, FAPs (68,), in place."""
-        del context
-        scale_mouth(faps, self.amount)
+        scale_mouth(faps, self._shown.step(self.amount, context.step_s, _EASE_S))
 
 
 def scale_mouth(faps: NDArray[np.float32], amount: float) -> None:
