@@ -112,7 +112,8 @@ export class Speaker {
 
 /**
  * Read a `.csv` or `.jsonl` file of `kouxing listen -o` or `kouxing render`, or a take (`.csv`) of the
- * app Live Link Face. Throws an error if the table has no times, or a value is not a number.
+ * app Live Link Face. Throws an error if the recording has no times or no frames, a value
+ * is not a number, or a time is earlier than the previous one.
  */
 export function readRecording(text: string): {
   /** names of the shapes; null: the values are the 68 FAPs */

@@ -13,37 +13,45 @@ const DAY_S = 86400;
  *
  * @param {string} text content of the file
  * @returns { names: of the shapes, or null for the 68 FAPs, frames: [[media time, Float32Array]] }
- * @throws {Error} if the table has no times or no frames, or a value is not a number
+ * @throws {Error} if the table has no times or no frames, a value is not a number, or a time is earlier than the previous one
  */
 export function readRecording(text) {
-  const lines = text.replace(/^\uFEFF/, "").trim().split(/\r?\n/);
+  const lines = text.replace(/^\uFEFF/, "").split(/\r?\n/).filter((line) => /[^ ,]/.test(line));
+  if (lines.length === 0) throw new Error("the recording is empty; record it again");
   const recording = lines[0].startsWith("{") ? readJsonLines(lines) : readCsv(lines);
   if (recording.frames.length === 0) throw new Error("the recording has no frames with a face; record it again");
   const wrong = recording.frames.findIndex(
     ([time, values]) => !Number.isFinite(time) || !values.every(Number.isFinite),
   );
   if (wrong >= 0) throw new Error(`frame ${wrong + 1} of the recording: a value is missing or not a number`);
+  const early = recording.frames.findIndex(([time], number, frames) => time < frames[number - 1]?.[0]);
+  if (early >= 0) throw new Error(`frame ${early + 1} of the recording: its time is earlier than the previous frame's; sort them`);
   return recording;
 }
 
 function readJsonLines(lines) {
-  const objects = lines.map((line) => JSON.parse(line));
-  const set = Object.keys(objects[0]).find((key) => !["time_s", "sequence"].includes(key));
-  const names = Array.isArray(objects[0][set]) ? null : Object.keys(objects[0][set]);
-  return {
-    names,
-    frames: objects.map((object) => {
+  let [set, names] = ["", null];
+  const frames = lines.map((line, number) => {
+    try {
+      const object = JSON.parse(line);
+      if (number === 0) {
+        set = Object.keys(object).find((key) => !["time_s", "sequence"].includes(key));
+        names = Array.isArray(object[set]) ? null : Object.keys(object[set]);
+      }
       const values = names === null ? object[set] : names.map((name) => object[set][name]);
       return [object.time_s * RATE_HZ, Float32Array.from(values)];
-    }),
-  };
+    } catch {
+      throw new Error(`line ${number + 1} of the recording is not a frame with time_s and the values of a face; record it again`);
+    }
+  });
+  return { names, frames };
 }
 
 function readCsv([header, ...lines]) {
   const titles = header.split(",").map((title) => title.trim());
   const timeColumn = titles.findIndex((title) => /^(time_s|timecode)$/i.test(title));
   if (timeColumn < 0) throw new Error("the recording has no times; add a column time_s or Timecode");
-  const isTake = titles[timeColumn] !== "time_s";
+  const isTake = titles[timeColumn].toLowerCase() === "timecode";
   const columns = titles.flatMap((title, column) =>
     column === timeColumn || /^(phone|blendshapecount)$/i.test(title) ? [] : [column],
   );

@@ -1,0 +1,109 @@
+"""The Python and JavaScript code reads the same recordings, and rejects the same ones."""
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kouxing.services.cli.recordings.curve_reader import read_table
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.face.shapes import ARKIT
+from tests.system import NODE, ROOT
+
+JAW = FAP_NUMBER["open_jaw"] - 1
+JAW_PER_WEIGHT = float(ARKIT.basis[ARKIT.names.index("jawOpen"), JAW])
+FAPS = json.dumps([0.0] * JAW + [0.5 * JAW_PER_WEIGHT] + [0.0] * (NUM_FAPS - JAW - 1))
+TAKE = "Timecode,BlendShapeCount,JawOpen,HeadYaw\n"
+FIRST_LINE = '{"time_s": 0, "arkit": {"jawOpen": 0}}\n'
+RECORDINGS = {
+    "shapes": "time_s,jawOpen\n0,0\n0.02,0.5\n",
+    "case of the titles": "Time_S,jawOpen,Phone\n0,0,a\n0.02,0.5,a\n",
+    "empty lines": "time_s,jawOpen\r\n\r\n0,0\r\n0.02,0.5\r\n,\r\n",
+    "json": FIRST_LINE + '\n{"time_s": 0.02, "arkit": {"jawOpen": 0.5}}\n',
+    "json of FAPs": f'{{"time_s": 0, "faps": {FAPS}}}\n{{"time_s": 0.02, "faps": {FAPS}}}\n',
+    "take": TAKE + "13:13:04:59.5,61,0,0\n13:13:05:00.7,61,0.5,0\n",
+    "take with dropped frames": TAKE + "13:13:04;59.5,61,0,0\n13:13:05;00.7,61,0.5,0\n",
+    "take within a second": TAKE + "13:13:04:31.0,61,0,0\n13:13:04:33.0,61,0.5,0\n",
+    "take over midnight": TAKE + "23:59:59:59.0,61,0,0\n00:00:00:00.0,61,0.5,0\n",
+    "take that loses the face": TAKE + "1:0:0:00.0,61,0,0\n1:0:0:01.0,0,,\n1:0:0:02.0,61,0.5,0\n",
+}
+REJECTED = {
+    "an empty file": "",
+    "no times": "frame,jawOpen\n0,0.5\n",
+    "no frames": "time_s,jawOpen\n",
+    "no frames with a face": TAKE + "1:0:0:00.0,0,,\n",
+    "a missing value": "time_s,jawOpen\n0,\n",
+    "a missing cell": "time_s,jawOpen\n0,0.1\n0.02\n",
+    "no number": "time_s,jawOpen\n0,nan\n",
+    "no time": "time_s,jawOpen\nnow,0\n",
+    "no time code": TAKE + "00:01,61,0,0\n",
+    "times that fall": "time_s,jawOpen\n0.1,0\n0,0\n",
+    "json without times": '{"faps": [0]}\n',
+    "json without values": '{"time_s": 0}\n',
+    "json with other values": FIRST_LINE + '{"time_s": 1, "vrm": {"aa": 0}}\n',
+    "no json": '{"time_s"\n',
+}
+
+JAVASCRIPT = """
+import { readFileSync } from "node:fs";
+import { readRecording } from "./recording.js";
+const read = (text) => {
+  try {
+    return readRecording(text);
+  } catch ({ name, message }) {
+    return { error: `${name}: ${message}` };
+  }
+};
+const texts = JSON.parse(readFileSync(0, "utf8"));
+const toArray = (_, value) => ArrayBuffer.isView(value) ? [...value] : value;
+console.log(JSON.stringify(texts.map(read), toArray));
+"""
+
+
+@pytest.fixture(scope="module")
+def in_javascript() -> dict[str, Any]:
+    """Return what JavaScript reads from all recordings, by their texts."""
+    texts = [*RECORDINGS.values(), *REJECTED.values()]
+    result = subprocess.run(
+        [NODE, "--input-type=module", "-e", JAVASCRIPT],
+        input=json.dumps(texts),
+        stdout=subprocess.PIPE,
+        encoding="utf-8",
+        cwd=ROOT / "clients" / "javascript",
+        check=True,
+    )
+    return dict(zip(texts, json.loads(result.stdout), strict=True))
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / ("face.jsonl" if text.startswith("{") else "face.csv")
+    path.write_text(text, encoding="utf-8", newline="")
+    return path
+
+
+@pytest.mark.parametrize("text", RECORDINGS.values(), ids=RECORDINGS)
+def test_both_read_the_same_frames(
+    tmp_path: Path, in_javascript: dict[str, Any], text: str
+) -> None:
+    animation = read_table(write(tmp_path, text))
+    read = in_javascript[text]
+    column, unit = (JAW, 1.0) if read["names"] is None else (0, JAW_PER_WEIGHT)
+    first, *_, (last_time, last) = read["frames"]
+    assert read["names"] is None or read["names"][0] == "jawOpen"
+    assert first[0] == 0
+    assert last_time / 16000 == pytest.approx((len(animation.faps) - 1) / animation.frame_rate_hz)
+    assert first[1][column] * unit == pytest.approx(animation.faps[0, JAW])
+    assert last[column] * unit == pytest.approx(animation.faps[-1, JAW])
+    assert last[column] * unit == pytest.approx(0.5 * JAW_PER_WEIGHT)
+
+
+@pytest.mark.parametrize("text", REJECTED.values(), ids=REJECTED)
+def test_both_reject_an_unclear_recording(
+    tmp_path: Path, in_javascript: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(UserError):
+        read_table(write(tmp_path, text))
+    assert in_javascript[text].get("error", "").startswith("Error: "), in_javascript[text]
