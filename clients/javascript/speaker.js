@@ -6,6 +6,7 @@ const OPTIONS = [
   "sampleRateHz", "numChannels", "encoding", "ahead", "mouthProfile", "language", "token", "error", "closed",
 ];
 const AUDIO_TYPES = ["Int16Array", "Float32Array", "Uint8Array", "ArrayBuffer", "DataView"];
+const FULL_SCALE = 32768; // as in the services
 const MAX_FLOAT = 8; // smaller values beyond 1 are clipped
 
 const MESSAGE_BYTES = 32000;
@@ -138,9 +139,9 @@ function toPcm(audio, encoding) {
     throw new RangeError("samples of a Float32Array must be from -1 to 1; divide integers by 32768");
   }
   if (encoding === "s16le" && type === "Float32Array") {
-    audio = Int16Array.from(audio, (value) => Math.round(32767 * Math.max(-1, Math.min(1, value))));
+    audio = Int16Array.from(audio, (value) => Math.max(-FULL_SCALE, Math.min(FULL_SCALE - 1, Math.round(FULL_SCALE * value))));
   } else if (encoding === "f32le" && type === "Int16Array") {
-    audio = Float32Array.from(audio, (value) => value / 32767);
+    audio = Float32Array.from(audio, (value) => value / FULL_SCALE);
   }
   return ArrayBuffer.isView(audio)
     ? new Uint8Array(audio.buffer, audio.byteOffset, audio.byteLength)

@@ -26,7 +26,7 @@ test("the microphone is cut into chunks of 20 ms without gaps, and clipped", () 
   const { posted } = capture.port;
   assert.deepEqual(posted.map(({ chunk }) => chunk.length), [960, 960]);
   const captured = posted.flatMap(({ chunk }) => [...chunk]);
-  const expected = input.slice(0, 1920).map((value) => Math.round(Math.min(1, value) * 32767));
+  const expected = input.slice(0, 1920).map((value) => Math.min(32767, Math.round(value * 32768)));
   assert.deepEqual(captured, [...expected]);
 });
 

@@ -58,7 +58,7 @@ def test_flushed_audio_is_not_sent_but_the_end_is() -> None:
 
 
 FLOATS = [0.0, 0.5, -1.0, 2.0]
-INTEGERS = array("h", [0, 16384, -32767, 32767])
+INTEGERS = array("h", [0, 16384, -32768, 32767])
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_rejects_an_array_of_another_format(kind: str) -> None:
 
 def test_small_integers_in_a_list_are_quiet() -> None:
     assert to_pcm([0, 1, -1], "s16le") == array("h", [0, 1, -1]).tobytes()
-    assert to_pcm([0, 1, -1], "f32le") == array("f", [0, 1 / 32767, -1 / 32767]).tobytes()
+    assert to_pcm([0, 1, -1], "f32le") == array("f", [0, 1 / 32768, -1 / 32768]).tobytes()
 
 
 @pytest.mark.parametrize("audio", [None, "text", [b"bytes"]])

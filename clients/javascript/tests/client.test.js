@@ -74,13 +74,17 @@ test("wrong options, addresses and audio are rejected", async () => {
   await assert.rejects(speaker.finish(), /looks like the start of a WAV file/);
 });
 
-test("samples of another realm, such as an iframe, are converted too", async () => {
+test("samples are converted at the services' full scale, also those of another realm, such as an iframe", async () => {
   const sent = [];
-  const socket = { readyState: WebSocket.OPEN, bufferedAmount: 0, send: (pcm) => sent.push(pcm.byteLength) };
-  for (const [encoding, samples] of [["s16le", "new Float32Array(4)"], ["f32le", "new Int16Array(4)"]]) {
+  const socket = { readyState: WebSocket.OPEN, bufferedAmount: 0, send: (pcm) => sent.push(pcm.slice().buffer) };
+  for (const [encoding, samples] of [
+    ["s16le", "Float32Array.of(0.5, -1, 2)"],
+    ["f32le", "Int16Array.of(16384, -32768, 0)"],
+  ]) {
     await new Speaker(socket, "voice", encoding, () => {}, () => {}).push(runInNewContext(samples));
   }
-  assert.deepEqual(sent, [8, 16]);
+  assert.deepEqual(new Int16Array(sent[0]), Int16Array.of(16384, -32768, 32767));
+  assert.deepEqual(new Float32Array(sent[1]), Float32Array.of(0.5, -1, 0));
 });
 
 test("a rejected session reports the reason", async () => {

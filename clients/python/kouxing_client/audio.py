@@ -15,7 +15,7 @@ from kouxing_client.messages import MEDIA_RATE_HZ, Fields
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 _CODES = {"s16le": "h", "f32le": "f"}
 _NATIVE_ORDER = "=<" if sys.byteorder == "little" else "=>"  # prefixes of a buffer's format
-_FULL_SCALE = 32767
+_FULL_SCALE = 32768  # as in the services
 _EXPECTED = "audio must be 16-bit integers (array type int16), or floats within ±1"
 MAX_FLOAT = 8.0  # smaller values beyond 1 are clipped
 # Audio before the newest acknowledgement that is kept in case another recognizer needs it
@@ -92,7 +92,9 @@ def _pack(numbers: memoryview[Any], encoding: str) -> bytes:
             )
     scaled: Iterable[float] = numbers
     if encoding == "s16le" and not is_integer:
-        scaled = (round(_FULL_SCALE * max(-1.0, min(1.0, value))) for value in numbers)
+        scaled = (
+            max(-_FULL_SCALE, min(_FULL_SCALE - 1, round(_FULL_SCALE * value))) for value in numbers
+        )
     elif encoding == "f32le" and is_integer:
         scaled = (value / _FULL_SCALE for value in numbers)
     packed = array(_CODES[encoding], scaled)

@@ -9,7 +9,7 @@ class CaptureProcessor extends AudioWorkletProcessor {
     if (input === undefined) return true;
     for (const value of input) {
       this.#squares += value * value;
-      this.#chunk[this.#numFilled++] = Math.max(-32768, Math.min(32767, Math.round(value * 32767)));
+      this.#chunk[this.#numFilled++] = Math.max(-32768, Math.min(32767, Math.round(value * 32768)));
       if (this.#numFilled === this.#chunk.length) {
         const chunk = this.#chunk.slice();
         const rms = Math.sqrt(this.#squares / chunk.length);
