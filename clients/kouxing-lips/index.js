@@ -188,8 +188,8 @@ export class LipSync extends EventTarget {
     const context = this.context;
     await context.audioWorklet.addModule(new URL("worklet.js", import.meta.url));
     this.#check(choice);
+    const node = sourceNode(context, source); // a wrong source does not end the current one
     this.#release();
-    const node = sourceNode(context, source);
     const { port1, port2 } = new MessageChannel();
     await this.#open({ sampleRateHz: context.sampleRate }, port1);
     this.#check(choice);

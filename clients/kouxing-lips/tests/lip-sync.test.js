@@ -215,6 +215,18 @@ test("the source that was chosen last is followed, even if an earlier one takes 
   assert.equal(lips.node, node);
 });
 
+test("a wrong source is rejected, and the current one is still followed", async () => {
+  const lips = await LipSync.create({ context });
+  const listening = lips.listenToMicrophone();
+  answerPrompt();
+  await open();
+  await listening;
+  const { node } = lips;
+  await assert.rejects(lips.listenTo(5), TypeError);
+  assert.equal(lips.node, node);
+  assert.ok(stream.track.isLive);
+});
+
 test("a buffer that is replaced does not report its end", async () => {
   const lips = await LipSync.create({ context });
   let numEnded = 0;
