@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import test from "node:test";
-import { languageFor, setLanguage, translate, translateError, translateResponse } from "../../services/gateway/page/language.js";
+import { addTexts, languageFor, setLanguage, translate, translateError, translateResponse } from "../../services/gateway/page/language.js";
 import { MouthProfileStore, Preferences } from "../../services/gateway/page/storage.js";
 import { TEXTS } from "../../services/gateway/page/texts.js";
 
@@ -41,6 +41,8 @@ test("the page uses the first language of the browser that it supports", () => {
   assert.equal(translateError({ code: "busy", text: "no" }), "no");
   assert.match(translateError({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
   assert.equal(translate("head.new-head"), "new-head", "a name without a text is shown as it is");
+  addTexts("lips", { plugged: { en: "Plug-in", zh: "插件" } });
+  assert.equal(translate("lips.plugged"), "Plug-in");
 });
 
 test("an error of the gateway is JSON or text", async () => {

@@ -7,6 +7,11 @@ const ATTRIBUTES = { title: "title", label: "aria-label" }; // by their data- at
 
 let language = "en";
 
+/** Add texts { en, zh } by name; their keys are `PREFIX.NAME`. */
+export function addTexts(prefix, texts) {
+  for (const [name, text] of Object.entries(texts)) TEXTS[`${prefix}.${name}`] = text;
+}
+
 /** An error whose message is a text for the user. */
 export class UserError extends Error {}
 

@@ -1,7 +1,7 @@
 // The settings panel: head, lips, size of movements, expressions and language.
 
 import { element } from "./elements.js";
-import { languageFor, translate, setLanguage } from "./language.js";
+import { addTexts, languageFor, translate, setLanguage } from "./language.js";
 import { TEXTS } from "./texts.js";
 
 const EXPRESSION_STRENGTH = 0.8;
@@ -22,11 +22,11 @@ export class Settings {
    */
   constructor(preferences, offers, handlers) {
     this.#preferences = preferences;
-    this.#offers = offers;
     const order = Object.keys(TEXTS);
-    offers.heads.sort((a, b) => order.indexOf(`head.${a}`) - order.indexOf(`head.${b}`));
-    for (const [name, title] of Object.entries(offers.lips)) TEXTS[`lips.${name}`] = title;
-    for (const [code, title] of Object.entries(offers.languages)) TEXTS[`speech.${code}`] = title;
+    const heads = [...offers.heads].sort((a, b) => order.indexOf(`head.${a}`) - order.indexOf(`head.${b}`));
+    this.#offers = { ...offers, heads };
+    addTexts("lips", offers.lips);
+    addTexts("speech", offers.languages);
     this.#applyLanguage();
     this.#bind("heads", handlers.heads);
     this.#bind("lips", handlers.lipModel);
