@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from kouxing.shared.command.terminal import Force, check_output, print_message
-from kouxing.shared.errors import UserError
+from kouxing.shared.files.output_file import open_output, write_error
 
 app = typer.Typer(no_args_is_help=True, help="Export the models for other programs.")
 
@@ -28,8 +28,9 @@ def export_web(
     check_output(*(folder / name for name in contents if folder.is_dir()), force=force)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            (folder / name).write_bytes(content)
     except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
+        raise write_error(folder, error) from error
+    for name, content in contents.items():
+        with open_output(folder / name) as file:
+            file.write(content)
     print_message(f"wrote {folder} ({sum(map(len, contents.values())) / 1e6:.1f} MB)")

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import resource
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -13,6 +14,7 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import plot_heads
+from kouxing.services.cli import web_model
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
 from kouxing.services.cli.recordings.animation import FaceMotion
@@ -228,6 +230,24 @@ def test_a_file_is_deleted_if_the_disk_is_full(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="the disk is full"):
         fill_the_disk(path)
     assert not path.exists()
+
+
+def test_a_failed_export_keeps_the_older_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web_model, "web_model", lambda: {"encoder.onnx": bytes(100_000)})
+    older = tmp_path / "encoder.onnx"
+    older.write_bytes(b"older")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
+    try:
+        result = CliRunner().invoke(app, ["export", "web", str(tmp_path), "--force"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert isinstance(result.exception, UserError)
+    assert "cannot write" in str(result.exception)
+    assert [*tmp_path.iterdir()] == [older]
+    assert older.read_bytes() == b"older"
 
 
 def test_removes_the_unfinished_file_of_a_killed_process_only(tmp_path: Path) -> None:
