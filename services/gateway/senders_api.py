@@ -18,6 +18,7 @@ from kouxing.services.senders.target import Target, parse_delay_s
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.settings.endpoints import is_loopback
 
 
 class SendersApi:
@@ -66,12 +67,17 @@ class SendersApi:
 
     def _allowed_target(self, url: str) -> Target:
         target = parse_target(url)
-        if not (target.is_local or url in self._configured):
+        if target.is_local or url in self._configured:
+            return target
+        if not is_loopback(target.host):
             raise UserError(
                 f"{target.host} is another machine; add the address to gateway.senders, "
                 "or use 'kouxing send'"
             )
-        return target
+        raise UserError(
+            f"camera={target.options['camera']} accepts other machines; write only its port, "
+            "add the address to gateway.senders, or use 'kouxing send'"
+        )
 
     def _state(self) -> web.Response:
         states = self.pool.states()

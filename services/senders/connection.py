@@ -88,8 +88,9 @@ class DatagramConnection(TargetConnection):
             self._tracker_input = await open_tracker_input(host, port, self._forward)
             self._tracker_problem = ""
         except OSError as error:
-            reason = f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
-            self._tracker_problem = reason
+            self._tracker_problem = (
+                f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
+            )
 
     def _forward(self, packet: bytes) -> bool:
         if self._newest_frame is None:

@@ -56,7 +56,7 @@ def sent_texts(source: str) -> Iterator[str]:
             name = ast.unparse(node.func)
             if name.endswith(("UserError", "_error", "warnings.append", "notices.append")):
                 yield template(node.args[-1])
-        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith(".problem"):
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith("problem"):
             yield template(node.value)
         if isinstance(node, ast.Return) and node.value is not None and "formats" in source:
             yield template(node.value)

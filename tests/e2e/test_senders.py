@@ -2,17 +2,21 @@
 
 import asyncio
 import contextlib
+import json
 import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
+from aiohttp import web
 from pythonosc.dispatcher import Dispatcher
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_server import BlockingOSCUDPServer
 
+from kouxing.services.gateway.senders_api import SendersApi
 from kouxing.services.senders import connection, vtube_studio
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
@@ -137,6 +141,25 @@ def test_starts_and_stops_senders(senders: SenderPool, receiver: socket.socket) 
         senders.start(parse_target(f"osc://127.0.0.1:{9 + number}"))
     with pytest.raises(UserError, match="stop one first"):
         senders.start(parse_target(url))
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("vmc://192.168.1.20", "192.168.1.20 is another machine"),
+        ("vmc://?camera=0.0.0.0:39541", "camera=0.0.0.0:39541 accepts other machines"),
+    ],
+)
+def test_a_page_starts_senders_on_this_machine_only(url: str, reason: str) -> None:
+    api = SendersApi([], lambda: None, idle_motion=False)
+    request = mock.AsyncMock()
+    request.read.return_value = json.dumps({"start": url}).encode()
+    with contextlib.closing(api.pool):
+        answer = asyncio.run(api.serve_post(request))
+        assert not api.pool.is_sending
+    assert isinstance(answer, web.Response)
+    assert answer.status == 422
+    assert reason in (answer.text or "")
 
 
 def test_media_time_continues_at_rest(senders: SenderPool, receiver: socket.socket) -> None:
