@@ -143,14 +143,15 @@ def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> flo
     return float(_LAGS_S[figures.argmax()]) if figures.max() > _MIN_LAG_CORRELATION else 0.0
 
 
-def fit_profile(observations: Observations) -> MouthProfile:
+def fit_profile(observations: Observations, fraction: float = 1.0) -> MouthProfile:
     """Fit a profile; cross-validation chooses the strength of the ridge.
 
-    Raises ``UserError`` if there is too little speech with tracked lips.
+    Raises ``UserError`` if there is too little speech with tracked lips: less than a ``fraction``
+    of the minimum.
     """
     usable = observations[_is_known(observations)]
     speech_s = len(usable) * ENCODER_FRAME_S
-    if speech_s < MIN_SPEECH_S:
+    if speech_s < fraction * MIN_SPEECH_S:
         raise UserError(
             f"only {speech_s:.0f} s of speech show the lips; film "
             f"{MIN_SPEECH_S:.0f} s or more, preferably a minute"
@@ -173,7 +174,7 @@ def measure_gain(lip_predictor: LipPredictor, observations: Observations) -> Pro
     Raises like ``fit_profile``.
     """
     first_held_out = round((1 - _HELD_OUT) * len(observations))
-    profile = fit_profile(observations[:first_held_out])
+    profile = fit_profile(observations[:first_held_out], 1 - _HELD_OUT)
     held_out = observations[first_held_out:]
     delay_s = choose_delay(lip_predictor.delays_s, FACE_DELAY_S)
     delay = lip_predictor.delays_s.index(delay_s)

@@ -11,6 +11,7 @@ from kouxing.services.mouth_profiles.learning import (
     FilmedSpeech,
     Observations,
     fit_profile,
+    measure_gain,
     observe,
 )
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_measures
@@ -92,16 +93,24 @@ def test_the_adapted_model_computes_the_formula() -> None:
         np.testing.assert_array_equal(changed[:, NUM_FAPS:], outputs[:, NUM_FAPS:])
 
 
-def test_rejects_too_little_speech() -> None:
-    num_positions = 499
-    speech = Observations(
+def filmed_speech(num_positions: int) -> Observations:
+    return Observations(
         known_s=0.02 * np.arange(num_positions, dtype=np.float64),
-        predicted=np.zeros((num_positions, SHAPE[1], NUM_FAPS), np.float32),
-        hidden=np.zeros((num_positions, SHAPE[0]), np.float32),
-        tracked=np.zeros((num_positions, SHAPE[1], NUM_FAPS)),
+        predicted=RNG.normal(size=(num_positions, SHAPE[1], NUM_FAPS)).astype(np.float32),
+        hidden=RNG.normal(size=(num_positions, SHAPE[0])).astype(np.float32),
+        tracked=RNG.normal(size=(num_positions, SHAPE[1], NUM_FAPS)),
     )
+
+
+def test_rejects_too_little_speech() -> None:
     with pytest.raises(UserError, match="s of speech show the lips"):
-        fit_profile(speech)
+        fit_profile(filmed_speech(499))
+
+
+def test_ten_seconds_of_speech_are_enough() -> None:
+    speech = filmed_speech(500)
+    fit_profile(speech)
+    assert measure_gain(MODEL, speech).speech_s == 2.5
 
 
 @pytest.mark.parametrize(("interval_s", "hole_s"), [(0.04, 0.16), (0.2, 0.6)])
