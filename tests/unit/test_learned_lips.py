@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
+from kouxing.services.synthesizer.lips.learned.closure_rule import ClosingPhones, ClosureRule
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.services.synthesizer.lips.learned.resting_lips import CLOSE_S, HOLD_S
 from kouxing.services.synthesizer.lips.lip_model import LipModel
@@ -14,7 +15,7 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange
 from tests import lips
-from tests.lips import LIPS
+from tests.lips import INVENTORY, LIPS
 
 MOUTH = np.array(MOUTH_FAPS) - 1
 JAW, LOWER_LIP = 2, 4  # columns of FAPs 3 and 5
@@ -146,6 +147,14 @@ def test_a_phone_that_is_known_too_late_closes_nothing() -> None:
     frames = run(speaking_face(), 0.0, 1.0, sound, [(0.64, phone("p", 0.46))])
     shown = [faps[HEIGHTS] for time_s, faps in frames if 0.4 < time_s < 0.9]
     assert np.abs(shown).max(axis=1).min() > 190.0
+
+
+def test_a_long_vowel_prevents_closures_until_its_end() -> None:
+    phones = ClosingPhones(INVENTORY, "b", ClosureRule(other=1.0))
+    phones.add(lips.phone(0, "a", 1.0, 2.0))
+    for time_s in (1.5, 2.0, 2.9):
+        phones.forget_before(time_s - 0.5)
+        assert phones.log_odds(time_s) == -1.0
 
 
 def test_dynamic_visemes_move_the_mouth_without_lip_positions() -> None:

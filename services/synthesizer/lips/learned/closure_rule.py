@@ -96,9 +96,11 @@ class ClosingPhones:
             self._phones[phone.index] = phone
 
     def forget_before(self, time_s: float) -> None:
-        """Forget phones that started before a time."""
+        """Forget phones that ended before a time."""
         self._phones = {
-            index: phone for index, phone in self._phones.items() if phone.onset_s >= time_s
+            index: phone
+            for index, phone in self._phones.items()
+            if phone.onset_s + phone.duration_s >= time_s
         }
 
     def clear(self) -> None:
