@@ -110,6 +110,8 @@ def _parse_options(url: str, query: str, protocol: type[TargetConnection]) -> di
         allowed = protocol.options[name]
         if len(allowed) > 1 and value not in allowed:
             raise UserError(f"{url}: {name} must be {' or '.join(allowed)}")
+        if not value.isprintable():
+            raise UserError(f"{url}: {name} contains a character that is not printable")
         if len(value) > MAX_TEXT:
             raise UserError(f"{url}: {name} is longer than {MAX_TEXT} characters")
         options[name] = value

@@ -241,5 +241,9 @@ class SenderPool:
                 sender.timer = self._loop.call_at(due_s, self._send_due, sender)
                 return
             sender.queue.popleft()
-            if sender.connection.send(frame):
+            try:
+                is_sent = sender.connection.send(frame)
+            except Exception as error:  # code of another distribution may raise any exception
+                is_sent, sender.connection.problem = False, f"cannot send a frame: {error!r}"
+            if is_sent:
                 sender.sent_s.append(time.monotonic())

@@ -22,6 +22,7 @@ from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.sender_pool import MAX_SENDERS, SenderPool
+from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import STALL_S
@@ -124,6 +125,17 @@ def test_an_unknown_host_does_not_delay_other_targets(
     senders.start(parse_target(f"livelink://127.0.0.1:{receiver.getsockname()[1]}"))
     assert receiver.recv(2000)
     wait_until(lambda: "cannot reach nowhere.invalid" in problem_of(senders, lost))
+
+
+def test_an_error_of_a_protocol_does_not_affect_other_targets(
+    senders: SenderPool, receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faulty = "vmc://127.0.0.1"
+    monkeypatch.setattr(VmcConnection, "send", mock.Mock(side_effect=ValueError("no")))
+    senders.start(parse_target(faulty))
+    senders.start(parse_target(f"livelink://127.0.0.1:{receiver.getsockname()[1]}"))
+    assert receiver.recv(2000)
+    assert problem_of(senders, faulty) == "cannot send a frame: ValueError('no')"
 
 
 def test_starts_and_stops_senders(senders: SenderPool, receiver: socket.socket) -> None:

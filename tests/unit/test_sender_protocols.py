@@ -178,6 +178,7 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
         ("vmc://?delay=0.12", "'0.12' is not 0 or a number of milliseconds from 1 to"),
         ("osc://?prefix=kouxing", "start with '/'"),
         (f"osc://?prefix=/{'a' * 64}", "longer than 64"),
+        ("osc://?prefix=/%00/", "not printable"),
         ("vmc://?head=on&only=mouth", "leave out head=on"),
         ("vmc://127.0.0.1:39539?camera=39539", "camera=39539 is the port of the avatar"),
         ("livelink://localhost?camera=0.0.0.0:11111", "camera=11111 is the port of the avatar"),

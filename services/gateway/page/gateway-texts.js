@@ -107,6 +107,7 @@ const CHINESE = {
     "camera={port} 是虚拟形象程序自己的端口；请换一个端口，并让面部追踪程序发送到它",
   "only=mouth lets another program control the head; leave out head=on":
     "only=mouth 表示头部由其他程序控制，请去掉 head=on",
+  "cannot send a frame: {error}": "无法发送画面数据：{error}",
   "cannot reach {address}: {reason}": "无法连接 {address}：{reason}",
   "VTube Studio is asking whether kouxing may move the model; press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
   "VTube Studio's API is off; turn on 'Start API (allow plugins)' in its settings":
@@ -126,6 +127,7 @@ const CHINESE = {
   "prefix must start with '/'": "prefix 必须以“/”开头",
   "unknown option {name}; use {options}": "没有选项 {name}，可用 {options}",
   "{name} must be {values}": "{name} 必须是 {values}",
+  "{name} contains a character that is not printable": "{name} 含有不可打印的字符",
   "{name} is longer than {count} characters": "{name} 超过 {count} 个字符",
   "the delay {delay} is not 0 or a number of milliseconds from 1 to {most}": "延迟 {delay} 既不是 0，也不是 1 到 {most} 毫秒的数",
 };
