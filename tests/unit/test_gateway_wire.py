@@ -74,6 +74,9 @@ def test_names_the_unknown_fields_of_a_microphone() -> None:
     command = browser_messages.parse_command('{"stop": true, "flush": true, "encoding": "s16le"}')
     assert command.flush
     assert command.problem.startswith("unknown field stop; use skip, flush, last, lip_model, ")
+    command = browser_messages.parse_command('{"language": "en", "flush": true}')
+    assert command.flush
+    assert command.problem == "language cannot change during a session; open another connection"
     command = browser_messages.parse_command(json.dumps(dict.fromkeys(["x" * 30, "y" * 30])))
     assert command.problem.startswith(f"unknown fields {'x' * 30}, yyyyyyy…; use ")
     options = '{"sample_rate_hz": 16000, "channels": 2}'

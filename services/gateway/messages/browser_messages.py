@@ -94,7 +94,7 @@ class MicrophoneCommand(Struct, frozen=True, kw_only=True):
     last: bool = False  # whether no more audio follows
     skip: Annotated[int, Meta(ge=0, le=MAX_SKIPPED_SAMPLES)] = 0  # samples that the client skipped
     face: dict[str, Any]  # settings to change
-    problem: str = ""  # error about unknown fields, which are ignored
+    problem: str = ""  # error about fields that are ignored
 
 
 def parse_command(
@@ -110,7 +110,11 @@ def parse_command(
     for name in _FORMAT_FIELDS:
         if name in fields and pcm_format and fields[name] != getattr(pcm_format, name):
             raise WrongFormat(f"{name} cannot change during a session; open another connection")
-    problem = find_unknown([name for name in fields if name not in _FORMAT_FIELDS], known)
+    options = MicrophoneOptions.__struct_fields__
+    problem = find_unknown([name for name in fields if name not in options], known)
+    for name in fields:
+        if name in options and name not in _FORMAT_FIELDS:
+            problem = f"{name} cannot change during a session; open another connection"
     settings = parse_face_settings(fields)
     face = {name: getattr(settings, name) for name in FACE_SETTINGS} if settings else {}
     fields = {**_with_flags(fields), "face": face, "problem": problem}
@@ -133,7 +137,7 @@ class ViewerCommand(Struct, frozen=True, kw_only=True):
     avatar: list[list[Annotated[str, Meta(max_length=128)]]] | None = None  # shapes of each mesh
     format: Annotated[str, whole_text(f"({'|'.join(FORMATS)})")] = FORMATS[0]  # the weights' format
     face: FaceSettings | None = None  # settings to change
-    problem: str = ""  # error about unknown fields, which are ignored
+    problem: str = ""  # error about fields that are ignored
 
 
 def parse_viewer_command(message: str) -> ViewerCommand:
