@@ -214,7 +214,7 @@ def render(
                 raise UserError(f"{source}: the file contains no frames")
             count = exporter.export(motion, progress)
         if motion.phones == []:
-            print_message(f"{source}: no speech was found; the mouth stays closed")
+            print_message(f"{source}: no speech was found; the mouth stays at rest")
         phones = "" if motion.phones is None else f", {plural(len(motion.phones), 'phone')}"
         print_message(f"wrote {target}: {plural(count, exporter.unit)}{phones}")
         if motion.is_text_mismatched:
