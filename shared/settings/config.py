@@ -340,13 +340,17 @@ class Settings:
             content = tomllib.loads(text)
         values: dict[str, Any] = {}
         for table, entries in content.items():
-            if table not in self._tables or not isinstance(entries, dict):
+            if not isinstance(entries, dict):
+                raise UserError(
+                    f"{file}: {table!r} is not in a table; write it below a line such as [common]"
+                )
+            if table not in self._tables:
                 raise UserError(f"{file}: unknown table [{table}]; {_hint(table, self._tables)}")
             values |= {f"{table}.{key}": value for key, value in entries.items()}
         layer = _make_layer({n: _as_text(v) for n, v in values.items()}, self._names, str(file))
         for name, value in values.items():
             table, key = address = self._names[name]
-            is_list = typing.get_origin(self._keys(table)[key].annotation) is tuple
+            is_list = _is_list(self._keys(table)[key])
             if not isinstance(value, list if is_list else str | int | float):
                 raise self._value_error(address, layer[address])
         return layer
@@ -356,6 +360,8 @@ class Settings:
         field = self._keys(table)[key]
         similar = difflib.get_close_matches(value.text, _names(field), n=1, cutoff=0.5)
         hint = f"; did you mean {similar[0]}?" if similar else ""
+        if _is_list(field):
+            hint = '; write ["A", "B"] in a file, and "A B" elsewhere'
         return UserError(
             f"{table}.{key}: {value.text!r} (from {value.origin}) is not"
             f" {describe_allowed_values(field)}{hint}"
@@ -368,6 +374,10 @@ def _fields(table: str, config_type: type[ServiceConfig]) -> Mapping[str, FieldI
     return {
         key: field for key, field in fields.items() if table != COMMON or not _has(field, Unique)
     }
+
+
+def _is_list(field: FieldInfo) -> bool:
+    return typing.get_origin(field.annotation) is tuple
 
 
 def _has(field: FieldInfo, mark: type) -> bool:

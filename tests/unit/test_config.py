@@ -115,8 +115,8 @@ def test_a_default_may_depend_on_another_key() -> None:
             ("gateway.https", text, "empty, proxy, or the path of a PEM file such as kouxing.pem")
             for text in ("true", "False", "0")
         ),
-        ("gateway.trusted_origins", "https://a.example; *", "such as https://example.org"),
-        ("gateway.senders", "vmc://127.0.0.1 http://127.0.0.1", "such as vmc://127.0.0.1:39540"),
+        ("gateway.trusted_origins", "https://a.example; *", '"A B" elsewhere'),
+        ("gateway.senders", "vmc://127.0.0.1 http://127.0.0.1", '"A B" elsewhere'),
     ],
 )
 def test_an_error_names_key_value_origin_and_what_is_allowed(
@@ -145,12 +145,16 @@ def test_names_may_have_capitals() -> None:
     [
         ("num_stable_frames =", "Invalid value"),
         ("[recogniser]\n", r"unknown table \[recogniser\]; the nearest is recognizer"),
-        ("common = 1\n", r"unknown table \[common\]"),
+        ("common = 1\n", r"'common' is not in a table; write it below a line such as \[common\]"),
+        ("head = 'mika'\n", "'head' is not in a table"),
         ("[recognizer]\nspeed = 1\n", "unknown key recognizer.speed; the nearest is recognizer."),
         ("[common]\nmin_confidence = 1\n", "the nearest is recognizer.min_confidence"),
         ("[control]\nlips = 'learned'\n", "the nearest is synthesizer.lips"),
         ("[driver]\nout = ['a']\n", "driver.out: .* is not text"),
-        ("[gateway]\nsenders = 'vmc://'\n", "gateway.senders: .* is not a list"),
+        (
+            "[gateway]\nsenders = 'vmc://'\n",
+            r'gateway.senders: .* is not a list .*; write \["A", "B"\] in a file',
+        ),
         ("[recognizer]\naudio = 5560\n", r"audio: '5560' \(from .*kouxing.toml"),
     ],
 )
