@@ -7,7 +7,7 @@ import { DrawRate, ImageQueue, drawsInSoftware } from "./page/draw-rate.js";
 import { Player } from "./page/player.js";
 import { FapTrack } from "./page/playout.js";
 import { Sound } from "./page/sound.js";
-import { loadPuppet } from "./puppet.js";
+import { fetchFile, loadPuppet } from "./puppet.js";
 import { readRecording } from "./recording.js";
 import { chooseSet } from "./shape-names.js";
 import { Viewer } from "./viewer.js";
@@ -129,7 +129,13 @@ export class KouxingFace extends HTMLElement {
    * @returns a promise that is resolved at the end, or when another recording starts
    */
   async play(audio = null) {
-    const { names, frames } = readRecording(await (await fetch(this.getAttribute("recording"))).text());
+    const url = this.getAttribute("recording");
+    if (!url) throw new Error("<kouxing-face> needs the attribute recording; add it");
+    if (this.#avatar === null) throw new Error("the model is not loaded yet; wait for the event load");
+    const bytes = await fetchFile(url).catch(({ message }) => {
+      throw new Error(`${url}: ${message}`);
+    });
+    const { names, frames } = readRecording(new TextDecoder().decode(bytes));
     const set = names === null ? "faps" : chooseSet(names);
     if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);
     const startMs = performance.now();
@@ -222,7 +228,15 @@ export class KouxingFace extends HTMLElement {
     const shapes = this.set === "faps" ? "" : this.set;
     const gateway = this.getAttribute("gateway") ?? location.origin;
     let shown = { session: null };
+    let isFirst = true; // whether the first attempt to connect has no result yet
     const handlers = {
+      connected: (isConnected) => {
+        if (this.#viewer === null) return; // closed by this element
+        const text = `cannot connect to the gateway at ${gateway}; start it with: kouxing run --set gateway.trusted_origins=${location.origin}`;
+        if (isConnected) this.#note.textContent = "";
+        else if (isFirst) this.#showError(new Error(text), text);
+        isFirst = false;
+      },
       frame: (mediaTime, faps) => shapes || this.#player.addFrame(mediaTime, faps),
       rest: (faps) => shapes || this.#setRest(faps, []),
       weights: (mediaTime, weights) => this.#player.addFrame(mediaTime, weights),
@@ -238,12 +252,17 @@ export class KouxingFace extends HTMLElement {
       phone: (message) => this.dispatchEvent(new CustomEvent("phone", { detail: message })),
       error: ({ text }) => this.dispatchEvent(new ErrorEvent("error", { message: text })),
     };
-    this.#viewer = new Viewer(gateway, handlers, { session, token, shapes });
+    try {
+      this.#viewer = new Viewer(gateway, handlers, { session, token, shapes });
+    } catch (error) {
+      this.#showError(error, error.message); // a wrong address
+    }
   }
 
   #disconnect() {
-    this.#viewer?.close();
+    const viewer = this.#viewer;
     this.#viewer = null;
+    viewer?.close();
     this.#recording?.onEnded();
     this.#recording = this.#values = null;
     this.#names = [];

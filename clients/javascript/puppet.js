@@ -66,7 +66,8 @@ async function readAvatar(url) {
   return avatar;
 }
 
-async function fetchFile(url) {
+/** Return the bytes at a URL. */
+export async function fetchFile(url) {
   const answer = await fetch(url).catch(({ message }) => {
     throw new Error(`cannot be loaded (${message}); check the address`);
   });

@@ -39,6 +39,7 @@ export class LipSync extends EventTarget {
   #isSpeaking = false;
   #isLaughing = false;
   #mayBeSlow = false; // with final phones
+  #isClosed = false;
 
   /** Names of the weights of each set. */
   names = {};
@@ -58,10 +59,11 @@ export class LipSync extends EventTarget {
   /** Load the models and the worker. */
   static async create({ models = MODELS, phones = true, context = null, shapes = DEFAULT_SHAPES, ...options } = {}) {
     checkOptions(options, OPTIONS);
+    // Bundlers find the file only if its URL is written here.
     const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
     const lips = new LipSync(worker, context, { shapes, ...options });
     lips.#mayBeSlow = phones === "final";
-    worker.onerror = () => lips.#fail("cannot start the worker; serve the package from the page's own origin");
+    worker.onerror = () => lips.#fail("cannot start worker.js of kouxing-lips; serve the package from the page's own origin, or copy it next to your bundle");
     try {
       await lips.#request("loaded", { type: "load", models: new URL(models, location.href).href, phones });
     } catch (error) {
@@ -73,6 +75,7 @@ export class LipSync extends EventTarget {
 
   /** Follow the microphone. If it cannot be opened, rejects with a message that says what to do. */
   async listenToMicrophone(constraints = {}) {
+    this.#checkOpen();
     if (!navigator.mediaDevices) throw new Error(TEXTS.insecure);
     const audio = { channelCount: 1, echoCancellation: true, autoGainControl: true, ...constraints };
     const choice = ++this.#choice;
@@ -175,6 +178,7 @@ export class LipSync extends EventTarget {
 
   /** Stop, and release all resources. */
   close() {
+    this.#isClosed = true;
     this.stop();
     this.#supersede();
     document.removeEventListener("visibilitychange", this.#onVisibility);
@@ -185,7 +189,9 @@ export class LipSync extends EventTarget {
 
   /** Follow the source of a choice. onRelease is called when it is no longer followed. */
   async #follow(source, choice, onRelease = () => {}) {
+    this.#checkOpen();
     const context = this.context;
+    if (context.state === "closed") throw new Error("the audio context is closed; create lip sync with an open one");
     await context.audioWorklet.addModule(new URL("worklet.js", import.meta.url));
     this.#check(choice);
     const node = sourceNode(context, source); // a wrong source does not end the current one
@@ -227,6 +233,10 @@ export class LipSync extends EventTarget {
     if (choice !== this.#choice) throw abortError();
   }
 
+  #checkOpen() {
+    if (this.#isClosed) throw new Error("this lip sync is closed; create another one");
+  }
+
   #release() {
     if (this.#source === null) return;
     this.#source.release();
@@ -243,7 +253,8 @@ export class LipSync extends EventTarget {
   }
 
   /** Send a request to the worker, and wait for its answer. It replaces an unanswered request. */
-  #request(answer, message, transfer = []) {
+  async #request(answer, message, transfer = []) {
+    this.#checkOpen();
     this.#supersede();
     return new Promise((resolve, reject) => {
       this.#pending = { message, answer, resolve, reject };
@@ -326,6 +337,10 @@ const elementNodes = new WeakMap(); // an element allows only one node
 
 /** Return the audio node of a source. Its property isPlayed is true if the page plays the sound. */
 function sourceNode(context, source) {
+  const current = source instanceof AudioNode ? source : elementNodes.get(source);
+  if (current && current.context !== context) {
+    throw new Error("the source belongs to another audio context; pass that context to LipSync.create() as context");
+  }
   if (source instanceof AudioNode) return Object.assign(source, { isPlayed: false });
   if (source instanceof MediaStreamTrack) source = new MediaStream([source]);
   if (source instanceof MediaStream) {

@@ -211,7 +211,7 @@ def faces(
         "arkit": 'src="arkit.glb" recording',
         "vrm": 'src="vrm-1.vrm" recording',
         "old": 'src="vrm-0.vrm" recording',
-        "own": f'src="own.glb" onclick="this.turnSoundOn()" {live}',
+        "own": f'src="own.glb" onclick="this.turnSoundOn()" data-{live} {live}',
         "none": 'src="none.glb"',
     }
     elements = "".join(
@@ -253,6 +253,24 @@ def test_the_web_component_plays_recordings_on_models_of_all_kinds(
         region = slice(width), slice(left, left + width)
         while not (faces.image()[region] != closed[region]).any():
             pass
+
+
+def test_the_web_component_reports_wrong_addresses(faces: Browser) -> None:
+    play = "arkit.play().catch(({ message }) => message)"
+    faces.evaluate("arkit.setAttribute('recording', 'absent.jsonl')")
+    assert "absent.jsonl: cannot be loaded (404" in faces.evaluate(play)
+    faces.evaluate("arkit.setAttribute('recording', '')")
+    assert "add" in faces.evaluate(play)
+    for address, text in (
+        ("localhost:8080", "localhost:8080 is not the address of a gateway"),
+        (f"{faces.evaluate('location.origin')}/absent", "cannot connect to the gateway at http://"),
+    ):
+        faces.evaluate(f"own.failure = ''; own.setAttribute('gateway', '{address}')")
+        faces.wait_for(f"own.failure.includes('{text}')")
+        assert text in faces.evaluate("own.shadowRoot.querySelector('p').textContent")
+    faces.evaluate("own.setAttribute('gateway', own.dataset.gateway)")
+    faces.wait_for("own.shadowRoot.querySelector('p').textContent === ''")
+    faces.page_errors.clear()
 
 
 def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser) -> None:

@@ -2,6 +2,7 @@
 
 import { FapTrack, Playout, Speaker, Viewer, readRecording } from "kouxing-client";
 import type { KouxingFace } from "kouxing-client/face";
+import "kouxing-client/face.js"; // the name in an import map, for pages without a bundler
 
 const gateway = "http://localhost:8080";
 const speaker: Speaker = await Speaker.open(gateway, { sampleRateHz: 24000, encoding: "f32le", ahead: true });

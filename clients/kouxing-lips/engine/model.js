@@ -21,7 +21,7 @@ const ARRAYS = {
 /**
  * Load the models.
  *
- * @param base URL of the folder with the files; in Node also a file URL
+ * @param base URL of the folder with the files, with or without a slash at its end; in Node also a file URL
  * @param options { phones: true also loads the phone recognizer, "final" also the block network }
  * @returns a promise of { encoder: Network, phoneLm: PhoneLm or null, blocks: Network or null, arrays:
  *   { values, shape } by name, constants, ... }; it is rejected if a file is missing or of another version
@@ -29,7 +29,8 @@ const ARRAYS = {
 export async function loadModel(base, { phones = false } = {}) {
   if (![true, false, FINAL].includes(phones)) throw new RangeError(`phones is ${phones}; it must be true, false or "${FINAL}"`);
   const files = [...FILES, ...(phones ? [PHONES_FILE] : []), ...(phones === FINAL ? [BLOCKS_FILE] : [])];
-  const [encoder, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, base))));
+  const folder = String(base).replace(/\/?$/, "/");
+  const [encoder, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, folder))));
   const model = JSON.parse(new TextDecoder().decode(header));
   if (model.format !== FORMAT) {
     throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; export them again`);
@@ -66,6 +67,6 @@ async function readBytes(url) {
     if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
     return new Uint8Array(await answer.arrayBuffer());
   } catch (error) {
-    throw new Error(`cannot load ${url} (${error.message}); write it with: kouxing export web`, { cause: error });
+    throw new Error(`cannot load ${url} (${error.message}); set the option models to the folder of this file, or write it with: kouxing export web`, { cause: error });
   }
 }

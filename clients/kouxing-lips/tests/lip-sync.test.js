@@ -2,6 +2,7 @@
 
 import assert from "node:assert/strict";
 import test from "node:test";
+import { loadModel } from "../engine/model.js";
 import { LipSync } from "../index.js";
 
 class FakeWorker {
@@ -116,6 +117,24 @@ test("a failed load ends the worker", async () => {
   FakeWorker.error = "the model cannot be loaded";
   await assert.rejects(LipSync.create({ context }), /the model cannot be loaded/);
   assert.ok(FakeWorker.newest.isTerminated);
+});
+
+test("the URL of the models may lack the slash at its end", async () => {
+  for (const url of ["file:///nowhere/models", "file:///nowhere/models/"]) {
+    await assert.rejects(loadModel(url), /cannot load file:\/\/\/nowhere\/models\/\w+\.\w+ .*set the option models/);
+  }
+});
+
+test("a closed lip sync, a closed context and a source of another context give a sentence", async () => {
+  const lips = await LipSync.create({ context });
+  const other = Object.assign(new FakeAudioNode(), { context: new FakeContext() });
+  await assert.rejects(lips.listenTo(other), /belongs to another audio context; pass that context/);
+  context.state = "closed";
+  await assert.rejects(lips.listenTo(new FakeBuffer()), /the audio context is closed/);
+  lips.close();
+  for (const call of [() => lips.open(16000), () => lips.listenTo(new FakeBuffer()), () => lips.listenToMicrophone()]) {
+    await assert.rejects(call, /this lip sync is closed; create another one/);
+  }
 });
 
 test("an error of another call does not reject open()", async () => {
