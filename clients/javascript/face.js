@@ -12,6 +12,7 @@ import { readRecording } from "./recording.js";
 import { chooseSet } from "./shape-names.js";
 import { Viewer } from "./viewer.js";
 
+const LOST_WEBGL = "the browser no longer draws this face; show fewer faces, at most about 16 on a page, or reload the page";
 const NO_WEBGL = "this browser has no WebGL; turn on hardware acceleration";
 const FOV_DEGREES = 20;
 const RATE_HZ = 16000;
@@ -45,6 +46,8 @@ export class KouxingFace extends HTMLElement {
   constructor() {
     super();
     const canvas = document.createElement("canvas");
+    canvas.addEventListener("webglcontextlost", () => this.#showError(new Error(LOST_WEBGL), LOST_WEBGL));
+    canvas.addEventListener("webglcontextrestored", () => (this.#note.textContent = ""));
     const style = document.createElement("style");
     style.textContent =
       ":host { display: block; aspect-ratio: 1; contain: strict } p { position: absolute; margin: 1em } canvas { display: block; width: 100%; height: 100% }";

@@ -255,6 +255,17 @@ def test_the_web_component_plays_recordings_on_models_of_all_kinds(
             pass
 
 
+def test_the_web_component_reports_that_it_is_no_longer_drawn(faces: Browser) -> None:
+    faces.evaluate(
+        "none.failure = ''; window.context = none.shadowRoot.querySelector('canvas')"
+        ".getContext('webgl2').getExtension('WEBGL_lose_context'); context.loseContext()"
+    )
+    faces.wait_for("none.failure.includes('show fewer faces')")
+    faces.evaluate("context.restoreContext()")
+    faces.wait_for("none.shadowRoot.querySelector('p').textContent === ''")
+    faces.page_errors.clear()
+
+
 def test_the_web_component_reports_wrong_addresses(faces: Browser) -> None:
     play = "arkit.play().catch(({ message }) => message)"
     faces.evaluate("arkit.setAttribute('recording', 'absent.jsonl')")

@@ -146,6 +146,7 @@ test("after a failed load, <kouxing-face> loads local lip sync again", async () 
   class FakeElement {
     style = {};
     append() {}
+    addEventListener() {}
     attachShadow = () => this;
     hasAttribute = () => true;
     getAttribute = () => "";
