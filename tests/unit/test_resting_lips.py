@@ -137,6 +137,11 @@ def test_a_bang_does_not_freeze_the_mouth() -> None:
     assert not amounts[round(1.2 / FRAME_S) :].any()
 
 
+def test_a_later_loud_sound_does_not_turn_quiet_speech_into_a_pause() -> None:
+    amounts = ajar_amounts(lambda time_s: -40.0 if time_s < 1.4 else -12.0, 1.0, delay_s=1.5)
+    assert not amounts[round(0.5 / FRAME_S) :].any()
+
+
 def test_the_end_of_the_sound_closes_the_lips_in_300_ms() -> None:
     lips = RestingLips()
     lips.add_event(SpeechChange(active=True, time_s=0.0))

@@ -15,11 +15,11 @@ s       0 for the predicted mouth, 1 for a slightly open mouth   1
                    and from LEAD_S before voice activity to its first sound
                 0  otherwise, and at an onset before the first voice activity
 
-``s`` follows cubics, so the mouth moves smoothly. A sound is a level at most
-``_RANGE_DB`` below the loudest recent one. Silence longer than ``_MIN_PAUSE_S`` is a pause,
-because the closure of a stop is shorter. In a pause, lips close for a phone, and for a likely
-closure shortly before a sound. If the lip predictor is nearly certain of a closure, they stay
-closed until the next sound.
+``s`` follows cubics, so the mouth moves smoothly. A sound is a level at most ``_RANGE_DB`` below the
+loudest recent one, and below the known ones of the next ``LEAD_S``. Silence longer than
+``_MIN_PAUSE_S`` is a pause, because the closure of a stop is shorter. In a pause, lips close for a
+phone, and for a likely closure shortly before a sound. If the lip predictor is nearly certain of a
+closure, they stay closed until the next sound.
 
 The first voice activity is detected too late to close the lips for an initial b, p or m. So lips
 that are ajar before it also close at an *onset*: a level more than ``_ONSET_DB`` above the
@@ -75,6 +75,8 @@ class RestingLips:
 
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()  # levels of future frames: time s, dB
+        # levels more than LEAD_S ahead, which do not count for the loudest level yet
+        self._later_levels: deque[tuple[float, float]] = deque()
         self._speech_changes: deque[SpeechChange] = deque()  # changes in future frames
         self._is_voice = self._has_spoken = self._has_ended = False
         self._loudest_db = -math.inf
@@ -95,7 +97,7 @@ class RestingLips:
                 if self._known_s == -math.inf:
                     self._sound_s = event.time_s
                 self._levels.append((event.time_s, event.level_db))
-                self._loudest_db = max(event.level_db, self._loudest_db - _FADE_DB)
+                self._later_levels.append((event.time_s, event.level_db))
                 self._known_s = event.time_s
             case SpeechChange():
                 self._speech_changes.append(event)
@@ -105,6 +107,7 @@ class RestingLips:
     def flush(self) -> None:
         """Drop the known events; the next frames return to rest."""
         self._levels.clear()
+        self._later_levels.clear()
         self._speech_changes.clear()
         self._is_voice, self._sound_s = False, -math.inf
 
@@ -116,6 +119,9 @@ class RestingLips:
                 self._sound_s, self._stays_closed = change.time_s, False
             self._is_voice = change.active
             self._has_spoken |= change.active
+        while self._later_levels and self._later_levels[0][0] <= time_s + LEAD_S:
+            _, level_db = self._later_levels.popleft()
+            self._loudest_db = max(level_db, self._loudest_db - _FADE_DB)
         while self._levels and self._levels[0][0] <= time_s:
             level_s, level_db = self._levels.popleft()
             self._update_background(level_db)
