@@ -49,18 +49,19 @@ class SendersApi:
         """Start or stop a sender, or delay all; answer with their state or with an error."""
         try:
             command = browser_messages.parse_object(await request.read())
-            start, stop, delay_ms = (command.get(key) for key in ("start", "stop", "delay_ms"))
-            if isinstance(start, str):
-                self.pool.start(self._allowed_target(start))
-                self._on_started()
-            elif isinstance(stop, str):
-                self.pool.stop(stop)
-            elif isinstance(delay_ms, int | float):
-                self.pool.set_delay(parse_delay_s(delay_ms))
-            else:
-                raise UserError(
-                    "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"
-                )
+            match [*command.items()]:
+                case [("start", str(url))]:
+                    self.pool.start(self._allowed_target(url))
+                    self._on_started()
+                case [("stop", str(url))]:
+                    self.pool.stop(url)
+                case [("delay_ms", int() | float() as delay_ms)] if not isinstance(delay_ms, bool):
+                    self.pool.set_delay(parse_delay_s(delay_ms))
+                case _:
+                    raise UserError(
+                        "expected either 'start' or 'stop' with an address such as vmc://, or "
+                        "'delay_ms' with a number, and no other field"
+                    )
         except UserError as error:
             return web.json_response({"error": str(error)}, status=422)
         return self._state()

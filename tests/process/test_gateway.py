@@ -361,7 +361,15 @@ async def test_the_newest_face_is_sent_to_another_program(
         program.bind(("127.0.0.1", 0))
         url = f"osc://127.0.0.1:{program.getsockname()[1]}"
         async with aiohttp.ClientSession() as http:
-            for command in ({"start": "nonsense"}, {}, {"delay_ms": -1}, {"delay_ms": 10**400}):
+            for command in (
+                {"start": "nonsense"},
+                {},
+                {"delay_ms": -1},
+                {"delay_ms": 10**400},
+                {"delay_ms": True},
+                {"start": url, "stop": url},
+                {"start": url, "rate": 30},
+            ):
                 async with http.post(senders, json=command) as answer:
                     assert answer.status == 422
                     assert (await answer.json())["error"]

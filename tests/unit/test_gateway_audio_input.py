@@ -196,3 +196,30 @@ def test_the_rate_limit_allows_a_burst_and_then_real_time() -> None:
         assert asyncio.get_running_loop().time() == pytest.approx(1.0, abs=0.01)
 
     run(flood())
+
+
+def test_a_canceled_reader_no_longer_receives() -> None:
+    async def cancel_reader() -> bool:
+        receiving = asyncio.Event()
+        is_receiving = False
+
+        class Client:
+            async def receive(self) -> None:
+                nonlocal is_receiving
+                is_receiving = True
+                receiving.set()
+                try:
+                    await asyncio.Future()
+                finally:
+                    is_receiving = False
+
+        audio_input = AudioInput(FakeSession(), PCM16, is_synthesized=False)  # type: ignore[arg-type]
+        messages = audio_input.messages(Client())  # type: ignore[arg-type]
+        reader: asyncio.Future[object] = asyncio.ensure_future(anext(messages))
+        await receiving.wait()
+        reader.cancel()
+        await asyncio.wait({reader})
+        await asyncio.sleep(0)  # the task that receives ends
+        return is_receiving
+
+    assert not asyncio.run(cancel_reader())

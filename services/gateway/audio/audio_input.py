@@ -98,13 +98,15 @@ class AudioInput:
         """Yield a client's messages until it disconnects; after ``end``, until all is forwarded."""
         while True:
             receiving = asyncio.create_task(client.receive())
-            await asyncio.wait(
-                {receiving, self._drain_task} if self._drain_task else {receiving},
-                return_when=asyncio.FIRST_COMPLETED,
-            )
-            if not receiving.done():
-                receiving.cancel()
-                return
+            try:
+                await asyncio.wait(
+                    {receiving, self._drain_task} if self._drain_task else {receiving},
+                    return_when=asyncio.FIRST_COMPLETED,
+                )
+                if not receiving.done():
+                    return
+            finally:
+                receiving.cancel()  # does nothing if it is done
             message = receiving.result()
             if message.type in _END_TYPES:
                 return
