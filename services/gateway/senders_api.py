@@ -59,7 +59,7 @@ class SendersApi:
                     self.pool.set_delay(parse_delay_s(delay_ms))
                 case _:
                     raise UserError(
-                        "expected either 'start' or 'stop' with an address such as vmc://, or "
+                        "expected 'start' or 'stop' with an address such as vmc://, or "
                         "'delay_ms' with a number, and no other field"
                     )
         except UserError as error:
