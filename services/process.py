@@ -45,7 +45,7 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
     An invalid setting prints one line and returns 2. An internal error logs a traceback and
     returns 1.
     """
-    from kouxing.shared.errors import UserError, prefix_name
+    from kouxing.shared.errors import USER_ERROR, UserError, prefix_name
     from kouxing.shared.monitoring.logs import LOG, configure
     from kouxing.shared.monitoring.metrics import use_single_malloc_arena
     from kouxing.shared.network.connection_limits import raise_file_limit
@@ -59,10 +59,10 @@ def run_service(make_service: Callable[[], Service], name: str, log_level: str) 
         service.startup()
     except ImportError as error:
         print(f"{name}: {error}; install kouxing again (in a checkout: make)", file=sys.stderr)
-        return 2
+        return USER_ERROR
     except UserError as error:
         print(prefix_name(name, str(error)), file=sys.stderr)
-        return 2
+        return USER_ERROR
     try:
         service.run()
     except Exception:  # at this point, even a UserError is an internal error
@@ -80,7 +80,7 @@ def main() -> None:
     gc.disable()  # until the service runs: it frees nothing, and takes a tenth of the startup time
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.service_kinds import KINDS
-    from kouxing.shared.errors import UserError, prefix_name
+    from kouxing.shared.errors import USER_ERROR, UserError, prefix_name
 
     parser = argparse.ArgumentParser(prog="python -m kouxing.services.process")
     parser.add_argument("kind", choices=KINDS)
@@ -93,7 +93,7 @@ def main() -> None:
         status = serve(arguments.kind, arguments.config, arguments.set)
     except UserError as error:
         print(prefix_name(arguments.kind, str(error)), file=sys.stderr)
-        status = 2
+        status = USER_ERROR
     sys.exit(status)
 
 

@@ -25,7 +25,7 @@ from kouxing.services.cli.recordings import commands as recordings
 from kouxing.services.cli.system import commands as system
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.terminal import CONSOLE
-from kouxing.shared.errors import UserError
+from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
 from kouxing.shared.service.service_kind import ServiceKind
 
@@ -199,7 +199,7 @@ def _run_command() -> None:
         sys.exit(status or 0)
     if text:
         CONSOLE.print(f"kouxing: {text}", style="red", markup=False, soft_wrap=True)
-    sys.exit(2)
+    sys.exit(USER_ERROR)
 
 
 def _usage_text(error: Any) -> str:

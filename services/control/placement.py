@@ -1,5 +1,6 @@
 """Chooses workers for a session."""
 
+from collections import deque
 from collections.abc import Collection, Mapping
 
 from kouxing.services.control.service_registry import ServiceRecord, ServiceRegistry
@@ -38,15 +39,17 @@ class Placement:
         for ``min_room`` sessions.
         """
         workers: dict[str, str] = {}
-        needed = list(CLIENT_NEEDS)
-        for endpoint in needed:  # grows
+        needed = deque(CLIENT_NEEDS)
+        while needed:
+            endpoint = needed.popleft()
+            if endpoint in workers:
+                continue
             placed = {*kept.values(), *workers.values()}
             instance = kept.get(endpoint) or self._choose(
                 endpoint, placed, now_s, language, min_room=min_room, excluded=excluded
             )
             workers[endpoint] = instance
-            needs = self._registry[instance].heartbeat.needs
-            needed += [need for need in needs if need not in needed]
+            needed += self._registry[instance].heartbeat.needs
         if UNPACED_AUDIO in self._registry[workers["audio"]].heartbeat.endpoints:
             workers[UNPACED_AUDIO] = workers["audio"]
         return workers

@@ -9,6 +9,7 @@ from typer.main import get_command
 from kouxing.services.cli.main import app
 
 ROOT = Path(__file__).parents[2]
+LINK = r"\]\((?!http)([^)#]*)(?:#([^)]+))?\)"  # path and heading of a relative link
 DOCUMENTS = [
     path
     for pattern in ("*.md", "docs/**/*.md", "proto/*.md", "examples/*.md", "clients/*/*.md")
@@ -17,9 +18,13 @@ DOCUMENTS = [
 ]
 
 
+def test_the_documents_have_links() -> None:
+    assert sum(len(re.findall(LINK, document.read_text("utf-8"))) for document in DOCUMENTS) > 100
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_relative_link_has_a_target(document: Path) -> None:
-    links = re.findall(r"\]\((?!http)([^)#]*)(?:#([^)]+))?\)", document.read_text("utf-8"))
+    links = re.findall(LINK, document.read_text("utf-8"))
     for link, heading in links:
         target = document.parent / link if link else document
         assert target.exists(), link

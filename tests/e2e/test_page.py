@@ -138,10 +138,14 @@ def test_every_control_can_be_clicked(
         "[...document.querySelectorAll('{} :is(button, select, input)')].filter((item) =>"
         "item.checkVisibility()).map((item, index) => (item.id ||= `control-${{index}}`))"
     )
-    for name in page.evaluate(shown.format("footer")):
+    in_footer = page.evaluate(shown.format("footer"))
+    assert "open-settings" in in_footer
+    for name in in_footer:
         page.center_of(name)
     page.click("open-settings")
-    for name in page.evaluate(shown.format("#settings")):
+    in_settings = page.evaluate(shown.format("#settings"))
+    assert len(in_settings) > 5
+    for name in in_settings:
         page.center_of(name)
     page.evaluate("document.getElementById('settings').hidePopover()")
     page.resize(*SIZE_PX)
