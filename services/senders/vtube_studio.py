@@ -3,7 +3,7 @@
 The API is JSON over a WebSocket. The first time, the user allows kouxing in a VTube Studio window,
 which issues a token for later connections. Then kouxing requests the list of tracking parameters
 and sets the ``tracking_parameters`` that exist, in every frame. The model's own settings define
-what they move. The package pyvts is not used; its last release is of 2024.
+what they move. The package pyvts is not used; its last release was in 2024.
 """
 
 import asyncio

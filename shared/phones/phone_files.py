@@ -2,7 +2,7 @@
 
 The TextGrid layout is Praat's long text format (Boersma and Weenink, Praat manual, "TextGrid file
 formats"). Intervals cover the whole time without gaps, so pauses are intervals with empty text.
-praatio would replace only the templates of the lines, because it does not cut overlaps.
+praatio would replace only the line templates, because it does not cut overlaps.
 """
 
 import csv

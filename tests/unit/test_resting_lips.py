@@ -132,6 +132,13 @@ def test_an_onset_after_voice_activity_does_not_close_the_lips() -> None:
     assert at(amounts, 1.6) == 1.0
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.04, 0.06])
+def test_the_lips_move_in_speech_with_any_delay(delay_s: float) -> None:
+    amounts = ajar_amounts(lambda _: LOUD_DB, 1.0, delay_s=delay_s, voice=(0.2,))
+    assert at(amounts, 0.1) > 0.5
+    assert not amounts[round(0.4 / FRAME_S) :].any()
+
+
 def test_a_bang_does_not_freeze_the_mouth() -> None:
     amounts = ajar_amounts(lambda time_s: 0.0 if 0.5 < time_s <= 0.6 else -30.0, 3.0)
     assert not amounts[round(1.2 / FRAME_S) :].any()

@@ -4,7 +4,7 @@
 // server, values are rounded to 32 bits after each operator. All tensors are allocated once, so a run
 // leaves no garbage.
 //
-// onnxruntime-web is not used. It would add 3.7 MB to a download of 2.9 MB; the code here has 10 kB. A step of the
+// onnxruntime-web is not used. It would add 3.7 MB to a download of 2.9 MB; the code here is 10 kB. A step of the
 // audio encoder needs 0.3 ms here and 0.6 ms in onnxruntime-web 1.30 (Node 20, one thread, shortest of 15 series).
 
 import { readGraph } from "./onnx-file.js";

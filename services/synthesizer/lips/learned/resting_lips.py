@@ -79,6 +79,7 @@ class RestingLips:
         self._later_levels: deque[tuple[float, float]] = deque()
         self._speech_changes: deque[SpeechChange] = deque()  # changes in future frames
         self._is_voice = self._has_spoken = self._has_ended = False
+        self._is_sounding = False  # whether the level of the last frame is a sound
         self._loudest_db = -math.inf
         self._background_db: float | None = None
         self._onset_until_s = -math.inf  # the last onset closes the lips until this time
@@ -109,7 +110,7 @@ class RestingLips:
         self._levels.clear()
         self._later_levels.clear()
         self._speech_changes.clear()
-        self._is_voice, self._sound_s = False, -math.inf
+        self._is_voice, self._is_sounding, self._sound_s = False, False, -math.inf
 
     def process_until(self, time_s: float) -> None:
         """Process the events up to the time of a frame; times increase."""
@@ -125,7 +126,8 @@ class RestingLips:
         while self._levels and self._levels[0][0] <= time_s:
             level_s, level_db = self._levels.popleft()
             self._update_background(level_db)
-            if self._is_sound(level_db):
+            self._is_sounding = self._is_sound(level_db)
+            if self._is_sounding:
                 self._sound_s, self._stays_closed = level_s, False
 
     def silence_penalty_at(self, time_s: float, closure: float, phones: float) -> float:
@@ -149,6 +151,8 @@ class RestingLips:
     def amount_at(self, time_s: float) -> float:
         """Return how far the mouth is ajar at the time of a frame, 0 to 1."""
         next_s = self._next_sound_s()
+        if self._is_sounding and self._known_s < time_s + _YIELD_S:
+            next_s = min(next_s, time_s)  # with a shorter delay, the sound is expected to continue
         soon_s = time_s + LEAD_S
         if self._has_ended:
             self._set_goal(0.0, _END_S)
