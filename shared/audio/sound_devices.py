@@ -79,7 +79,7 @@ def open_microphone(name: str) -> AudioSource:
         except sounddevice.PortAudioError as error:
             raise UserError(f"cannot record the microphone: {error}") from None
         raise UserError(
-            "the microphone sends no more audio; reconnect it, and run the command again"
+            "the microphone stopped sending audio; reconnect it, and run the command again"
         )
 
     return AudioSource(name or "microphone", MEDIA_RATE_HZ, 1, None, blocks(), is_live=True)

@@ -96,7 +96,7 @@ def test_reports_a_microphone_that_stops(
     monkeypatch.setattr(sound_devices, "_TIMEOUT_S", 600.0 if is_unplugged else 0.0)
     blocks = open_microphone("").blocks
     assert len(next(blocks)) == 320
-    with pytest.raises(UserError, match="the microphone sends no more audio; reconnect it"):
+    with pytest.raises(UserError, match="the microphone stopped sending audio; reconnect it"):
         next(blocks)
 
 

@@ -1,4 +1,4 @@
-"""What ``speak`` does with the events about its session's video."""
+"""``speak`` handles the events about its session's video."""
 
 import io
 from collections.abc import Iterator

@@ -168,12 +168,17 @@ test("the worker names the request that failed", async () => {
 
 const aborted = { name: "AbortError" };
 
-test("stop() releases the microphone", async () => {
-  const lips = await LipSync.create({ context });
+/** Let lip sync follow the microphone, which the user allows. */
+async function followMicrophone(lips) {
   const listening = lips.listenToMicrophone();
   answerPrompt();
   await open();
   await listening;
+}
+
+test("stop() releases the microphone", async () => {
+  const lips = await LipSync.create({ context });
+  await followMicrophone(lips);
   assert.ok(stream.track.isLive);
   lips.stop();
   assert.ok(!stream.track.isLive);
@@ -205,10 +210,7 @@ test("stop() also works while the sound starts", async () => {
   const lips = await LipSync.create({ context });
   context.state = "suspended";
   context.resume = async () => lips.stop();
-  const listening = lips.listenToMicrophone();
-  answerPrompt();
-  await open();
-  await listening;
+  await followMicrophone(lips);
   assert.ok(!stream.track.isLive);
 });
 
@@ -236,10 +238,7 @@ test("the source that was chosen last is followed, even if an earlier one takes 
 
 test("a wrong source is rejected, and the current one is still followed", async () => {
   const lips = await LipSync.create({ context });
-  const listening = lips.listenToMicrophone();
-  answerPrompt();
-  await open();
-  await listening;
+  await followMicrophone(lips);
   const { node } = lips;
   await assert.rejects(lips.listenTo(5), TypeError);
   assert.equal(lips.node, node);

@@ -129,21 +129,24 @@ def is_sequence(path: Path) -> bool:
 
 def picture_name(path: Path, number: int) -> Path:
     """Return the file of a picture in a sequence: a folder, or a name such as ``face%05d.png``."""
-    if path.suffix.lower() != ".png":
-        path /= "%05d.png"
-    return path.with_name(_NUMBER_FIELD.sub(lambda match: match[0] % number, path.name, count=1))
+    numbered = _numbered(path)
+    name = _NUMBER_FIELD.sub(lambda match: match[0] % number, numbered.name, count=1)
+    return numbered.with_name(name)
 
 
 def existing_pictures(path: Path) -> list[Path]:
     """Return the existing files of a sequence, in the order of their names."""
-    first = picture_name(path, 0)
-    before, after = _NUMBER_FIELD.split(
-        path.name if path.suffix.lower() == ".png" else "%05d.png", maxsplit=1
-    )
+    numbered = _numbered(path)
+    before, after = _NUMBER_FIELD.split(numbered.name, maxsplit=1)
     name = re.compile(f"{re.escape(before)} *([0-9]+){re.escape(after)}")
-    files = sorted(first.parent.iterdir()) if first.parent.is_dir() else []
+    files = sorted(numbered.parent.iterdir()) if numbered.parent.is_dir() else []
     matches = [(file, match) for file in files if (match := name.fullmatch(file.name))]
     return [file for file, match in matches if picture_name(path, int(match[1])) == file]
+
+
+def _numbered(path: Path) -> Path:
+    """Return the path of a sequence's pictures, with a field for the number."""
+    return path if path.suffix.lower() == ".png" else path / "%05d.png"
 
 
 class VideoWriter:
@@ -289,12 +292,13 @@ class PictureSequence:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._num_images = 0
+        folder = _numbered(path).parent
         try:
-            if path.suffix.lower() != ".png":
+            if folder == path:
                 path.mkdir(exist_ok=True)
         except OSError as error:
             raise write_error(path, error) from error
-        remove_unfinished(path.parent if path.suffix.lower() == ".png" else path)
+        remove_unfinished(folder)
 
     def write_image(self, image: UInt8) -> None:
         """Write a picture (H, W, 3) or (H, W, 4), sRGB."""

@@ -15,11 +15,11 @@ s       0 for the predicted mouth, 1 for a slightly open mouth   1
                    and from LEAD_S before voice activity to its first sound
                 0  otherwise, and at an onset before the first voice activity
 
-``s`` follows cubics, so the mouth moves smoothly. A sound is a level at most ``_RANGE_DB`` below
-the loudest recent one, and below the known ones of the next ``LEAD_S``. Silence longer than
-``_MIN_PAUSE_S`` is a pause, because the closure of a stop is shorter. In a pause, lips close for a
-phone, and for a likely closure shortly before a sound. If the lip predictor is nearly certain of a
-closure, they stay closed until the next sound.
+``s`` follows cubics, so the mouth moves smoothly. A level is a sound if it is at most ``_RANGE_DB``
+below the loudest level, which is the maximum of recent levels and of those known for the next
+``LEAD_S``. Silence longer than ``_MIN_PAUSE_S`` is a pause, because the closure of a stop is
+shorter. In a pause, lips close for a phone, and for a likely closure shortly before a sound. If the
+lip predictor is nearly certain of a closure, they stay closed until the next sound.
 
 The first voice activity is detected too late to close the lips for an initial b, p or m. So lips
 that are ajar before it also close at an *onset*: a level more than ``_ONSET_DB`` above the
