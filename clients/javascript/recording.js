@@ -25,7 +25,7 @@ export function readRecording(text) {
   );
   if (wrong >= 0) throw new Error(`frame ${wrong + 1} of the recording: a value is missing or not a number`);
   const early = recording.frames.findIndex(([time], number, frames) => time < frames[number - 1]?.[0]);
-  if (early >= 0) throw new Error(`frame ${early + 1} of the recording: its time is earlier than the previous frame's; sort them`);
+  if (early >= 0) throw new Error(`frame ${early + 1} of the recording: its time is earlier than the previous frame's; sort the frames by time`);
   return recording;
 }
 

@@ -1,6 +1,6 @@
 """A headless Chromium with one page, driven by the Chrome DevTools Protocol.
 
-Playwright is not used: its package has 53 MB, because it contains Node.
+Playwright is not used: its package is 53 MB, because it contains Node.
 """
 
 import asyncio

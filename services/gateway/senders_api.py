@@ -76,8 +76,8 @@ class SendersApi:
                 "or use 'kouxing send'"
             )
         raise UserError(
-            f"camera={target.options['camera']} accepts other machines; write only its port, "
-            "add the address to gateway.senders, or use 'kouxing send'"
+            f"camera={target.options['camera']} accepts data from other machines; "
+            "write only its port, add the address to gateway.senders, or use 'kouxing send'"
         )
 
     def _state(self) -> web.Response:

@@ -1,6 +1,6 @@
 """The gateway service: shows sessions in browsers, and streams microphones into sessions.
 
-It streams audio to recognizers as any client does.
+It streams audio to recognizers like any other client.
 """
 
 import asyncio

@@ -77,7 +77,7 @@ def open_microphone(name: str) -> AudioSource:
                 while (block := recorded.get(timeout=_TIMEOUT_S)) is not None:
                     yield block
         except sounddevice.PortAudioError as error:
-            raise UserError(f"cannot record the microphone: {error}") from None
+            raise UserError(f"cannot record from the microphone: {error}") from None
         raise UserError(
             "the microphone stopped sending audio; reconnect it, and run the command again"
         )

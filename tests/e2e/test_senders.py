@@ -159,7 +159,7 @@ def test_starts_and_stops_senders(senders: SenderPool, receiver: socket.socket) 
     ("url", "reason"),
     [
         ("vmc://192.168.1.20", "192.168.1.20 is another machine"),
-        ("vmc://?camera=0.0.0.0:39541", "camera=0.0.0.0:39541 accepts other machines"),
+        ("vmc://?camera=0.0.0.0:39541", "camera=0.0.0.0:39541 accepts data from other machines"),
     ],
 )
 def test_a_page_starts_senders_on_this_machine_only(url: str, reason: str) -> None:

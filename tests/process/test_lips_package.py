@@ -201,4 +201,4 @@ def test_samples_that_are_not_finite_give_a_sentence(models: Path) -> None:
 def test_missing_models_give_a_sentence(tmp_path: Path) -> None:
     error = package_output(tmp_path, np.zeros(320, np.float32))["error"]
     assert error.startswith("cannot load file://")
-    assert error.endswith("or write it with: kouxing export web")
+    assert error.endswith("or create the file with: kouxing export web")

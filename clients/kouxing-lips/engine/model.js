@@ -67,6 +67,6 @@ async function readBytes(url) {
     if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
     return new Uint8Array(await answer.arrayBuffer());
   } catch (error) {
-    throw new Error(`cannot load ${url} (${error.message}); set the option models to the folder of this file, or write it with: kouxing export web`, { cause: error });
+    throw new Error(`cannot load ${url} (${error.message}); set the option models to the folder that contains this file, or create the file with: kouxing export web`, { cause: error });
   }
 }

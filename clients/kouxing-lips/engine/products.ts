@@ -1,4 +1,4 @@
-// Products of matrices, with SIMD. All places are bytes of the memory; matrices are stored by rows.
+// Matrix products with SIMD. All pointers are byte offsets into the memory; matrices are stored in row-major order.
 // This is AssemblyScript (https://www.assemblyscript.org), not TypeScript; products.js contains the compiled code.
 
 const FLOAT_BYTES = 4;
@@ -153,7 +153,7 @@ export function quantize(x: usize, scales: usize, out: usize, rows: i32, size: i
 /**
  * out = factor * tanh(factor * x) + offset: the sigmoid with 0.5 and 0.5, the hyperbolic tangent with 1 and 0.
  * The rational function is that of Eigen and onnxruntime, within 2e-7.
- * x, out: (count,) float; out may have up to three values more
+ * x, out: (count,) float; up to three values may be written past the end of out
  */
 export function activate(x: usize, out: usize, count: i32, factor: f32, offset: f32): void {
   const scale = f32x4.splat(factor);

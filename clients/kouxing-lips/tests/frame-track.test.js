@@ -25,7 +25,7 @@ test("frames of the last minute are kept", () => {
   assert.equal(track.at(0).faps[0], 2);
 });
 
-test("frames of an hour can come at once", () => {
+test("an hour of frames can arrive at once", () => {
   const track = new FrameTrack();
   track.push(Array.from({ length: 180000 }, (_, number) => frame(number / 50, number)));
   assert.equal(track.endS, 179999 / 50);

@@ -125,7 +125,7 @@ test("the URL of the models may lack the slash at its end", async () => {
   }
 });
 
-test("a closed lip sync, a closed context and a source of another context give a sentence", async () => {
+test("a closed lip sync, a closed context and a source of another context give a clear error", async () => {
   const lips = await LipSync.create({ context });
   const other = Object.assign(new FakeAudioNode(), { context: new FakeContext() });
   await assert.rejects(lips.listenTo(other), /belongs to another audio context; pass that context/);

@@ -200,7 +200,8 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
     if (steps_s < 0).any():
         number = int(np.argmax(steps_s < 0)) + 2
         raise UserError(
-            f"{path}, frame {number}: its time is earlier than the previous frame's; sort them"
+            f"{path}, frame {number}: its time is earlier than the previous frame's;"
+            " sort the frames by time"
         )
     times_s, first = np.unique(times_s - times_s[0], return_index=True)
     rate_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 1 else 50.0

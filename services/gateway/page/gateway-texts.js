@@ -121,7 +121,7 @@ const CHINESE = {
   "already sending to {count} programs; stop one first": "已在向 {count} 个程序发送，请先停止一个",
   "{host} is another machine; add the address to gateway.senders, or use 'kouxing send'":
     "{host} 是另一台机器；请把地址加入 gateway.senders，或用 kouxing send",
-  "camera={address} accepts other machines; write only its port, add the address to gateway.senders, or use 'kouxing send'":
+  "camera={address} accepts data from other machines; write only its port, add the address to gateway.senders, or use 'kouxing send'":
     "camera={address} 接受其他机器的数据；请只写端口，或把地址加入 gateway.senders，或用 kouxing send",
   "{url} is not a valid address; write {forms}": "地址 {url} 无效，请写 {forms}",
   "prefix must start with '/'": "prefix 必须以“/”开头",

@@ -44,7 +44,8 @@ class _NoJitterBuffer(JitterBuffer):
     """Passes each packet on when it arrives. An Opus packet is a whole frame.
 
     aiortc's buffer holds 80 ms of audio; after a lost packet, 0.32 s. If the client stops sending
-    in pauses, it holds the end of the speech until the next packets arrive. It has no option.
+    in pauses, it holds the end of the speech until the next packets arrive. It has no option for
+    this.
     """
 
     def add(self, packet: RtpPacket) -> tuple[bool, JitterFrame | None]:

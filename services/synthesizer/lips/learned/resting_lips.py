@@ -75,7 +75,7 @@ class RestingLips:
 
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()  # levels of future frames: time s, dB
-        # levels more than LEAD_S ahead, which do not count for the loudest level yet
+        # levels more than LEAD_S ahead, which do not count toward the loudest level yet
         self._later_levels: deque[tuple[float, float]] = deque()
         self._speech_changes: deque[SpeechChange] = deque()  # changes in future frames
         self._is_voice = self._has_spoken = self._has_ended = False
