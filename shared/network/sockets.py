@@ -314,6 +314,7 @@ class Poller:
         self._poller = zmq.Poller()
         self._sockets: dict[zmq.Socket[bytes], Socket] = {}
         self._quiet: set[zmq.Socket[bytes]] = set()  # sockets that do not end `wait`
+        self._paused: set[zmq.Socket[bytes]] = set()
         self.waker = Waker()  # ends each `wait` until it is cleared
         self._poller.register(self.waker.descriptor, zmq.POLLIN)
 
@@ -327,23 +328,35 @@ class Poller:
 
     def remove(self, socket: Socket) -> None:
         """Stop watching a socket."""
+        self._poller.register(socket.raw, 0)  # 0: no longer, if it was polled
         del self._sockets[socket.raw]
-        if socket.raw in self._quiet:
-            self._quiet.remove(socket.raw)
+        self._quiet.discard(socket.raw)
+        self._paused.discard(socket.raw)
+
+    def pause(self, socket: Socket, *, paused: bool) -> None:
+        """Pause or resume a socket. `wait` does not return a paused socket."""
+        if paused:
+            self._paused.add(socket.raw)
         else:
-            self._poller.unregister(socket.raw)
+            self._paused.discard(socket.raw)
+        if socket.raw not in self._quiet:
+            self._poller.register(socket.raw, 0 if paused else zmq.POLLIN)
+
+    def is_paused(self, socket: Socket) -> bool:
+        """Return whether a socket is paused."""
+        return socket.raw in self._paused
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Return the readable sockets in the order in which they were added."""
         events = self._poller.poll(max(0, math.ceil(timeout_s * 1000)))
         ready = {raw for raw, _ in events}
-        for raw in self._quiet:
+        for raw in self._quiet - self._paused:
             if int(raw.get(zmq.EVENTS)) & _READABLE:
                 ready.add(raw)
         readable = []
         for raw, socket in self._sockets.items():
             if raw in ready:
                 readable.append(socket)
-            else:
+            elif raw not in self._paused:  # a paused socket may have messages
                 socket.record_empty()
         return readable

@@ -37,7 +37,6 @@ class MessageLoop:
         self.waker = self._poller.waker  # ends every `wait` until it is cleared
         bus.wake_on_connections(self.waker)
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
-        self._paused: set[Socket] = set()
 
     def register(
         self, socket: Socket, handlers: dict[type[Message], Handler], *, is_quiet: bool = False
@@ -54,12 +53,7 @@ class MessageLoop:
 
     def pause(self, socket: Socket, *, paused: bool) -> None:
         """Pause or resume a socket. Messages of a paused socket stay queued; their senders wait."""
-        if paused and socket not in self._paused:
-            self._paused.add(socket)
-            self._poller.remove(socket)
-        elif not paused and socket in self._paused:
-            self._paused.remove(socket)
-            self._poller.add(socket)
+        self._poller.pause(socket, paused=paused)
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Wait up to the timeout for messages; return the sockets with messages."""
@@ -79,7 +73,7 @@ class MessageLoop:
         end_s = time.monotonic() + MAX_TURN_S
         for received in socket.receive():
             self._dispatch(socket, handlers, received)
-            if socket in self._paused or time.monotonic() > end_s:
+            if self._poller.is_paused(socket) or time.monotonic() > end_s:
                 break
 
     def _dispatch(

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Callable, Iterator
 
 import pytest
+import zmq
 from kouxing_client.keys import Key, read_key
 
 from kouxing.services.control.config import ControlConfig
@@ -164,6 +165,41 @@ def test_answers_counts_and_drops_unexpected_messages(slow: SlowService) -> None
     assert isinstance(answer, Error)
     assert (answer.code, answer.request) == ("bad-message", "r")
     assert slow.metrics.snapshot(0.0)["dropped_unexpected"] == 1
+
+
+def test_a_paused_socket_keeps_its_place_and_its_settings(
+    slow: SlowService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later, quiet = (slow.bus.bind_router("tcp://127.0.0.1:*", name) for name in ("later", "quiet"))
+    slow.register(later, {})
+    slow.register(quiet, {}, is_quiet=True)
+    bound = [slow.input, later, quiet]
+    with Bus() as bus:
+        for socket in bound:
+            bus.connect_dealer(socket.endpoint).send(Progress(level_db=0.0))
+        wait_until(lambda: slow.wait(0.01) == bound)
+        for paused in (True, True, False, False):  # `pause` is also called without a change
+            slow.pause(slow.input, paused=paused)
+            slow.pause(quiet, paused=paused)
+            assert slow.wait(0.0) == ([later] if paused else bound)
+        polled: list[zmq.Socket[bytes]] = []
+        poll = zmq.Poller.poll
+
+        def record(poller: zmq.Poller, timeout_ms: int) -> list[tuple[zmq.Socket[bytes], int]]:
+            events = poll(poller, timeout_ms)
+            polled.extend(raw for raw, _event in events)
+            return events
+
+        monkeypatch.setattr(zmq.Poller, "poll", record)
+        slow.wait(0.0)
+        assert slow.input.raw in polled
+        assert quiet.raw not in polled, "a quiet socket does not wake the loop"
+
+
+def test_a_paused_socket_can_be_closed(slow: SlowService) -> None:
+    slow.pause(slow.input, paused=True)
+    slow.unregister(slow.input)
+    assert slow.wait(0.0) == []
 
 
 def test_drops_a_message_when_no_file_can_be_opened(
