@@ -170,7 +170,7 @@ class VisemeStream:
 
     def _build_timeline(self) -> Timeline:
         phones = self._known.sorted_by_onset()
-        return build_timeline(phones, self._inventory, self._known.speech_ends_s, live=True)
+        return build_timeline(phones, self._inventory, self._known.speech_ends_s, is_live=True)
 
     def _start_transition(self, target: FapState) -> None:
         """Start a transition from the current mouth to ``target`` on the target trajectory."""

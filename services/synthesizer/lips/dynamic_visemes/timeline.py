@@ -120,12 +120,13 @@ def build_timeline(
     phones: Sequence[Phone],
     inventory: PhoneInventory,
     speech_ends_s: Sequence[float] = (),
-    live: bool = False,
+    *,
+    is_live: bool = False,
 ) -> Timeline:
     """Place visemes and silences.
 
     ``phones`` may be in any order. Silence and ``speech_ends_s`` end the speech before them.
-    With ``live`` more phones may follow: the last phone is open unless speech has ended, and the
+    If ``is_live``, more phones may follow: the last phone is open unless speech has ended, and the
     durations of phones that are not final are estimates.
     """
     in_order = sorted(phones, key=lambda phone: (phone.onset_s, phone.index))
@@ -146,8 +147,8 @@ def build_timeline(
         if not phone.final and next_onset_s - phone.onset_s < _MIN_PHONE_S:
             continue  # revised to almost nothing
         bound_s = next((end for end in quiet_s if phone.onset_s < end < next_onset_s), next_onset_s)
-        end_s = _end_of(phone, bound_s, is_estimate=live and not phone.final)
-        if live and bound_s == np.inf:
+        end_s = _end_of(phone, bound_s, is_estimate=is_live and not phone.final)
+        if is_live and bound_s == np.inf:
             open_phone = OpenPhone(end_s, _is_held(phone.symbol, inventory))
         touching = end_s == next_onset_s
         if not touching:
