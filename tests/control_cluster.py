@@ -9,7 +9,7 @@ from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.services.control.session_table import SessionTable
 from kouxing.shared.fast_record import replace
-from kouxing.shared.settings.keys import Peer
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.control import Heartbeat, SessionProgress
 from kouxing.shared.wire.session import OpenSession
 

@@ -11,8 +11,8 @@ from kouxing_client.messages import Message, ServiceState, SessionFacts
 
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.network.sockets import Poller, Socket
-from kouxing.shared.settings.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import Heartbeat, HeartbeatReply, SessionStarted, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import (

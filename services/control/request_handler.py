@@ -9,9 +9,10 @@ from kouxing_client.messages import Message
 from kouxing.shared.errors import Rejected
 from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.service.message_loop import Handler
-from kouxing.shared.settings.keys import Grant, Peer
+from kouxing.shared.settings.keys import Grant
 from kouxing.shared.wire.control import AllowedKey, Heartbeat
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import (

@@ -30,10 +30,10 @@ from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.network.bus import COMMAND_LIMITS
+from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.service.base import Service
 from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.settings.endpoints import with_key
-from kouxing.shared.settings.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import EventName, Heartbeat, HeartbeatReply, SessionStarted
 from kouxing.shared.wire.face import CurrentFace, FaceSettings, SetFace
 from kouxing.shared.wire.session import (

@@ -15,9 +15,9 @@ from kouxing.services.control.worker_load import WorkerLoad
 from kouxing.services.service_kinds import PROVIDERS
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
+from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.service.base import HEARTBEAT_S, IDLE_HEARTBEAT_S
 from kouxing.shared.settings.endpoints import split_endpoint, with_key
-from kouxing.shared.settings.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import ErrorCode
 

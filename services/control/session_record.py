@@ -6,7 +6,7 @@ from kouxing_client.messages import Lateness, SessionFacts, SessionState
 
 from kouxing.services.control.placement import UNPACED_AUDIO
 from kouxing.shared.fast_record import replace
-from kouxing.shared.settings.keys import Peer
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import CurrentFace
 from kouxing.shared.wire.session import (

@@ -13,8 +13,9 @@ from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.phones.inventory import find_language
-from kouxing.shared.settings.keys import MAX_KEY_SHARE, Peer
+from kouxing.shared.settings.keys import MAX_KEY_SHARE
 from kouxing.shared.wire.control import Heartbeat, StartSession
 from kouxing.shared.wire.face import CurrentFace, FaceSettings
 from kouxing.shared.wire.session import ErrorCode, OpenSession

@@ -21,10 +21,10 @@ from kouxing.shared.errors import Rejected
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.files.output_file import remove_unfinished
 from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.service.session_follower import SessionFollower
 from kouxing.shared.service.session_service import SessionService
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import ErrorCode

@@ -31,6 +31,7 @@ from kouxing.services.service_kinds import KINDS
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RESTING_RATE_HZ, RestingFace
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.phones import events
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
@@ -38,7 +39,6 @@ from kouxing.shared.phones.syllable_captions import SyllableCaptions
 from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.service.session_follower import SessionFollower
 from kouxing.shared.service.session_service import SessionService
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import HeartbeatReply, SessionProgress, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.speech import Acoustic

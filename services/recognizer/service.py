@@ -33,11 +33,11 @@ from kouxing.services.service_kinds import KINDS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.monitoring.metrics import trim_heap
+from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.phones.events import Waveform
 from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.service.session_service import SessionService
-from kouxing.shared.settings.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode

@@ -32,6 +32,7 @@ from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.network.bus import PHONE_LIMITS
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
@@ -39,7 +40,6 @@ from kouxing.shared.service.message_loop import MAX_TURN_S, Handler
 from kouxing.shared.service.overload import CATCH_UP_S, MAX_LATE_FOR_S
 from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.settings.endpoints import key_of
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.events import (
     SpeechMessage,

@@ -12,8 +12,8 @@ from itertools import islice
 from kouxing_client.messages import Message
 
 from kouxing.shared.fast_record import replace
+from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.network.sockets import Socket
-from kouxing.shared.settings.keys import NO_PEER, Peer
 from kouxing.shared.wire.events import batch_messages
 from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
 

@@ -18,12 +18,13 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import Record
 from kouxing.shared.name_rules import is_name
 from kouxing.shared.network.connection_limits import LimitedSocket
+from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.network.peer_connection import LONG_PENALTY_S, PENALTY_S, PeerConnection
 from kouxing.shared.network.socket_limits import KIB
 from kouxing.shared.network.waker import Waker
 from kouxing.shared.network.zap import Zap
 from kouxing.shared.settings.endpoints import split_endpoint
-from kouxing.shared.settings.keys import NO_PEER, Grant, Peer, may_subscribe
+from kouxing.shared.settings.keys import Grant, may_subscribe
 from kouxing.shared.wire.codec import BadMessage, decode, encode
 from kouxing.shared.wire.session import Error
 

@@ -27,13 +27,14 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.monitoring.metrics import LoadMeter, memory_mb, trim_heap
 from kouxing.shared.network.bus import Bus, ProbeResult
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.service import parent_process
 from kouxing.shared.service.message_loop import Handler, MessageLoop
 from kouxing.shared.service.service_kind import ServiceKind
 from kouxing.shared.settings.config import ServiceConfig
 from kouxing.shared.settings.endpoints import is_loopback, split_endpoint, with_key
-from kouxing.shared.settings.keys import Grant, Peer, load_key, rejection_hint, save_grants
+from kouxing.shared.settings.keys import Grant, load_key, rejection_hint, save_grants
 from kouxing.shared.wire.control import (
     AllowedKey,
     Heartbeat,

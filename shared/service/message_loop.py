@@ -12,8 +12,8 @@ from kouxing_client.messages import Message
 from kouxing.shared.monitoring.logs import LOG, RateLimit
 from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.network.bus import Bus
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.sockets import Poller, ReceivedMessage, Socket
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.codec import BadMessage
 from kouxing.shared.wire.session import Error, ErrorCode
 

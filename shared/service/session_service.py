@@ -8,9 +8,9 @@ from kouxing_client.messages import Event, Message
 
 from kouxing.shared.errors import Rejected, StartFailure, UserError
 from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.service.base import HEARTBEAT_S, Service
 from kouxing.shared.service.message_loop import Handler
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import EventName, SessionStarted, StartSession
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession
 

@@ -23,7 +23,7 @@ import re
 import shlex
 import stat
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -48,18 +48,6 @@ _ALLOWED = "allowed"
 _SUBSCRIBER = "subscriber:"
 _PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
 _ROLE = re.compile(rf"client|operator|service:[a-z-]{{1,64}}|subscriber:({NAME}|\*)")
-
-
-@dataclass(frozen=True, slots=True)
-class Peer:
-    """The sender of a message to a ROUTER socket."""
-
-    address: bytes = b""  # ROUTING_ID
-    key: str = ""  # authenticated public key, empty without encryption
-    connection: int = field(default=0, compare=False)  # 0: the connection has ended
-
-
-NO_PEER = Peer()
 
 
 class Grant(NamedTuple):

@@ -8,7 +8,7 @@ from kouxing_client.field_types import MASK_BYTES
 from kouxing_client.messages import EndOfFaps, FapFrame, Phone, Sound
 from numpy.typing import NDArray
 
-from kouxing.shared.settings.keys import Peer
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.session import AudioChunk
 from tests.fake_control import EPOCH, FakeControl
 

@@ -19,7 +19,7 @@ from kouxing.services.recognizer.sessions.unpaced_decoder import MAX_UNPACED_S
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.bus import Bus
-from kouxing.shared.settings.keys import Peer
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import AudioChunk, Error

@@ -16,8 +16,8 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.fast_record import replace
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import Error

@@ -5,7 +5,7 @@ import pytest
 from kouxing.services.control.worker_load import MIN_SESSIONS, RETRY_AFTER_S, WorkerLoad
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
-from kouxing.shared.settings.keys import Peer
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.session import OpenSession
 from tests.control_cluster import Cluster, worker
 

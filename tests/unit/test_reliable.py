@@ -6,6 +6,7 @@ from typing import Any, cast
 
 from kouxing_client.messages import Message
 
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.reliable import (
     ACKNOWLEDGE_INTERVAL_S,
     MAX_UNACKNOWLEDGED_S,
@@ -13,7 +14,6 @@ from kouxing.shared.network.reliable import (
     ReliableReceiver,
     ReliableSender,
 )
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.events import split_batch
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
 

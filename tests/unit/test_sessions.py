@@ -10,7 +10,7 @@ from kouxing_client.messages import SessionFacts, Speech
 from kouxing.services.control.restart_recovery import RestartRecovery
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
-from kouxing.shared.settings.keys import Peer
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.control import Heartbeat, SessionProgress
 from kouxing.shared.wire.face import FaceSettings
 from tests.control_cluster import CLIENT, Cluster, worker

@@ -15,9 +15,9 @@ from kouxing.services.recognizer.sessions.synthesizer_link import (
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.fast_record import replace
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.reliable import ReliableReceiver
 from kouxing.shared.network.sockets import Socket
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.events import split_batch
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame, Progress, Results
 

@@ -5,9 +5,9 @@ import time
 
 from kouxing.services.recognizer.sessions.session import RecognizerSession
 from kouxing.shared.errors import Rejected
+from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.service.message_loop import MessageLoop
-from kouxing.shared.settings.keys import Peer
 from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode
 
 

@@ -18,11 +18,11 @@ from kouxing.shared.audio.pcm import decode_pcm
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
+from kouxing.shared.network.peer import NO_PEER
 from kouxing.shared.network.replaying_publisher import ReplayingPublisher
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.phones.events import Waveform
 from kouxing.shared.service.overload import CATCH_UP_S, SkipPolicy
-from kouxing.shared.settings.keys import NO_PEER
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_to_message
 from kouxing.shared.wire.face import CurrentFace
