@@ -13,7 +13,6 @@ from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.settings.keys import Grant
-from kouxing.shared.wire.control import AllowedKey, Heartbeat
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import (
     CloseSession,
@@ -41,7 +40,6 @@ class RequestHandler:
     def __init__(
         self, bus: Bus, commands: Socket, metrics: Metrics, defers: Callable[[], bool]
     ) -> None:
-        self.key_versions: dict[str, tuple[int, int]] = {}  # by instance of the worker
         self._bus = bus
         self._commands = commands
         self._metrics = metrics
@@ -118,19 +116,6 @@ class RequestHandler:
         """Return whether a sender may have the page's token: a client or a service."""
         zap, key = self._bus.zap, sender.key
         return zap is None or self.has_role(key, "client") or zap.is_service(key)
-
-    def changed_keys(self, heartbeat: Heartbeat) -> dict[str, AllowedKey] | None:
-        """Return the list of allowed keys for a worker, unless it has the list already."""
-        zap, instance = self._bus.zap, heartbeat.instance
-        if zap is None or heartbeat.role != "worker":
-            return None
-        if self.key_versions.get(instance) == zap.version:
-            return None
-        self.key_versions[instance] = zap.version
-        return {
-            public: AllowedKey(name=grant.name, roles=list(grant.roles))
-            for public, grant in zap.grants.items()
-        }
 
     def retry_deferred(self) -> None:
         """Handle the deferred requests again."""

@@ -16,6 +16,7 @@ from kouxing_client.messages import Event, Message, Speech
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.face_check import check_face
 from kouxing.services.control.fault_log import FaultLog
+from kouxing.services.control.key_distributor import KeyDistributor
 from kouxing.services.control.placement import Placement
 from kouxing.services.control.request_handler import RequestHandler
 from kouxing.services.control.restart_recovery import RestartRecovery
@@ -76,6 +77,7 @@ class ControlService(Service):
         self._resting_face = CurrentFace(FaceSettings(), now_s)
         self._recovery = RestartRecovery(self._registry, now_s)
         self._idle_limit_s = config.idle_limit_s
+        self._keys = KeyDistributor(self.bus.zap)
         self._keys_version = (0, 0)  # version of the key list for which revoked sessions have ended
         self._tick_stall = StallDetector(now_s, MAX_TICK_DELAY_S)
         self._sleep_s = 0.0  # planned time until the next tick
@@ -255,7 +257,7 @@ class ControlService(Service):
             received_ns=received_ns,
             replied_ns=now_ns(),
             control_instance=self._process_id,
-            keys=self._requests.changed_keys(heartbeat),
+            keys=self._keys.keys_for(heartbeat),
             missing=self._placement.missing_kinds(),
         )
         self._commands.send(reply, to=sender)
@@ -356,7 +358,7 @@ class ControlService(Service):
 
     def _on_service_lost(self, instance: str, reason: str) -> None:
         self._registry.remove(instance)
-        self._requests.key_versions.pop(instance, None)
+        self._keys.forget(instance)
         if reason == STOPPED:
             LOG.info("%s stopped", instance)
         else:
