@@ -176,7 +176,7 @@ class Service(MessageLoop):
 
             host, port = split_endpoint(f"tcp://{self.config.metrics}", "metrics")
             self._metrics_server = MetricsServer(
-                host.strip("[]"), int(port), self.metrics, self.name, is_alive=self.check_health
+                host.strip("[]"), int(port), self.metrics, self.name, is_alive=self.check_or_exit
             )
         self._warn_if_open_to_others()
         self._warn_if_closed_to_others()
@@ -237,8 +237,8 @@ class Service(MessageLoop):
             self._tick_due_s = max(now_s + TICK_S, min(due_s, self.on_tick(now_s)))
         self.send_heartbeat_if_due()
 
-    def check_health(self) -> bool:
-        """Return whether the loop runs; exit if it has hung for long.
+    def check_or_exit(self) -> bool:
+        """Return whether the loop runs; end the process if it has hung for long.
 
         The program that checks the health may not be able to restart this process.
         """

@@ -405,10 +405,10 @@ def test_a_health_check_ends_a_process_whose_loop_hangs(
     ends: list[int] = []
     monkeypatch.setattr("kouxing.shared.service.base.os._exit", ends.append)
     slow.step(0.0)
-    assert slow.check_health()
+    assert slow.check_or_exit()
     clock.now_s += IDLE_HEARTBEAT_S + MAX_LATE_S
-    assert not slow.check_health()
+    assert not slow.check_or_exit()
     assert ends == []
     clock.now_s += EXIT_AFTER_S
-    slow.check_health()
+    slow.check_or_exit()
     assert ends == [1]
