@@ -111,5 +111,5 @@ class LivePipeline:
 
 def _decode(recognizer: Recognizer, stream: SpeechStream) -> list[SoundEvent]:
     recognizer.decode_streams([stream])
-    results = recognizer.get_result(stream)
+    results = stream.take_results()
     return [result for result in results if not isinstance(result, Waveform)]

@@ -49,7 +49,7 @@ class LiveStream:
         """Return the results of the audio so far."""
         self._recognizer.decode_streams([self.stream])
         assert not any(scorer.has_speech for scorer in self.stream.scorers)
-        return self._recognizer.get_result(self.stream)
+        return self.stream.take_results()
 
 
 def recognize_live(
@@ -74,4 +74,4 @@ def recognize_together(
         stream.accept_waveform(samples)
         stream.input_finished()
     recognizer.decode_streams(streams)
-    return [recognizer.get_result(stream) for stream in streams]
+    return [stream.take_results() for stream in streams]

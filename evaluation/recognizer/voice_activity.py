@@ -135,7 +135,7 @@ def voice_states(model: AcousticModel, samples: Samples) -> Mask:
     for piece in split_slices(samples, 0):
         stream.accept_waveform(piece)
         recognizer.decode_streams([stream])
-        for event in recognizer.get_result(stream):
+        for event in stream.take_results():
             if isinstance(event, SpeechChange):
                 is_active = event.active
             elif isinstance(event, Progress):

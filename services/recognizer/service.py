@@ -350,7 +350,7 @@ class RecognizerService(SessionService):
         only once.
         """
         now_s = time.monotonic()
-        results = session.new_results(self._recognizer)
+        results = session.new_results()
         acoustic = session.acoustic_message(results)
         published = [*session.published_messages(results)]
         if acoustic is not None:

@@ -33,6 +33,10 @@ class FakeSession:
     def can_accept(self) -> bool:
         return bool(self.audio)
 
+    @property
+    def needs_network(self) -> bool:
+        return "needs the network" in self.found
+
     def accept_waveform(self, max_s: float, now_s: float, hop: int) -> None:
         assert max_s > 0.0 < now_s, hop
         self.audio.clear()
@@ -53,9 +57,6 @@ class FakeRecognizer:
 
     def detect_speech(self, streams: Sequence[FakeSession]) -> None:
         assert len(streams) == 1
-
-    def needs_network(self, stream: FakeSession) -> bool:
-        return "needs the network" in stream.found
 
     def decode_speech(self, streams: Sequence[FakeSession]) -> None:
         for stream in streams:

@@ -2,7 +2,6 @@
 
 import math
 from functools import cache
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -150,7 +149,7 @@ def test_reports_the_acoustic_model_in_use() -> None:
         session.audio.append((start, samples[start : start + 1600]), start / 16_000)
         session.accept_waveform(1.0, start / 16_000, hop=1)
         recognizer().decode_streams([session.stream])
-        message = session.acoustic_message(session.new_results(recognizer()))
+        message = session.acoustic_message(session.new_results())
         models.append(message.model if message else None)
     reported = [(number, model) for number, model in enumerate(models) if model]
     assert [model for _, model in reported][:2] == ["full", "light"]
@@ -161,8 +160,8 @@ def test_keeps_the_start_of_the_current_speech() -> None:
     session = make_session()
 
     def speech_time_after(*changes: SpeechChange) -> int | None:
-        fake = SimpleNamespace(get_result=lambda _stream: list(changes))
-        session.new_results(cast(Recognizer, fake))
+        cast(Any, session.stream).take_results = lambda: list(changes)
+        session.new_results()
         return session.speech_time
 
     start, stop = (SpeechChange(active=active, time_s=2.0) for active in (True, False))
@@ -225,7 +224,7 @@ def test_a_session_gets_the_lip_positions_of_its_mouth_profile() -> None:
     session = make_session(mouth_profile=profile.to_bytes(lip_predictor().digest))
     session.stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
     recognizer().decode_streams([session.stream])
-    results = session.new_results(recognizer())
+    results = session.new_results()
     frames = [result for result in results if isinstance(result, LipPositions)]
     assert len(frames) > 5
     assert {np.frombuffer(frame.values, "<f4")[0] for frame in frames} == {77.0}

@@ -54,7 +54,7 @@ class Sessions:
                     stream.accept_waveform(self._sounds[number][begin : begin + CHUNK])
                 self._recognizer.decode_streams(streams)
                 for stream in streams:
-                    self._recognizer.get_result(stream)
+                    stream.take_results()
 
 
 def used_mb() -> float:

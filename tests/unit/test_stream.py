@@ -190,17 +190,17 @@ def test_lips_may_be_early_and_phones_are_the_same() -> None:
     for begin in range(0, len(SAMPLES), 320):
         stream.accept_waveform(SAMPLES[begin : begin + 320])
         recognizer.detect_speech([stream])
-        if recognizer.needs_network(stream):
+        if stream.needs_network:
             stream.decode_early()
-            early = recognizer.get_result(stream)
+            early = stream.take_results()
             assert not of_kind(Phone, early)
             num_early += len(of_kind(LipPositions, early))
             outputs += early
         recognizer.decode_streams([stream])
-        outputs += recognizer.get_result(stream)
+        outputs += stream.take_results()
     stream.input_finished()
     recognizer.decode_streams([stream])
-    outputs += recognizer.get_result(stream)
+    outputs += stream.take_results()
     assert num_early > 20
     assert_same((Phone, LipPositions, Progress, SpeechChange), outputs, expected)
 
@@ -219,21 +219,21 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
             recognizer.detect_speech([stream])
             if is_scoring:  # the other thread finishes after the next chunk
                 stream.decode_early()
-                early = recognizer.get_result(stream)
+                early = stream.take_results()
                 num_early += len(of_kind(LipPositions, early))
                 results += early
                 recognizer.decode_speech([stream])
                 stream.take_back_speech()
                 recognizer.detect_speech([stream])
-            elif recognizer.needs_network(stream):
+            elif stream.needs_network:
                 stream.decode_early()
-                results += recognizer.get_result(stream)
+                results += stream.take_results()
                 if continues:
                     stream.hand_over_speech()
             is_scoring = stream.can_accept_while_scoring(stream.next_media_time)
             if not is_scoring:
                 recognizer.decode_speech([stream])
-                results += recognizer.get_result(stream)
+                results += stream.take_results()
         outputs.append(results)
     assert num_early > 5
     assert_same((Phone, LipPositions, Progress, SpeechChange), outputs[1], outputs[0])
@@ -245,7 +245,7 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
     stream.set_hop(4)
     recognizer.decode_streams([stream])
     begin = 0
-    while not recognizer.needs_network(stream):
+    while not stream.needs_network:
         stream.accept_waveform(SAMPLES[begin : begin + 320])
         recognizer.detect_speech([stream])
         begin += 320

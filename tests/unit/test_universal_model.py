@@ -128,7 +128,7 @@ def test_sessions_of_two_languages_share_a_recognizer() -> None:
         stream.accept_waveform(HELLO)
         stream.input_finished()
     recognizer.decode_streams(streams)
-    mandarin, other = (phones_of(recognizer.get_result(stream)) for stream in streams)
+    mandarin, other = (phones_of(stream.take_results()) for stream in streams)
     alone = LiveStream(load_model())
     assert mandarin == phones_of(alone.feed(HELLO) + alone.finish())
     symbols = {phone.symbol for phone in other}

@@ -1,6 +1,7 @@
 """The recognizer: live audio in, phones, lip positions and speech events out.
 
-The verbs come from sherpa-onnx: create_stream, accept_waveform, decode_streams and get_result.
+``create_stream``, ``accept_waveform`` and ``decode_streams`` are named as in sherpa-onnx. There,
+``get_result`` returns the whole result; here, ``take_results`` returns each result once.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
-from kouxing.services.recognizer.live.live_decoder import StreamOutput
 from kouxing.services.recognizer.live.speech_scorer import detect_speech, score_speech
 from kouxing.services.recognizer.live.stream import SpeechStream
 from kouxing.services.recognizer.search.decoder import Decoder
@@ -31,7 +31,7 @@ class Recognizer:
     >>> for chunk in microphone:
     ...     stream.accept_waveform(chunk)
     ...     recognizer.decode_streams([stream])
-    ...     events = recognizer.get_result(stream)
+    ...     events = stream.take_results()
     """
 
     def __init__(self, model: AcousticModel, rule: OutputRuleConfig | None = None) -> None:
@@ -72,10 +72,6 @@ class Recognizer:
         """Find the speech in the audio that the streams have accepted, in batches."""
         detect_speech([scorer for stream in streams for scorer in stream.scorers])
 
-    def needs_network(self, stream: SpeechStream) -> bool:
-        """Return whether decoding a stream's audio needs a run of the block network."""
-        return any(scorer.needs_network for scorer in stream.scorers)
-
     def decode_streams(self, streams: Sequence[SpeechStream]) -> None:
         """Decode all audio that the streams have accepted; the model scores it in batches."""
         self.detect_speech(streams)
@@ -86,10 +82,6 @@ class Recognizer:
         score_speech([scorer for stream in streams for scorer in stream.scorers])
         for stream in streams:
             stream.decode()
-
-    def get_result(self, stream: SpeechStream) -> list[StreamOutput]:
-        """Return the results since the last call, in the order of media time."""
-        return stream.take_results()
 
     def warm_up(self) -> None:
         """Run all compiled functions once, so that no session waits for the compiler."""

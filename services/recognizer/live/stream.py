@@ -105,6 +105,11 @@ class SpeechStream:
         """The scorers that may have audio to score."""
         return [segment.scorer for segment in self._segments]
 
+    @property
+    def needs_network(self) -> bool:
+        """Whether decoding the audio needs a run of the block network."""
+        return any(scorer.needs_network for scorer in self.scorers)
+
     def accept_waveform(self, samples: Floats, media_time: int | None = None) -> None:
         """Queue finite samples, (n,) or (n, channels), in [-1, 1], for decoding.
 

@@ -26,7 +26,7 @@ def recognize_recording(
 
     def decode() -> None:
         recognizer.decode_streams([stream])
-        for result in recognizer.get_result(stream):
+        for result in stream.take_results():
             if isinstance(result, Phone) and result.final and not result.is_withdrawn:
                 phones.append(replace(result, index=len(phones)))
 

@@ -110,7 +110,7 @@ class LiveBatchDecoder:
 
         Returns whether the session was queued.
         """
-        if not (session.is_scoring or self._recognizer.needs_network(session.stream)):
+        if not (session.is_scoring or session.stream.needs_network):
             return False
         if session.is_scoring or self._hop_controller.hop > 1:
             session.stream.decode_early()

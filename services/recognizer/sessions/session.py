@@ -258,9 +258,9 @@ class RecognizerSession:
         )
         self.socket.send(acknowledgement, to=self.client)
 
-    def new_results(self, recognizer: Recognizer) -> list[SpeechMessage | Waveform]:
+    def new_results(self) -> list[SpeechMessage | Waveform]:
         """Return the stream's new results, without those that a lost recognizer has emitted."""
-        results = recognizer.get_result(self.stream)
+        results = self.stream.take_results()
         if self.resume_filter is not None:
             results = self.resume_filter.new_results(results)
         messages = [
