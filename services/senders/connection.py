@@ -6,6 +6,7 @@ import socket
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import ClassVar
 
 from kouxing.services.senders.face_frame import FaceFrame
@@ -15,8 +16,17 @@ from kouxing.services.senders.tracker_input import TrackerInput, open_tracker_in
 RETRY_S = 1.0
 _ASSUME_LISTENING_AFTER_S = 1.0  # without an error for this time, a program is listening
 
-Options = Mapping[str, tuple[str, ...]]
-COMMON_OPTIONS: Options = {"delay": ("0",), "only": ("face", "mouth")}
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """An option of a target's address. Without ``choices``, it is any text."""
+
+    default: str = ""
+    choices: tuple[str, ...] = ()
+
+
+Options = Mapping[str, Option]  # by name
+COMMON_OPTIONS: Options = {"delay": Option("0"), "only": Option("face", ("face", "mouth"))}
 
 
 class TargetConnection(ABC):
@@ -26,7 +36,7 @@ class TargetConnection(ABC):
     """
 
     default_port: ClassVar[int]  # default port of the protocol
-    options: ClassVar[Options] = COMMON_OPTIONS  # names and values, default first; (): any text
+    options: ClassVar[Options] = COMMON_OPTIONS
     contents: ClassVar[str] = ""  # what a frame contains; empty: the target's shapes
 
     def __init__(self, target: Target) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from datetime import datetime
 from typing import ClassVar
 
-from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
+from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Option, Options
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.face.high_level_faps import fap_table
 
@@ -43,7 +43,7 @@ class LiveLinkConnection(DatagramConnection):
     """Sends to Unreal Engine."""
 
     default_port = 11111
-    options: ClassVar[Options] = {**COMMON_OPTIONS, "name": (), "camera": ()}
+    options: ClassVar[Options] = {**COMMON_OPTIONS, "name": Option(), "camera": Option()}
 
     def encode(self, frame: FaceFrame) -> Iterable[bytes]:
         """Return the datagram of a frame, with the time of day as its time code."""

@@ -24,7 +24,7 @@ from typing import ClassVar
 
 from pythonosc.osc_message_builder import build_msg
 
-from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
+from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Option, Options
 from kouxing.services.senders.face_frame import FaceFrame
 
 _MAX_DEPTH = 4  # nesting of bundles in received packets
@@ -37,8 +37,10 @@ class OscConnection(DatagramConnection):
 
     default_port = 9000
     options: ClassVar[Options] = {
-        **COMMON_OPTIONS, "shapes": ("arkit", "vrm", "oculus"), "prefix": (),
-    }  # fmt: skip
+        **COMMON_OPTIONS,
+        "shapes": Option("arkit", ("arkit", "vrm", "oculus")),
+        "prefix": Option(),
+    }
 
     def encode(self, frame: FaceFrame) -> Iterator[bytes]:
         """Yield the datagrams of a frame."""

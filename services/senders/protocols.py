@@ -103,13 +103,13 @@ def _check_combination(target: Target) -> None:
 
 
 def _parse_options(url: str, query: str, protocol: type[TargetConnection]) -> dict[str, str]:
-    options = {name: next(iter(values), "") for name, values in protocol.options.items()}
+    options = {name: option.default for name, option in protocol.options.items()}
     for name, value in parse_qsl(query, keep_blank_values=True):
         if name not in options:
             raise UserError(f"{url}: unknown option {name!r}; use {', '.join(options)}")
-        allowed = protocol.options[name]
-        if len(allowed) > 1 and value not in allowed:
-            raise UserError(f"{url}: {name} must be {' or '.join(allowed)}")
+        choices = protocol.options[name].choices
+        if choices and value not in choices:
+            raise UserError(f"{url}: {name} must be {' or '.join(choices)}")
         if not value.isprintable():
             raise UserError(f"{url}: {name} contains a character that is not printable")
         if len(value) > MAX_TEXT:

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import ClassVar
 
-from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Options
+from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Option, Options
 from kouxing.services.senders.face_frame import Angles, FaceFrame, mouth_shape_names
 from kouxing.services.senders.osc import (
     bundle_messages,
@@ -47,9 +47,9 @@ class VmcConnection(DatagramConnection):
     default_port = 39540
     options: ClassVar[Options] = {
         **COMMON_OPTIONS,
-        "shapes": ("vrm", "arkit"),
-        "head": ("off", "on"),
-        "camera": (),
+        "shapes": Option("vrm", ("vrm", "arkit")),
+        "head": Option("off", ("off", "on")),
+        "camera": Option(),
     }
 
     def encode(self, frame: FaceFrame) -> Iterator[bytes]:

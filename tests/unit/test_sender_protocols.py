@@ -4,12 +4,13 @@ import json
 import logging
 import math
 from collections.abc import Iterable
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from kouxing.services.senders import protocols
-from kouxing.services.senders.connection import DatagramConnection
+from kouxing.services.senders.connection import COMMON_OPTIONS, DatagramConnection, Option
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.protocols import make_connection, parse_target
@@ -194,6 +195,7 @@ class PlainConnection(DatagramConnection):
 
     default_port = 7000
     contents = "the time"
+    options: ClassVar = {**COMMON_OPTIONS, "format": Option("text", ("text",))}
 
     def encode(self, frame: FaceFrame) -> Iterable[bytes]:
         yield b"%.1f" % frame.time_s
@@ -211,6 +213,8 @@ def test_other_distributions_add_protocols(
             target = parse_target("plain://")
         assert (target.port, target.contents) == (7000, "the time and head")
         assert list(make_connection(target).encode(frame_of(jawOpen=0.7))) == [b"0.0"]  # type: ignore[attr-defined]
+        with pytest.raises(UserError, match="format must be text"):
+            parse_target("plain://?format=json")
         with pytest.raises(UserError, match="vts://HOST:8001 or plain://HOST:7000"):
             parse_target("missing://")
         assert "missing from no_such_module:Sender: No module" in caplog.text
