@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictor
 from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.live.stream import SpeechStream
@@ -25,7 +25,7 @@ from kouxing.shared.phones.events import SoundEvent, Waveform
 def recognize_events(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    lip_predictor: LipPositionModel | None,
+    lip_predictor: LipPredictor | None,
     face_delay_s: float = 0.0,
     config: RecognizerConfig | None = None,
 ) -> list[SoundEvent]:
@@ -62,7 +62,7 @@ class LivePipeline:
         *,
         sample_rate_hz: int = MEDIA_RATE_HZ,
         synthesizer: SynthesizerConfig | None = None,
-        lip_predictor: LipPositionModel | None = None,
+        lip_predictor: LipPredictor | None = None,
     ) -> None:
         synthesizer = synthesizer or SynthesizerConfig()
         self.events: list[SoundEvent] = []

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.front_end.slices import SliceMeter
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictor
 from kouxing.services.recognizer.live.speech_segmenter import (
     SpeechEnd,
     SpeechItem,
@@ -68,7 +68,7 @@ class AnalyzedRecording:
 def analyze_recording(
     samples: NDArray[np.float32],
     phones: Sequence[Phone],
-    lip_predictor: LipPositionModel | None = None,
+    lip_predictor: LipPredictor | None = None,
     *,
     is_text_known: bool = True,
     with_progress: WithProgress = iter,

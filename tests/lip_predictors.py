@@ -3,20 +3,20 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS, LipPredictor
+from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS, GruLipPredictor
 
 NUM_FEATURES, NUM_COMPONENTS, UNITS, NUM_LIPS = 160 + 307, 6, 5, 51  # log-mel, encoder's features
 DELAYS_S = (-0.005, 0.055, 0.155)
 
 
-def random_lip_predictor() -> LipPredictor:
+def random_lip_predictor() -> GruLipPredictor:
     rng = np.random.default_rng(0)
     outputs = (len(DELAYS_S), NUM_OUTPUTS)
 
     def draw(*shape: int, spread: float = 0.3) -> NDArray[np.float32]:
         return rng.normal(0, spread, shape).astype(np.float32)
 
-    return LipPredictor(
+    return GruLipPredictor(
         delays=np.array(DELAYS_S, np.float32),
         feature_mean=draw(NUM_FEATURES),
         projection=draw(NUM_FEATURES, NUM_COMPONENTS, spread=0.01),

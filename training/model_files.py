@@ -88,7 +88,7 @@ def _save_acoustic_model(path: Path, form: str, topology: Topology, **arrays: An
     write_archive(path, {"format": np.array(form), **topology_arrays(topology), **others})
 
 
-def save_lip_predictor(path: Path, predictor: lip_predictor.LipPredictor) -> None:
+def save_lip_predictor(path: Path, predictor: lip_predictor.GruLipPredictor) -> None:
     """Write a lip predictor, with weights of 16 bits."""
     arrays = {field.name: getattr(predictor, field.name) for field in fields(predictor)}
     halves = {name: array.astype(np.float16) for name, array in arrays.items()}

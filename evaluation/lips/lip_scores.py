@@ -29,7 +29,7 @@ from kouxing.evaluation.recognizer.disturbances import (
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictor
 from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
@@ -53,7 +53,7 @@ class LiveFace:
     """A lip model with its lip predictor and its delay."""
 
     lips: LipModel
-    predictor: LipPositionModel
+    predictor: LipPredictor
     delay_ms: float
 
     def mouth(self, events: Sequence[SoundEvent]) -> Mouth:
@@ -135,7 +135,7 @@ def scored_clips_of(
 
     The first condition must be CLEAN. Other programs follow in this condition.
     """
-    predictors: dict[int, LipPositionModel | None] = {
+    predictors: dict[int, LipPredictor | None] = {
         id(face.predictor): face.predictor for face in faces.values()
     }
     delays_s = sorted({face.delay_ms / 1e3 for face in faces.values()} or {0.0})

@@ -14,8 +14,8 @@ from kouxing.services.live_pipeline import recognize_events
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lips.lip_prediction import (
-    LipPositionModel,
-    LipPositionStream,
+    LipPredictor,
+    LipPredictorStream,
     choose_delay,
 )
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
@@ -30,10 +30,10 @@ FRAME_RATE_HZ = 50.0
 class _MultiDelayPredictor:
     """A lip predictor that predicts for several delays in one run of the recognizer."""
 
-    predictor: LipPositionModel
+    predictor: LipPredictor
     delays_s: Sequence[float]
 
-    def create_stream(self, _delays_s: Sequence[float]) -> LipPositionStream:
+    def create_stream(self, _delays_s: Sequence[float]) -> LipPredictorStream:
         return self.predictor.create_stream(
             [delay_s for delay_s in self.predictor.delays_s if delay_s in self.delays_s]
         )
@@ -45,7 +45,7 @@ class _MultiDelayPredictor:
 def live_events(
     model: AcousticModel,
     samples: Samples,
-    lips: LipPositionModel | None,
+    lips: LipPredictor | None,
     delays_s: Sequence[float],
     config: RecognizerConfig | None = None,
 ) -> dict[float, list[SoundEvent]]:

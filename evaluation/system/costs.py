@@ -20,7 +20,7 @@ from kouxing.services.heads import DEFAULT_HEAD
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lips.lip_predictor import LipPredictor, load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import GruLipPredictor, load_lip_predictor
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -52,7 +52,7 @@ def measure_sessions(path: Path) -> dict[str, float]:
 
 def _cpu_s(
     recognizer: Recognizer,
-    lips: LipPredictor | None,
+    lips: GruLipPredictor | None,
     samples: NDArray[np.float32],
     num_sessions: int,
 ) -> float:

@@ -40,7 +40,7 @@ from kouxing.services.mouth_profiles.lip_tracks import (
 from kouxing.services.recognizer.lips.lip_prediction import choose_delay
 from kouxing.services.recognizer.lips.lip_predictor import (
     NUM_LIP_FAPS,
-    LipPredictor,
+    GruLipPredictor,
     load_lip_predictor,
 )
 from kouxing.services.recognizer.lips.mouth_profile import MouthProfile
@@ -107,7 +107,7 @@ class ProfileGain:
     curves: Array  # (3, 3, n): measure; tracked, before, after
 
 
-def observe(lip_predictor: LipPredictor, filmed: FilmedSpeech) -> Observations:
+def observe(lip_predictor: GruLipPredictor, filmed: FilmedSpeech) -> Observations:
     """Run the lip predictor over a recording. The result is empty if there is no speech."""
     inputs = record_lip_inputs(filmed.samples)
     stream = lip_predictor.create_stream(lip_predictor.delays_s)
@@ -168,7 +168,7 @@ def fit_profile(observations: Observations, fraction: float = 1.0) -> MouthProfi
     return _fit(usable, STRENGTHS[int(np.argmin(errors))])
 
 
-def measure_gain(lip_predictor: LipPredictor, observations: Observations) -> ProfileGain:
+def measure_gain(lip_predictor: GruLipPredictor, observations: Observations) -> ProfileGain:
     """Fit a profile to the first three quarters, and measure it on the last quarter.
 
     Raises like ``fit_profile``.

@@ -20,7 +20,7 @@ ENCODER_FRAME_S = FRAMES_PER_ENCODER_FRAME * HOP_S
 
 
 class LipInputs:
-    """Records the lip predictor's inputs over one recording; implements ``LipPositionStream``."""
+    """Records the lip predictor's inputs over one recording; implements ``LipPredictorStream``."""
 
     def __init__(self) -> None:
         self.starts: list[int] = []  # first encoder frame of each segment of speech

@@ -10,7 +10,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lips.lip_predictor import (
     CLOSURE,
     FORMAT,
-    LipPredictor,
+    GruLipPredictor,
     join_features,
     load_lip_predictor,
 )
@@ -26,7 +26,7 @@ SAMPLES = samples_of_file(VOWELS_FILE)[:32_000]
 MODEL = random_lip_predictor()
 
 
-def arrays_of(model: LipPredictor) -> dict[str, np.ndarray]:
+def arrays_of(model: GruLipPredictor) -> dict[str, np.ndarray]:
     arrays = {field.name: getattr(model, field.name) for field in fields(model)}
     return {"format": np.array(FORMAT), **arrays}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lips.lip_predictor import LipPredictor, load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import GruLipPredictor, load_lip_predictor
 from kouxing.services.recognizer.lips.mouth_profile import MouthProfile
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.sessions.session import (
@@ -46,7 +46,7 @@ def recognizer() -> Recognizer:
 
 
 @cache
-def lip_predictor() -> LipPredictor:
+def lip_predictor() -> GruLipPredictor:
     return load_lip_predictor()
 
 

@@ -32,7 +32,7 @@ from kouxing.services.recognizer.lips.lip_predictor import (
     LIP_FAPS,
     NUM_LIP_FAPS,
     NUM_OUTPUTS,
-    LipPredictor,
+    GruLipPredictor,
 )
 from kouxing.shared.errors import UserError
 from kouxing.training.lips.linear import fit_linear
@@ -207,7 +207,7 @@ def standardize(target: Floats, units: FapScale) -> Floats:
 
 def combine_parts(
     basis: Basis, network: LipNetwork, linear_weights: Array, linear_bias: Array
-) -> LipPredictor:
+) -> GruLipPredictor:
     """Combine the network with the linear part (see ``fit_linear``) and the encoder's lips.
 
     Lip-to-teeth contact comes from the network. The FAPs are scaled around their means.
@@ -234,7 +234,7 @@ def combine_parts(
     bias[:, :NUM_LIP_FAPS] += units.mean
     bias[:, CLOSURE] += np.interp(DELAYS_S, *_CLOSURE_BIAS)
     output = weights["output.weight"].T.reshape(-1, *shape) * network_scale
-    return LipPredictor(
+    return GruLipPredictor(
         delays=np.array(DELAYS_S, np.float32),
         feature_mean=basis.mean,
         projection=basis.projection,

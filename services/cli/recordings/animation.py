@@ -21,7 +21,7 @@ from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
-from kouxing.services.recognizer.lips.lip_predictor import LipPredictor, load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import GruLipPredictor, load_lip_predictor
 from kouxing.services.recognizer.lips.mouth_profile import read_mouth_profile
 from kouxing.services.recognizer.offline.alignment import align_syllables
 from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
@@ -188,13 +188,13 @@ def animate(
 
 
 @lru_cache(maxsize=1)
-def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, LipPredictor]:
+def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, GruLipPredictor]:
     """Load the models once for all files of a command."""
     model = load_model_for_language(language)
     return model, _load_lip_predictor(mouth)
 
 
-def _load_lip_predictor(mouth: Path | None) -> LipPredictor:
+def _load_lip_predictor(mouth: Path | None) -> GruLipPredictor:
     """Return the network that predicts learned lips, adapted to a mouth profile, if any."""
     predictor = load_lip_predictor()
     if mouth is None:

@@ -1,4 +1,4 @@
-"""The interface of a model that predicts lip positions from the audio.
+"""The interface of lip predictors: models that predict lip positions from the audio.
 
 The audio encoder computes features for every encoder frame, 50 times a second. From these features,
 the model predicts lip positions during speech. A model offers several delays; the recognizer
@@ -18,7 +18,7 @@ from kouxing.shared.phones.events import LipPositions
 ENCODER_FRAME_LAG_S = 0.005
 
 
-class LipPositionStream(Protocol):
+class LipPredictorStream(Protocol):
     """Predicts the lip positions of one session, segment by segment."""
 
     def process_encoder_frame(
@@ -40,14 +40,14 @@ class LipPositionStream(Protocol):
         """Start a new segment of speech."""
 
 
-class LipPositionModel(Protocol):
+class LipPredictor(Protocol):
     """A trained model, shared by any number of streams."""
 
     @property
     def delays_s(self) -> Sequence[float]:
         """Available delays in seconds, ascending."""
 
-    def create_stream(self, delays_s: Sequence[float]) -> LipPositionStream:
+    def create_stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
         """Create a session's stream with some of the delays."""
 
     def with_mouth_profile(self, content: bytes) -> Self:

@@ -66,8 +66,8 @@ _COLUMNS, _ONES, _OTHERS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class LipPredictor:
-    """A trained lip predictor, shared by any number of streams."""
+class GruLipPredictor:
+    """A lip predictor with a gated recurrent unit, shared by any number of streams."""
 
     delays: Floats  # (delays,) seconds, ascending; a negative delay is a forecast
     feature_mean: Floats  # (features,)
@@ -105,7 +105,7 @@ class LipPredictor:
             self._weights_by_delays[key] = lips, output
         return self._weights_by_delays[key]
 
-    def create_stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
+    def create_stream(self, delays_s: Sequence[float]) -> GruLipPredictorStream:
         """Create a session's stream; raises ``UserError`` if the model lacks one of the delays."""
         unknown = [delay_s for delay_s in delays_s if delay_s not in self.delays_s]
         if unknown:
@@ -113,7 +113,7 @@ class LipPredictor:
             raise UserError(
                 f"the lip predictor has no delay of {1e3 * unknown[0]:g} ms; choose {choices}"
             )
-        return LipPredictorStream(self, [self.delays_s.index(delay_s) for delay_s in delays_s])
+        return GruLipPredictorStream(self, [self.delays_s.index(delay_s) for delay_s in delays_s])
 
     @cached_property
     def digest(self) -> bytes:
@@ -129,11 +129,11 @@ class LipPredictor:
         num_inner, num_delays, _ = self.output_weights.shape
         return num_inner, num_delays, NUM_LIP_FAPS
 
-    def with_mouth_profile(self, content: bytes) -> LipPredictor:
+    def with_mouth_profile(self, content: bytes) -> GruLipPredictor:
         """Adapt the model to a mouth profile; raises as ``parse_mouth_profile``."""
         return self.adapt(parse_mouth_profile(content, self.digest, self.residual_shape))
 
-    def adapt(self, profile: MouthProfile) -> LipPredictor:
+    def adapt(self, profile: MouthProfile) -> GruLipPredictor:
         """Adapt the model to one speaker."""
         faps = slice(NUM_LIP_FAPS)
         lips, output, bias = (
@@ -146,10 +146,10 @@ class LipPredictor:
         return replace(self, lip_weights=lips, output_weights=output, output_bias=bias)
 
 
-class LipPredictorStream:
+class GruLipPredictorStream:
     """Predicts the lip positions of one session, segment by segment."""
 
-    def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
+    def __init__(self, model: GruLipPredictor, delays: Sequence[int]) -> None:
         self._model = model
         self._delays_s = [model.delays_s[delay] for delay in delays]
         self._lip_weights, self._output_weights = model.weights_for_delays(delays)
@@ -165,7 +165,7 @@ class LipPredictorStream:
     def process_encoder_frame(
         self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
-        """Return the lip positions of an encoder frame; see ``LipPositionStream``."""
+        """Return the lip positions of an encoder frame; see ``LipPredictorStream``."""
         outputs = self.step(join_features(frames, features))
         return [
             LipPositions(
@@ -218,12 +218,12 @@ def _sigmoid(x: Floats) -> Floats:
     return probability
 
 
-def load_lip_predictor(path: Path = LIP_PREDICTOR_PATH) -> LipPredictor:
+def load_lip_predictor(path: Path = LIP_PREDICTOR_PATH) -> GruLipPredictor:
     """Read a file; raises ``UserError`` if it is missing, broken or of another format."""
     return load_component(path, FORMAT, "lip predictor", _parse_lip_predictor)
 
 
-def _parse_lip_predictor(archive: Archive) -> LipPredictor:
+def _parse_lip_predictor(archive: Archive) -> GruLipPredictor:
     """Build the predictor after checking every size; raises ``ValueError`` if a size is wrong."""
     delays = archive.floats("delays", *_read_shape(archive, "delays", 1))
     if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:
@@ -238,7 +238,7 @@ def _parse_lip_predictor(archive: Archive) -> LipPredictor:
     if num_lips > num_features:
         raise ValueError(f"it reads {num_lips} lip values from {num_features} features")
     outputs = (len(delays), NUM_OUTPUTS)
-    return LipPredictor(
+    return GruLipPredictor(
         delays=delays,
         feature_mean=archive.floats("feature_mean", num_features),
         projection=archive.floats("projection", num_features, num_components),

@@ -12,7 +12,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, s
 from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictor
 from kouxing.services.recognizer.live.speech_scorer import detect_speech, score_speech
 from kouxing.services.recognizer.live.stream import SpeechStream
 from kouxing.services.recognizer.search.decoder import Decoder
@@ -42,7 +42,7 @@ class Recognizer:
         self,
         *,
         sample_rate_hz: int = SAMPLE_RATE_HZ,
-        lip_predictor: LipPositionModel | None = None,
+        lip_predictor: LipPredictor | None = None,
         face_delay_s: float = 0.0,
         speech_time: int = 0,
         language: str | None = None,

@@ -22,7 +22,7 @@ from kouxing.services.recognizer.acoustic.encoder import (
     process_encoder_frames,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionStream
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictorStream
 from kouxing.services.recognizer.live.speech_segmenter import (
     EncoderInput,
     SpeechEnd,
@@ -81,7 +81,7 @@ class SpeechScorer:
     def __init__(
         self,
         model: AcousticModel,
-        lip_stream: LipPositionStream | None = None,
+        lip_stream: LipPredictorStream | None = None,
         start_frame: int | None = None,
     ) -> None:
         self._default_stream: AcousticStream = model.create_stream()

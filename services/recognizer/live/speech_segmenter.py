@@ -19,7 +19,7 @@ from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAM
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionStream
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictorStream
 from kouxing.services.recognizer.live.voice_traits import VoiceTraits, load_voice_readout
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import LipPositions
@@ -76,7 +76,7 @@ class SpeechSegmenter:
     def __init__(
         self,
         front_end: FrontEnd,
-        lip_stream: LipPositionStream | None,
+        lip_stream: LipPredictorStream | None,
         start_frame: int | None = None,
     ) -> None:
         self._front_end = front_end

@@ -14,7 +14,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, F
 from kouxing.services.recognizer.front_end.features import frame_at
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.front_end.slices import SliceMeter
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel, choose_delay
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictor, choose_delay
 from kouxing.services.recognizer.live.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.live.speech_scorer import SpeechScorer
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
@@ -48,7 +48,7 @@ class SpeechStream:
         rule: OutputRuleConfig,
         *,
         sample_rate_hz: int,
-        lip_predictor: LipPositionModel | None,
+        lip_predictor: LipPredictor | None,
         face_delay_s: float,
         speech_time: int,
     ) -> None:

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from kouxing_client.messages import Message, Phone, Speech
 
-from kouxing.services.recognizer.lips.lip_prediction import LipPositionModel
+from kouxing.services.recognizer.lips.lip_prediction import LipPredictor
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.sessions.audio_queue import AudioQueue
 from kouxing.services.recognizer.sessions.resumption import Chunk, ReplayWindow, ResumeFilter
@@ -54,7 +54,7 @@ class RecognizerSession:
         self,
         start: StartSession,
         recognizer: Recognizer,
-        lip_predictor: LipPositionModel,
+        lip_predictor: LipPredictor,
         socket: Socket,
         publisher: Socket,
         now_s: float,
