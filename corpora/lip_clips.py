@@ -27,6 +27,7 @@ from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import select_lip_faps
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.lips.lip_predictor import LIP_FAPS, OTHER_SIDE
 from kouxing.services.recognizer.offline.alignment import align_text
 from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_columns
@@ -45,12 +46,11 @@ _FILMED = "tracked video"  # start of the kind of a filmed clip
 CLOSED_FRACTION = 0.1  # lips that touch open at most this fraction of their tracked range
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
 
-# Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same
-# name of MakeHuman's face (CC0), both sides of a pair together. The rig's jaw opens wider than a
-# speaker's, so it is scaled to the opening of filmed speakers. Pursed lips are scaled to half a
+# Change of ``LIP_FAPS`` for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the
+# same name of MakeHuman's face (CC0), both sides of a pair together. The rig's jaw opens wider than
+# a speaker's, so it is scaled to the opening of filmed speakers. Pursed lips are scaled to half a
 # centimeter. Real pursed lips nearly touch, but the shapes' lips do not, so their heights come from
 # the filmed speakers' u. The head adds the backward swing of the jaw.
-_RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
 _RIG_DELAY_S = 0.04  # lag of its lips behind filmed speakers' lips
@@ -74,9 +74,6 @@ _RIG_SHAPES = {
                             768],
     "mouth_dimple": [0, -46, 18, 118, -94, 71, 164, 12, 12, 24, 70, 121, -41, 135, 176],
     "mouth_chinRaise_u": [6, 0, 293, -2, 0, 170, 35, 246, 0, 0, 311, -2, 0, 164, 18],
-}  # fmt: skip
-MIRROR = {
-    7: 6, 9: 8, 11: 10, 13: 12, 54: 53, 56: 55, 58: 57, 60: 59,
 }  # fmt: skip
 
 
@@ -229,7 +226,7 @@ def _tracked_faps(tracks: dict[str, Array]) -> Array:
 
 def _rig_faps(tracks: dict[str, Array]) -> Array:
     faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
-    faps[:, fap_columns(_RIG_FAPS)] = 0.0
+    faps[:, fap_columns(LIP_FAPS)] = 0.0
     for shape, effect in _RIG_SHAPES.items():
         # up to three letters are the side: mouth_suck_dl, mouth_press_l, mouth_funnel_dr
         sides = [
@@ -240,14 +237,14 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
         if not sides:
             raise KeyError(shape)
         weight = np.mean(np.stack(sides), axis=0)
-        faps[:, fap_columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
+        faps[:, fap_columns(LIP_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
     faps[:, fap_columns(PROTRUSION_FAPS)] *= _DEPTH_SCALE
     for upper, lower in fap_columns((4, 5)), fap_columns((8, 10)):
         # lips do not pass through each other
         crossed = np.maximum(faps[:, upper] + faps[:, lower], 0.0)
         faps[:, upper] -= 0.5 * crossed
         faps[:, lower] -= 0.5 * crossed
-    for right, left in MIRROR.items():
+    for left, right in OTHER_SIDE.items():
         faps[:, MOUTH_FAPS.index(right)] = faps[:, MOUTH_FAPS.index(left)]
     return faps
 

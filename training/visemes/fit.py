@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.optimize import minimize
 
-from kouxing.corpora.lip_clips import MIRROR, LipClip
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.recognizer.lips.lip_predictor import OTHER_SIDE
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import softmax
 from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import log_pause, log_silence
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import (
@@ -54,7 +55,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
 )
 from kouxing.shared import fast_record
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import LIP_HEIGHT_FAPS, MOUTH_FAPS, NUM_MOUTH_FAPS
+from kouxing.shared.face.faps import LIP_HEIGHT_FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 
@@ -284,8 +285,8 @@ def fit_parameters(frames: FrameTable) -> VisemeParameters:
     """Fit all measured FAPs in the two stages of Wang & Cai 2003."""
     measured = [
         column
-        for column in range(NUM_MOUTH_FAPS)
-        if not np.isnan(frames.faps[:, column]).all() and MOUTH_FAPS[column] not in MIRROR
+        for column, fap in enumerate(MOUTH_FAPS)
+        if not np.isnan(frames.faps[:, column]).all() and fap not in OTHER_SIDE.values()
     ]
     informative = [column for column in fap_columns((3, 5, 6)) if column in measured]
 
@@ -310,9 +311,8 @@ def fit_parameters(frames: FrameTable) -> VisemeParameters:
         gain = min(max(float(np.std(measured_fap) / np.std(modeled)), 1.0), _MAX_GAIN)
         visemes[4, ~fit.fixed] *= gain
         visemes[:3], silences[:2] = np.exp(visemes[:3]), np.exp(silences[:2])
-        sides = [column] + [
-            MOUTH_FAPS.index(right) for right, left in MIRROR.items() if left == MOUTH_FAPS[column]
-        ]
+        fap = MOUTH_FAPS[column]
+        sides = fap_columns((fap, OTHER_SIDE.get(fap, fap)))
         for name, values in zip(_UNKNOWNS, visemes, strict=True):
             arrays[name][:, sides] = values[:, None]
         for name, value in zip(_SILENCE_UNKNOWNS, silences, strict=True):
