@@ -2,8 +2,9 @@
 
 The files in the folder determine the layout:
 
-- ``manifest.tsv``: columns ``utt_id path speaker source license split seconds text pinyin``. Only
-  one of ``text`` and ``pinyin`` is required; ``pinyin`` takes precedence.
+- ``manifest.tsv``: columns ``utt_id path speaker source license split kind seconds text pinyin``.
+  Only one of ``text`` and ``pinyin`` is required; ``pinyin`` takes precedence. ``synthetic`` as the
+  ``kind``, or in the license, marks speech of a synthesizer.
 - A Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``). If its name is ``dev`` or ``test``, it
   is that split.
 - AISHELL-1 (``transcript/aishell_transcript_v0.8.txt`` and ``wav/<split>/<speaker>/*.wav``).
@@ -13,11 +14,11 @@ its own language (:mod:`kouxing.corpora.universal_phones`). Bad rows are reporte
 skipped, because large corpora always contain some.
 
 Natural recordings are held out from all training, to measure recognizers on them.
-``conversation.tsv`` is a manifest (:mod:`kouxing.corpora.speech_corpus`) of those with a text:
-podcasts, a talk, a web seminar and a prompt, with eight voices. The publishers of ``MOSS-TTSD`` and
-``Step-Audio-EditX`` provide the texts. Other texts are the output of one large recognizer
-(``RapidASR``) or the majority of several (``vad_example``), so they contain errors. Long recordings
-are cut into segments that overlap by 0.48 s, and so are their texts.
+``conversation.tsv`` is a manifest of those with a text: podcasts, a talk, a web seminar and a
+prompt, with eight voices. The publishers of ``MOSS-TTSD`` and ``Step-Audio-EditX`` provide the
+texts. Other texts are the output of one large recognizer (``RapidASR``) or the majority of several
+(``vad_example``), so they contain errors. Long recordings are cut into segments that overlap by
+0.48 s, and so are their texts.
 
 ``languages.tsv`` lists recordings in several languages, by speakers that no model was trained on,
 and their phones. No setting of the universal model was chosen on these recordings, except for those
@@ -27,7 +28,7 @@ of two native speakers of English (``en-native``) and of one of Korean.
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -77,6 +78,7 @@ class Utterance:
     path: Path
     speaker: str = ""
     license: str = ""
+    is_synthetic: bool = False  # speech of a synthesizer
     language: str = ""  # ISO 639 code, if the corpus has several languages
     split: str = ""
     seconds: float = 0.0
@@ -88,6 +90,13 @@ class Utterance:
     def minutes(self) -> float:
         """Duration of the recording."""
         return self.seconds / 60
+
+    @property
+    def kind(self) -> str:
+        """The kind of speech: ``sentence``, ``word`` or ``synthetic``."""
+        if self.is_synthetic:
+            return "synthetic"
+        return "word" if len(self.phones) <= _MAX_WORD_PHONES else "sentence"
 
 
 def syllables_of(utterance: Utterance, inventory: PhoneInventory) -> list[Syllable]:
@@ -125,18 +134,6 @@ class RowErrors:
 def may_distribute(license_name: str) -> bool:
     """Return whether a model trained on data under this license may be distributed."""
     return bool(_FREE_LICENSE.search(license_name)) and not _CLOSED_LICENSE.search(license_name)
-
-
-def is_synthetic(license_name: str) -> bool:
-    """Return whether data under this license is synthetic speech."""
-    return "synthetic" in license_name.lower()
-
-
-def kind_of_speech(license_name: str, phones: Sequence[int]) -> str:
-    """Return the kind of a recording: ``sentence``, ``word`` or ``synthetic``."""
-    if is_synthetic(license_name):
-        return "synthetic"
-    return "word" if len(phones) <= _MAX_WORD_PHONES else "sentence"
 
 
 def read_corpus(
@@ -223,6 +220,7 @@ def _utterance(row: dict[str, str], inventory: PhoneInventory, *, any_license: b
         path=path,
         speaker=row.get("speaker") or row["utt_id"],
         license=license_name,
+        is_synthetic=row.get("kind") == "synthetic" or "synthetic" in license_name.lower(),
         language=row.get("language", ""),
         split=_split_of(row),
         seconds=seconds,

@@ -15,14 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import log_mel_of, samples_of
-from kouxing.corpora.speech_corpus import (
-    RowErrors,
-    Utterance,
-    audio_files,
-    is_synthetic,
-    kind_of_speech,
-    read_corpus,
-)
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, read_corpus
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
 from kouxing.shared.phones.inventory import PhoneInventory
 
@@ -46,12 +39,8 @@ class Example:
     syllables: tuple[int, ...]  # number of phones in each syllable
     weight: float  # weight of its frames in the estimates
     license: str
+    kind: str  # see ``Utterance.kind``
     speaker: str
-
-    @property
-    def kind(self) -> str:
-        """The kind of speech, see :func:`kind_of_speech`."""
-        return kind_of_speech(self.license, self.phones)
 
     @property
     def minutes(self) -> float:
@@ -100,6 +89,7 @@ def load_examples(
                 syllables=utterance.syllables,
                 weight=weight,
                 license=utterance.license,
+                kind=utterance.kind,
                 speaker=utterance.speaker,
             )
         )
@@ -117,7 +107,7 @@ def weights_of(utterances: Sequence[Utterance]) -> list[float]:
     for utterance in utterances:
         weight = np.sqrt(_NEUTRAL_MINUTES / minutes[utterance.speaker])
         weight = float(np.clip(weight, _MIN_WEIGHT, _MAX_WEIGHT))
-        weights.append(weight * (_SYNTHETIC_WEIGHT if is_synthetic(utterance.license) else 1.0))
+        weights.append(weight * (_SYNTHETIC_WEIGHT if utterance.is_synthetic else 1.0))
     return weights
 
 

@@ -173,8 +173,9 @@ def corpus(tmp_path: Path) -> Path:
         f"d\ta.wav\tA\tsynthetic\ttrain\t9\t{sentence} zao3",
         f"e\ta.wav\tA\tCC0-1.0\tdev\t9\t{sentence} zao3",
         f"f\tnone.wav\tA\tCC0-1.0\ttrain\t9\t{sentence} zao3",
+        f"g\ta.wav\tA\tCC0-1.0\ttrain\t9\t{sentence} zao3\tsynthetic",
     ]
-    columns = "utt_id path speaker license split seconds pinyin"
+    columns = "utt_id path speaker license split seconds pinyin kind"
     folder = write_manifest(tmp_path / "corpus", columns, rows).parent
     (folder / "a.wav").touch()
     return folder

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
 from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
@@ -127,7 +127,7 @@ def _copies(example: Example, rng: np.random.Generator) -> list[RecordingCopy]:
     Low-weight recordings are sampled less often.
     """
     num_copies, weight = 1, example.weight
-    if not is_synthetic(example.license):
+    if example.kind != "synthetic":
         if len(example.syllables) >= _MIN_SENTENCE_SYLLABLES:
             num_copies = _SENTENCE_COPIES
         else:

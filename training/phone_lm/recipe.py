@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.speech_corpus import RowErrors, kind_of_speech, read_corpus
+from kouxing.corpora.speech_corpus import RowErrors, read_corpus
 from kouxing.services.recognizer.acoustic.model_file import (
     parse_phone_lm,
     phone_lm_arrays,
@@ -222,7 +222,7 @@ def train_phone_lm(
         row.phones
         for corpus in corpora
         for row in read_corpus(corpus, errors, inventory, split="train")
-        if kind_of_speech(row.license, row.phones) == "sentence"
+        if row.kind == "sentence"
     }
     corpus_stream = join_sentences(sorted(sentences), inventory)
     num_text = sum(map(len, streams))

@@ -14,8 +14,6 @@ from kouxing.corpora.lip_clips import read_clips
 from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
-    is_synthetic,
-    kind_of_speech,
     may_distribute,
     read_corpus,
     syllables_of,
@@ -95,7 +93,7 @@ def read_training_set(
 def _group_of(recording: Utterance) -> str:
     if recording.speaker.startswith("emodb_"):
         return "emodb"
-    return "synthetic" if is_synthetic(recording.license) else recording.language
+    return "synthetic" if recording.is_synthetic else recording.language
 
 
 def _may_train(recording: Utterance) -> bool:
@@ -114,7 +112,7 @@ def _sample_mandarin(corpus: Path, errors: RowErrors, *, any_license: bool) -> l
     random.Random(3).shuffle(rows)  # noqa: S311 - reproducible
     by_kind: dict[str, list[Utterance]] = defaultdict(list)
     for row in rows:
-        by_kind[kind_of_speech(row.license, row.phones)].append(row)
+        by_kind[row.kind].append(row)
     drawn = [
         row for kind, recordings in by_kind.items() for row in recordings[: _MANDARIN_LIMITS[kind]]
     ]
