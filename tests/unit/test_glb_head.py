@@ -14,7 +14,7 @@ from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.scene import load_head, place_camera
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
 from tests.glb_writer import Mesh, add_skeleton, edit, wrap_scene, write_glb
 from tests.heads import neutral_faps
@@ -75,6 +75,15 @@ def test_reads_oculus_visemes(tmp_path: Path, short: bool) -> None:
     for viseme in ("PP", "FF", "kk", "aa", "ih", "oh", "ou"):
         assert shape_error(head, VISEME_SHAPES[viseme]) < 0.15, viseme
     assert shape_error(head, neutral_faps(close_t_l_eyelid=700, close_t_r_eyelid=700)) < 0.4
+
+
+@pytest.mark.parametrize("num_faps", [1, 30])
+def test_fap_names_without_a_jaw_do_not_hide_arkit_shapes(tmp_path: Path, num_faps: int) -> None:
+    nose = neutral_faps(stretch_l_nose=400)
+    others = [fap.name for fap in FAPS if fap.name not in ("open_jaw", *SHAPES)][-num_faps:]
+    head = read_glb(write_glb(tmp_path / "my.glb", meshes(SHAPES | dict.fromkeys(others, nose))))
+    for name in ("jawOpen", "mouthPucker", "eyeBlinkRight"):
+        assert shape_error(head, SHAPES[name]) < 0.25, name
 
 
 def same_place(head: Head) -> None:

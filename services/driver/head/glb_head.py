@@ -86,8 +86,10 @@ def _select_known_shapes(pieces: list[MeshPiece]) -> ShapeFaps:
         name for piece in pieces for name, shift in piece.shapes.items() if shift.any()
     )
     faps = {name: fap for name in names if (fap := re.split("[.:|]", name)[-1]) in _FAP_BY_NAME}
+    if len(faps) < _MIN_FAPS or "open_jaw" not in faps.values():
+        faps = {}  # other sets of shapes may share a few names
     table: ShapeFaps = {}
-    if len(faps) >= _MIN_FAPS:
+    if faps:
         for fap in _FAP_BY_NAME.values():
             table[fap.name] = np.zeros(NUM_FAPS)
             table[fap.name][fap.number - 1] = units_per_weight(fap.fapu)
