@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kouxing.services.driver.head import glb_file
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.render.scene import load_head
 from kouxing.shared.errors import UserError
@@ -96,7 +97,7 @@ def data_uri(document: dict[str, Any], binary: bytearray) -> None:
         view["buffer"] = 1
 
 
-def draco(document: dict[str, Any], binary: bytearray) -> None:
+def draco(document: dict[str, Any], binary: bytearray, **options: Any) -> None:
     """Compress the first mesh, the skin, and remove its uncompressed positions."""
     primitive = document["meshes"][0]["primitives"][0]
     arrays = {}
@@ -106,7 +107,8 @@ def draco(document: dict[str, Any], binary: bytearray) -> None:
     ):
         _, arrays[name] = content(document, binary, number, kind)
         del document["accessors"][number]["bufferView"]
-    encoded = DracoPy.encode(**arrays, preserve_order=True, quantization_bits=16)
+    options = {"preserve_order": True, "quantization_bits": 16} | options
+    encoded = DracoPy.encode(**arrays, **options)
     view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(encoded)}
     document["bufferViews"].append(view)
     binary += encoded + b"\0" * (-len(encoded) % 4)
@@ -160,6 +162,7 @@ def _replace_by_compressed(
     [
         *(names_in_primitives, names_in_accessors, one_eye_mirrored, lights),
         *(texture_of_an_extension, null_binds, data_uri, draco),
+        partial(draco, create_metadata=True),
         partial(compress_with_meshopt, "NONE", "TRIANGLES"),
         partial(compress_with_meshopt, "EXPONENTIAL", "INDICES"),
         *(partial(transform, kind) for kind in TRANSFORMS),
@@ -188,6 +191,18 @@ def test_rejects_damaged_compressed_data(tmp_path: Path, wrong: dict[str, Any]) 
 
     path = edit(write_glb(tmp_path / "my.glb", meshes({"jawOpen": SHAPES["jawOpen"]})), change)
     with pytest.raises(UserError, match=r"my\.glb: the file is damaged"):
+        read_glb(path)
+
+
+@pytest.mark.parametrize("preserve_order", [True, False], ids=["sequential", "edgebreaker"])
+def test_limits_the_size_of_a_draco_mesh_before_it_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preserve_order: bool
+) -> None:
+    path = write_glb(tmp_path / "my.glb", meshes({"jawOpen": SHAPES["jawOpen"]}))
+    edit(path, partial(draco, preserve_order=preserve_order))
+    monkeypatch.setattr(glb_file, "MAX_BYTES", path.stat().st_size + 1000)
+    monkeypatch.setattr(DracoPy, "decode", lambda _: pytest.fail("the mesh was decoded"))
+    with pytest.raises(UserError, match="it is larger than"):
         read_glb(path)
 
 

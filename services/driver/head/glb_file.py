@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from kouxing.services.driver.head.draco_header import read_mesh_size
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content, parse_json, read_file
 
@@ -166,13 +167,19 @@ class GlbFile:
             import DracoPy  # noqa: PLC0415 - few files need it
 
             compressed = primitive["extensions"][_DRACO]
-            mesh = DracoPy.decode(self.view(compressed["bufferView"]))
+            data = self.view(compressed["bufferView"])
+            num_faces, num_points = read_mesh_size(data)
+            indices = primitive["attributes"].values()
+            kinds = [self.item("accessors", index)["type"] for index in indices]
+            num_values = 3 * num_faces + num_points * sum(_NUM_COMPONENTS[kind] for kind in kinds)
+            self._allow(4 * num_values)
+            mesh = DracoPy.decode(data)
             decoded["indices"] = np.asarray(mesh.faces, np.float64).reshape(-1, 1)
             for name in accessors.keys() & compressed["attributes"].keys():
                 item = self.item("accessors", accessors[name])
-                data = mesh.get_attribute_by_unique_id(compressed["attributes"][name])["data"]
+                values = mesh.get_attribute_by_unique_id(compressed["attributes"][name])["data"]
                 decoded[name] = _to_float(
-                    data.astype(_COMPONENT_TYPES[item["componentType"]]), item
+                    values.astype(_COMPONENT_TYPES[item["componentType"]]), item
                 )
         return {
             name: self.accessor(index) for name, index in accessors.items() if name not in decoded
