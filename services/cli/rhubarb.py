@@ -124,7 +124,8 @@ def _format_mouths(motion: FaceMotion, options: argparse.Namespace) -> str:
     ]
     if options.exportFormat == "dat":
         names = _PRESTON_BLAIR if options.datUsePrestonBlair else {}
-        return _moho_switches([*cues, (end_s, rest)], options.datFrameRate, names)
+        spoken = [(start_s, mouth) for start_s, mouth in cues if start_s < end_s]
+        return _moho_switches([*spoken, (end_s, rest)], options.datFrameRate, names)
     return format_cues(f".{options.exportFormat}", cues, rest, end_s, motion.source)
 
 

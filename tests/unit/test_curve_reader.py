@@ -50,6 +50,26 @@ def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveFormat, has_h
     np.testing.assert_allclose(animation.faps[:, HEAD_YAW], 5000.0 * has_head, atol=1.0)
 
 
+def slow_curves(frame_rate_hz: float) -> FrameStream:
+    """Return curves with the first frame at 0.99 of a step after a full second."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    rows = [((number + 0.99) / frame_rate_hz, number, faps) for number in range(20)]
+    return FrameStream(rows, frame_rate_hz)
+
+
+def test_a_live_link_take_keeps_its_rate(tmp_path: Path) -> None:
+    path = tmp_path / "take.csv"
+    exporter = CURVE_EXPORTERS[".csv"](path, ExportOptions(curve_format=CurveFormat.LIVELINK))
+    exporter.write(slow_curves(6.0))
+    animation = read_table(path)
+    assert animation.frame_rate_hz == pytest.approx(6.0, abs=0.01)
+    assert len(animation.faps) == 20
+    path.unlink()
+    with pytest.raises(UserError, match=r"take\.csv: .*at least 6 frames .* has 5; use --as arkit"):
+        exporter.write(slow_curves(5.0))
+    assert not path.exists()
+
+
 def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:
     path = tmp_path / "take.csv"
     CURVE_EXPORTERS[".csv"](path, ExportOptions(curve_format=CurveFormat.LIVELINK)).write(

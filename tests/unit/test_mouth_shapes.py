@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from kouxing.services.cli import rhubarb
+from kouxing.services.cli.recordings.animation import FaceMotion
 from kouxing.services.cli.recordings.cue_files import format_cues
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.high_level_faps import VISEMES as MPEG4_VISEMES
 from kouxing.shared.face.mouth_shapes import Cue, mouth_cues, mouth_shape, oculus_cues
@@ -96,6 +98,27 @@ def test_lips_that_close_for_a_rest_are_at_rest_at_once() -> None:
     text = format_cues(".tsv", [(0.0, "C"), (0.1, "A"), (0.3, "X")], "X", 0.5, None)
     assert text == "0.00\tC\n0.10\tX\n0.50\tX\n"
     assert format_cues(".tsv", [], "X", 0.2, None) == "0.00\tX\n0.20\tX\n"
+
+
+def test_no_cue_ends_after_the_recording() -> None:
+    content = json.loads(format_cues(".json", HI, "X", 0.3, None))
+    assert content["metadata"]["duration"] == 0.3
+    assert content["mouthCues"][-1] == {"start": 0.27, "end": 0.3, "value": "C"}
+    assert format_cues(".tsv", HI, "X", 0.3, None).endswith("0.27\tC\n0.30\tX\n")
+    # lips that close for a pause, part of which follows the end
+    text = format_cues(".tsv", [(0.0, "C"), (0.1, "A"), (0.3, "X")], "X", 0.2, None)
+    assert text == "0.00\tC\n0.10\tX\n0.20\tX\n"
+
+
+def test_no_switch_of_moho_follows_the_end_of_the_recording(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    faces = [REST, OPEN, WIDE]
+    frames = [(number / 50, faces[number // 5]) for number in range(5 * len(faces))]
+    motion = FaceMotion(frames, 50.0, 25.0, samples=np.zeros(int(0.18 * MEDIA_RATE_HZ), np.float32))
+    monkeypatch.setattr(rhubarb, "_animate", lambda _: motion)
+    rhubarb.main(["-q", "-f", "dat", "--datFrameRate", "50", "said.wav"])
+    assert capsys.readouterr().out == "MohoSwitch1\n1 X\n6 C\n10 X\n"
 
 
 @pytest.mark.slow

@@ -43,15 +43,15 @@ def format_cues(
 ) -> str:
     """Return the cues of a recording as a file, for a suffix in ``CUE_FORMATS``.
 
-    ``end_s`` is the end of the recording. Lips that close for a pause are at rest immediately.
-    Equal consecutive mouths become one cue.
+    ``end_s`` is the end of the recording. Later cues are left out. Lips that close for a pause are
+    at rest immediately. Equal consecutive mouths become one cue.
     """
     end = math.floor(100.0 * end_s + 1e-6) / 100.0
     merged: list[Cue] = []
     for start_s, mouth in cues:
         before = merged[-1][1] if merged else ""
         continues = before == mouth or (before, mouth) == (CLOSED, REST)
-        merged.append((merged.pop()[0] if continues else start_s, mouth))
+        merged.append((merged.pop()[0] if continues else min(start_s, end), mouth))
     spans = [
         (f"{start:.2f}", f"{until:.2f}", mouth)
         for (start, mouth), (until, _) in pairwise([*merged, (end, rest)])

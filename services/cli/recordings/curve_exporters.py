@@ -39,6 +39,9 @@ Values = NDArray[np.float32]
 FrameRow = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
 _SHAPE_FORMATS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
 _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
+# The time code does not name its rate. With fewer frames, none may have a count above 50, and
+# readers take the time code for one of 50 per second.
+_MIN_LIVE_LINK_FRAMES_HZ = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +108,12 @@ class CsvExporter(CurveExporter):
     def write(self, curves: FrameStream) -> int:
         """Write each frame when it arrives."""
         if self._curve_format is CurveFormat.LIVELINK:
+            if (curves.frame_rate_hz or _LIVE_LINK_RATE_HZ) < _MIN_LIVE_LINK_FRAMES_HZ:
+                raise UserError(
+                    f"{self._output}: a take of Live Link Face needs at least"
+                    f" {_MIN_LIVE_LINK_FRAMES_HZ} frames per second, but this motion has"
+                    f" {curves.frame_rate_hz:g}; use --as arkit"
+                )
             columns = _LIVE_LINK_COLUMNS
             cells = (_live_link_cells(row) for row in curves.rows)
         else:

@@ -92,6 +92,7 @@ _READ_AS = (
 )
 _KEYCAP = re.compile("[0-9#*]\ufe0f?\u20e3")  # emoji of a key, a bullet
 _NUMERAL = re.compile("[①-⒛Ⅰ-Ⅻⅰ-ⅻ㈠-㈩㊀-㊉]")  # a number as one character
+_NUMBER = re.compile(r"(?<![^\W_])\d")  # the start of a number, but not a tone
 _LETTERS = str.maketrans("ɑɡ\u0306", "ag\u030c")  # schoolbook letters; a breve instead of a caron
 _TONES = {"\u0304": 1, "\u0301": 2, "\u030c": 3, "\u0300": 4}  # combining marks
 
@@ -188,7 +189,7 @@ def write(spelling: str) -> str:
 
 
 def transcribe(text: str) -> Transcript:
-    """Convert a text to syllables: characters with numbers and dates, or pinyin and bopomofo.
+    """Convert a text to syllables: characters, numbers and dates, or pinyin and bopomofo.
 
     Among characters, bopomofo and pinyin with tones are also read. They are the reading of the
     characters before or after them if they sound alike, or if they follow in brackets.
@@ -210,6 +211,10 @@ def transcribe(text: str) -> Transcript:
         return _read_annotated(text)
     if not any(letter.isalpha() for letter in text):
         return _read_characters(text)
+    if _NUMBER.search(text):
+        numbers = _read_characters(text)
+        if not numbers.dropped:  # numbers with units, such as 100kg
+            return numbers
     text = read_bopomofo(text, spell)
     words = _PINYIN_WORD.findall(unicodedata.normalize("NFKC", text))
     spellings = [_split_word(word) for word in words]
