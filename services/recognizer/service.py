@@ -195,7 +195,7 @@ class RecognizerService(SessionService):
                 self._live.decode_all([flushed])
             flushed.audio.clear()
             flushed.link.forget()
-            flushed.silent_s = 0.0  # so that a stalled client is reported again
+            flushed.on_flush(time.monotonic())
             flushed.stream.flush()
             self._send_results(flushed)
             if flushed.last_chunk is not None:

@@ -100,6 +100,14 @@ def test_reports_speech_in_progress_to_a_restarted_control(service: Recognizer) 
     assert [start.speech_time for start in service.served_sessions()] == [2840]
 
 
+def test_accepts_the_next_audio_after_a_flush_whatever_its_number(service: Recognizer) -> None:
+    service.start_session(UNPACED)
+    service.receive(replace(chunk(0, 640), acknowledge=True))
+    service.flush_session("s")
+    service.receive(replace(chunk(4, 640), acknowledge=True))
+    assert service._sessions["s"].last_sequence == 5
+
+
 @pytest.mark.parametrize("paced", [False, True])
 def test_decodes_a_long_chunk_in_parts_with_heartbeats_between(
     service: Recognizer, paced: bool

@@ -96,6 +96,7 @@ class RecognizerSession:
         self.replay_window = ReplayWindow()
         self.last_sequence = 0  # number of the newest accepted audio message
         self._gap_since_s: float | None = None  # when messages after a gap were first dropped
+        self._flushed_s: float | None = None  # last interruption, until the client has continued
         self.client = NO_PEER  # sender of the newest audio
         self.last_chunk: AudioChunk | None = None  # None until it has arrived
         self.is_finished = False  # all audio up to the end is decoded
@@ -137,15 +138,22 @@ class RecognizerSession:
 
         ZeroMQ loses messages in flight when a connection ends. A client that asks for
         acknowledgements resends them. Until then, or for ``RESEND_WAIT_S``, later messages are
-        dropped. Returns whether the message was accepted.
+        dropped, except after an interruption. Returns whether the message was accepted.
         """
         is_next = self.last_sequence in (0, message.sequence - 1)
-        if message.acknowledge and not is_next:
+        if message.acknowledge and not is_next and self._flushed_s is None:
             self._gap_since_s = now_s if self._gap_since_s is None else self._gap_since_s
             if now_s < self._gap_since_s + RESEND_WAIT_S:
                 return False
         self.last_sequence, self._gap_since_s = message.sequence, None
+        if self._flushed_s is not None and now_s > self._flushed_s + RESEND_WAIT_S:
+            self._flushed_s = None  # messages sent before the interruption have arrived by now
         return True
+
+    def on_flush(self, now_s: float) -> None:
+        """Record an interruption: the client does not send or resend older audio."""
+        self._flushed_s = now_s
+        self.silent_s = 0.0  # so that a stalled client is reported again
 
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
         """Raise ``Rejected`` if the sender may not send this message here."""
