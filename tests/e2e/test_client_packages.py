@@ -94,9 +94,9 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("javascript")
     source = folder / "source" / "clients" / "javascript"
     shutil.copytree(JAVASCRIPT_CLIENT, source, ignore=shutil.ignore_patterns("node_modules"))
-    page = "services/gateway/page"
-    (folder / "source" / page).parent.mkdir(parents=True)
-    (folder / "source" / page).symlink_to(ROOT / page)
+    (folder / "source" / "services" / "gateway").mkdir(parents=True)
+    for name in ("services/gateway/page", "LICENSE", "NOTICE"):
+        (folder / "source" / name).symlink_to(ROOT / name)
     project = folder / "project"
     project.mkdir()
     (project / "package.json").write_text("{}", encoding="utf-8")
@@ -133,6 +133,12 @@ def gateway(system: System, site: str) -> Iterator[Gateway]:
     gateway = Gateway(system.control, trusted_origins=site)
     yield gateway
     gateway.stop()
+
+
+def test_the_javascript_package_contains_its_license(project: Path) -> None:
+    for name in ("LICENSE", "NOTICE"):
+        packed = project / "node_modules" / "kouxing-client" / name
+        assert packed.read_bytes() == (ROOT / name).read_bytes()
 
 
 def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -> None:
