@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from kouxing.evaluation.system import lips_package
 from kouxing.evaluation.system.lips_package import package_faps
+from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.phones.events import SoundEvent
+from kouxing.shared.phones.events import LipPositions, Progress, SoundEvent, SpeechChange
 
 RATE_HZ = 16_000
 DELAY_S, FRAME_RATE_HZ = 0.06, 50.0
@@ -33,3 +34,24 @@ def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> F
     faps = lips_package.server_faps(events, feeling)
     faps[:, TONGUE] = 0.0
     return faps
+
+
+def closure_at_the_end_of_speech() -> list[SoundEvent]:
+    """Return events of lips that are closing fast when the speech ends."""
+    openings = [1.0] * 20 + [0.1]
+    lip_faps = [MOUTH_FAPS.index(fap) for fap in (4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)]
+    events: list[SoundEvent] = [SpeechChange(active=True, time_s=0.0)]
+    for number in range(40):
+        time_s = number / FRAME_RATE_HZ
+        if number < len(openings):
+            faps = np.zeros(len(MOUTH_FAPS), np.float32)
+            faps[lip_faps] = -200.0 * openings[number]
+            events.append(
+                LipPositions(
+                    time_s=time_s, delay_s=DELAY_S, faps=faps, closure=0.01, lip_to_teeth=0.0
+                )
+            )
+        if number == len(openings):
+            events.append(SpeechChange(active=False, time_s=time_s + DELAY_S))
+        events.append(Progress(time_s=time_s + DELAY_S, level_db=-20.0))
+    return events

@@ -207,6 +207,14 @@ static void move_to_rest(double *faps, double amount) {
   }
 }
 
+/* Separate lips that pass through each other. */
+static void separate_lips(double *faps) {
+  for (int i = 0; i < CLOSURES_UPPER_LENGTH; i++) {
+    const double crossed = fmax(0.0, faps[CLOSURES_UPPER[i]] + faps[CLOSURES_LOWER[i]]);
+    for (int row = 0; row < CLOSURES_BOTH_LENGTH; row++) faps[CLOSURES_BOTH[row * CLOSURES_UPPER_LENGTH + i]] -= 0.5 * crossed;
+  }
+}
+
 /* Compute the FAPs of the next lip positions, stabilized and with closures. */
 static void stabilize(Face *face, const LipPositions *frame, double *faps) {
   if (frame->time_s - track_end_s(&face->track) <= LEARNED_MAX_GAP_S) {
@@ -219,10 +227,7 @@ static void stabilize(Face *face, const LipPositions *frame, double *faps) {
     memcpy(face->stable, frame->faps, sizeof face->stable);
   }
   memcpy(faps, face->stable, sizeof face->stable);
-  for (int i = 0; i < CLOSURES_UPPER_LENGTH; i++) { /* lips do not pass through each other */
-    const double crossed = fmax(0.0, faps[CLOSURES_UPPER[i]] + faps[CLOSURES_LOWER[i]]);
-    for (int row = 0; row < CLOSURES_BOTH_LENGTH; row++) faps[CLOSURES_BOTH[row * CLOSURES_UPPER_LENGTH + i]] -= 0.5 * crossed;
-  }
+  separate_lips(faps);
   const double probability = clamp(frame->closure, CLOSURES_MIN_PROBABILITY, CLOSURES_MAX_PROBABILITY);
   const double opening = -(faps[CLOSURES_INNER_UPPER] + faps[CLOSURES_INNER_LOWER]);
   const double width = faps[CLOSURES_LEFT_CORNER] + faps[CLOSURES_RIGHT_CORNER];
@@ -377,14 +382,14 @@ static void solve_weights(Face *face, const double *right, double *weights) {
 }
 
 void face_visemes(Face *face, double time_s, float *weights) {
-  double faps[SHAPES_NUM_FAPS] = {0}, right[NUM_SHAPES], solution[NUM_SHAPES], sum = 0.0;
+  double mouth[NUM_MOUTH_FAPS], faps[SHAPES_NUM_FAPS] = {0}, right[NUM_SHAPES], solution[NUM_SHAPES], sum = 0.0;
   follow_voice(&face->rest, time_s);
   if (face->has_lip_positions) follow_track(face, time_s);
   const double ajar = ajar_amount_at(&face->rest, time_s);
   face->time_s = time_s;
-  for (int i = 0; i < NUM_MOUTH_FAPS; i++) {
-    faps[MOUTH_FAPS[i] - 1] = (float)(face->mouth.value[i] + ajar * (REST_AJAR[i] - face->mouth.value[i]));
-  }
+  memcpy(mouth, face->mouth.value, sizeof mouth);
+  separate_lips(mouth); /* an interrupted closing movement overshoots */
+  for (int i = 0; i < NUM_MOUTH_FAPS; i++) faps[MOUTH_FAPS[i] - 1] = (float)(mouth[i] + ajar * (REST_AJAR[i] - mouth[i]));
   for (int i = 0; i < LEARNED_UNTRACKED_LENGTH; i++) faps[MOUTH_FAPS[LEARNED_UNTRACKED[i]] - 1] = 0.0;
   apply_expressiveness(faps);
   for (int shape = 0; shape < NUM_SHAPES; shape++) {

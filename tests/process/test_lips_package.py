@@ -17,12 +17,13 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.phones.events import Phone, Progress, SoundEvent
+from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
 from tests.lips_package import (
     DELAY_S,
     FRAME_RATE_HZ,
     RATE_HZ,
     Frames,
+    closure_at_the_end_of_speech,
     faps_of,
     package_output,
     server_faps,
@@ -132,6 +133,43 @@ def test_weights_equal_the_servers(models: Path) -> None:
             np.testing.assert_allclose(frame[name], expected, atol=1e-4)
 
 
+def server_faps_of_events(events: Sequence[SoundEvent]) -> Frames:
+    face = FaceAnimator(load_lip_model(), frame_rate_hz=FRAME_RATE_HZ, delay_s=DELAY_S)
+    return np.array([faps for event in events for _, faps in face.process(event)])
+
+
+def package_faps_of_events(models: Path, events: Sequence[SoundEvent]) -> Frames:
+    printed = subprocess.run(
+        [NODE, SCRIPTS / "face.mjs", models, str(DELAY_S)],
+        input=json.dumps([*map(plain_event, events)]).encode(),
+        capture_output=True,
+        check=True,
+        timeout=120,
+    )
+    return np.array(json.loads(printed.stdout), np.float32)
+
+
+def plain_event(event: SoundEvent) -> dict[str, Any]:
+    """Return an event as the package's objects, except phones and expressions."""
+    match event:
+        case LipPositions(time_s=time_s, delay_s=delay_s, faps=faps, closure=closure):
+            values = {"delayS": delay_s, "faps": faps.tolist(), "closure": closure}
+            return {"type": "lips", "timeS": time_s, **values}
+        case SpeechChange(time_s=time_s, active=active):
+            return {"type": "speech", "timeS": time_s, "active": active}
+        case Progress(time_s=time_s, level_db=level_db, is_laughter=is_laughter):
+            values = {"levelDb": level_db, "isLaughter": is_laughter}
+            return {"type": "progress", "timeS": time_s, **values}
+    raise AssertionError(event)
+
+
+def test_lips_do_not_pass_through_each_other_at_the_end_of_speech(models: Path) -> None:
+    events = closure_at_the_end_of_speech()
+    ours, theirs = package_faps_of_events(models, events), server_faps_of_events(events)
+    assert (opening(theirs) >= 0).all()
+    np.testing.assert_allclose(ours, theirs, atol=0.1)
+
+
 def test_laughter_follows_its_notes_as_on_the_server(models: Path) -> None:
     levels_db = [-50.0] * 10 + [-20.0, -15.0, -25.0, -45.0, -50.0] * 5 + [-60.0] * 30
     events = [
@@ -140,25 +178,8 @@ def test_laughter_follows_its_notes_as_on_the_server(models: Path) -> None:
         )
         for number, level_db in enumerate(levels_db)
     ]
-    face = FaceAnimator(load_lip_model(), frame_rate_hz=FRAME_RATE_HZ, delay_s=DELAY_S)
-    theirs = np.array([frame for event in events for _, frame in face.process(event)])
-    plain = [
-        {
-            "type": "progress",
-            "timeS": event.time_s,
-            "levelDb": event.level_db,
-            "isLaughter": event.is_laughter,
-        }
-        for event in events
-    ]
-    printed = subprocess.run(
-        [NODE, SCRIPTS / "face.mjs", models, str(DELAY_S)],
-        input=json.dumps(plain).encode(),
-        capture_output=True,
-        check=True,
-        timeout=120,
-    )
-    ours = np.array(json.loads(printed.stdout), np.float32)
+    theirs = server_faps_of_events(events)
+    ours = package_faps_of_events(models, events)
     assert np.ptp(opening(theirs)) > 300  # the mouth opens at the notes
     np.testing.assert_allclose(ours, theirs, atol=0.1)
 

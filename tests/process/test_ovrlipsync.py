@@ -4,7 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,22 +19,40 @@ from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.live.voice_traits import load_voice_readout
+from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.face.shapes import OCULUS
-from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
 from tests.documents import code_blocks
-from tests.lips_package import FRAME_RATE_HZ, Frames, server_faps
+from tests.lips_package import (
+    FRAME_RATE_HZ,
+    Frames,
+    closure_at_the_end_of_speech,
+    server_faps,
+)
 from tests.system import DEMO, NODE, ROOT, samples_of_file
 
 SOURCE = ROOT / "clients" / "ovrlipsync"
 LIBRARY = "OVRLipSync.c", "lips.c", "encoder.c", "face.c", "lips_model.c"
 NUM_VISEMES = 15
 RATE_HZ, BUFFER = 48_000, 1024
+FACE_BYTES = 1 << 20  # more than a ``Face`` needs
 SUCCESS, CANNOT_CREATE, INVALID, BAD_RATE, UNDEFINED = 0, -2201, -2202, -2203, -2206
 ENHANCED, WITH_LAUGHTER = 1, 2
 S16_MONO, F32_MONO, F32_STEREO = 0, 2, 3
 VISEME_ON, SMOOTHING = 0, 3
 EVIDENCE_FRACTION = 0.1  # of a new position, for laughter
 Weights = NDArray[np.float64]
+
+
+class CLipPositions(ctypes.Structure):
+    """``LipPositions`` of ``encoder.h``."""
+
+    _fields_ = (
+        ("time_s", ctypes.c_double),
+        ("delay_s", ctypes.c_double),
+        ("faps", ctypes.c_double * NUM_MOUTH_FAPS),
+        ("closure", ctypes.c_double),
+    )
 
 
 class Frame(ctypes.Structure):
@@ -76,9 +94,9 @@ def library(folder: Path) -> Iterator[Any]:
     library.ovrLipSync_Shutdown()
 
 
-def server_weights(samples: Frames) -> Weights:
+def server_weights(events: Sequence[SoundEvent]) -> Weights:
     """Return the server's visemes (num_frames, 15); feeling does not move them in the library."""
-    events = [event for event in server_events(samples) if not isinstance(event, Phone)]
+    events = [event for event in events if not isinstance(event, Phone)]
     return np.array([OCULUS.weights(faps) for faps in server_faps(events, feeling=0.0)])
 
 
@@ -114,9 +132,39 @@ def test_a_c_program_has_the_servers_visemes(folder: Path, name: str) -> None:
     numbers, delays_ms, weights = rows[:, 0], rows[:, 1], rows[:, 3:]
     assert numbers.tolist() == [*range(len(rows))]
     assert delays_ms[10:].max() == 60
-    expected = server_weights(sound)
+    expected = server_weights(server_events(sound))
     assert_close(weights, at_faces(expected, (numbers + 1) / FRAME_RATE_HZ, delays_ms))
     assert weights[:, 1:].max(axis=0)[[0, 9]].min() > 0.3  # PP and aa
+
+
+def library_weights(library: Any, events: Sequence[SoundEvent]) -> Weights:
+    """Return the visemes of events (num_frames, 15), from the functions of ``face.h``.
+
+    The events' progress is one frame at a time.
+    """
+    face = ctypes.create_string_buffer(FACE_BYTES)
+    weights = (ctypes.c_float * NUM_VISEMES)()
+    library.face_init(face)
+    rows: list[list[float]] = []
+    for event in events:
+        match event:
+            case SpeechChange(time_s=time_s, active=active):
+                library.face_change_speech(face, ctypes.c_double(time_s), ctypes.c_bool(active))
+            case LipPositions(time_s=time_s, delay_s=delay_s, faps=faps, closure=closure):
+                values = (ctypes.c_double * NUM_MOUTH_FAPS)(*faps.tolist())
+                library.face_add_lips(
+                    face, ctypes.byref(CLipPositions(time_s, delay_s, values, closure))
+                )
+            case Progress(time_s=time_s, level_db=level_db):
+                library.face_add_level(face, ctypes.c_double(time_s), ctypes.c_double(level_db))
+                library.face_visemes(face, ctypes.c_double(len(rows) / FRAME_RATE_HZ), weights)
+                rows.append([*weights])
+    return np.array(rows)
+
+
+def test_lips_do_not_pass_through_each_other_at_the_end_of_speech(library: Any) -> None:
+    events = closure_at_the_end_of_speech()
+    np.testing.assert_allclose(library_weights(library, events), server_weights(events), atol=1e-4)
 
 
 def new_frame() -> tuple[Frame, Frames]:
@@ -156,7 +204,7 @@ def test_buffers_at_48_khz_from_python(library: Any) -> None:
     delays_ms, mono = process(library, context, sound)
     known_s = (1 + np.arange(len(mono))) * BUFFER / RATE_HZ
     assert 60 <= delays_ms[10:].min() < delays_ms[10:].max() <= 90
-    expected = server_weights(to_16_khz(sound, RATE_HZ))
+    expected = server_weights(server_events(to_16_khz(sound, RATE_HZ)))
     assert_close(mono, at_faces(expected, known_s, delays_ms))
 
     assert library.ovrLipSync_ResetContext(context) == SUCCESS

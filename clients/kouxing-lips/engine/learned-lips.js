@@ -55,9 +55,11 @@ export class LearnedLips {
     if (this.#hasLipPositions) this.#followTrack(timeS);
     const ajar = this.#resting.amountAt(timeS);
     this.#timeS = timeS;
-    const { AJAR } = this.#model.constants.rest;
-    const faps = this.#mouth.value.map((x, i) => x + ajar * (AJAR[i] - x));
-    for (const column of this.#model.constants.learned.UNTRACKED) faps[column] = 0;
+    const { closures, learned, rest } = this.#model.constants;
+    const faps = this.#mouth.value.slice();
+    separateLips(faps, closures); // an interrupted closing movement overshoots
+    faps.forEach((x, i) => (faps[i] = x + ajar * (rest.AJAR[i] - x)));
+    for (const column of learned.UNTRACKED) faps[column] = 0;
     return faps;
   }
 
