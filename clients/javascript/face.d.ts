@@ -7,6 +7,16 @@ export interface LocalLips extends EventTarget {
   express(strengths: Record<string, number>, holdS?: number): void;
   resume(): Promise<void>;
   stop(): void;
+  addEventListener(
+    type: "notice",
+    listener: (this: LocalLips, event: CustomEvent<string>) => void,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  addEventListener(
+    type: string,
+    listener: EventListenerOrEventListenerObject,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
 }
 
 export interface KouxingFaceEventMap extends HTMLElementEventMap {

@@ -33,7 +33,10 @@ console.log(time, values.length);
 const face: KouxingFace = document.createElement("kouxing-face");
 face.addEventListener("session", ({ detail }) => console.log(detail.epoch));
 await face.turnSoundOn();
-await (await face.lips).listenToMicrophone();
+const lips = await face.lips;
+lips.addEventListener("notice", ({ detail }) => console.log(detail.length));
+lips.addEventListener("ended", ({ type }) => console.log(type));
+await lips.listenToMicrophone();
 if (face.set !== "faps" && face.shown !== null && !Array.isArray(face.shown)) console.log(face.shown.jawOpen);
 
 // @ts-expect-error: unknown shapes
