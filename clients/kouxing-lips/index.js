@@ -213,7 +213,7 @@ export class LipSync extends EventTarget {
           node.disconnect(delay);
           delay.disconnect();
         }
-        if (source instanceof AudioBuffer) {
+        if (isInstance(source, "AudioBuffer")) {
           node.onended = null;
           node.stop();
         }
@@ -221,7 +221,7 @@ export class LipSync extends EventTarget {
       },
     };
     input.port.postMessage(port2, [port2]);
-    if (source instanceof AudioBuffer) {
+    if (isInstance(source, "AudioBuffer")) {
       node.start();
       node.onended = () => this.dispatchEvent(new Event("ended"));
     }
@@ -333,24 +333,30 @@ function abortError() {
   return new DOMException("another source was opened, or lip sync was stopped or closed", "AbortError");
 }
 
+/** Return whether an object is an instance of a class of the browser, also of another realm, such as an iframe. */
+function isInstance(object, className) {
+  if (object === null || object === undefined) return false;
+  return object.constructor?.name === className || isInstance(Object.getPrototypeOf(object), className);
+}
+
 const elementNodes = new WeakMap(); // an element allows only one node
 
 /** Return the audio node of a source. Its property isPlayed is true if the page plays the sound. */
 function sourceNode(context, source) {
-  const current = source instanceof AudioNode ? source : elementNodes.get(source);
+  const current = isInstance(source, "AudioNode") ? source : elementNodes.get(source);
   if (current && current.context !== context) {
     throw new Error("the source belongs to another audio context; pass that context to LipSync.create() as context");
   }
-  if (source instanceof AudioNode) return Object.assign(source, { isPlayed: false });
-  if (source instanceof MediaStreamTrack) source = new MediaStream([source]);
-  if (source instanceof MediaStream) {
+  if (isInstance(source, "AudioNode")) return Object.assign(source, { isPlayed: false });
+  if (isInstance(source, "MediaStreamTrack")) source = new MediaStream([source]);
+  if (isInstance(source, "MediaStream")) {
     if (source.getAudioTracks().length === 0) throw new Error("the stream has no audio track");
     return Object.assign(new MediaStreamAudioSourceNode(context, { mediaStream: source }), { isPlayed: false });
   }
-  if (source instanceof AudioBuffer) {
+  if (isInstance(source, "AudioBuffer")) {
     return Object.assign(new AudioBufferSourceNode(context, { buffer: source }), { isPlayed: true });
   }
-  if (source instanceof HTMLMediaElement) {
+  if (isInstance(source, "HTMLMediaElement")) {
     if (!elementNodes.has(source)) elementNodes.set(source, new MediaElementAudioSourceNode(context, { mediaElement: source }));
     return Object.assign(elementNodes.get(source), { isPlayed: true });
   }

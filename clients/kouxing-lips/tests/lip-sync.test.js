@@ -2,6 +2,7 @@
 
 import assert from "node:assert/strict";
 import test from "node:test";
+import { runInNewContext } from "node:vm";
 import { loadModel } from "../engine/model.js";
 import { LipSync } from "../index.js";
 
@@ -44,9 +45,9 @@ class FakeNode {
   stop() {}
 }
 
-class FakeBuffer {}
+class AudioBuffer {}
 
-class FakeAudioNode {}
+class AudioNode {}
 
 class FakeContext extends EventTarget {
   state = "running";
@@ -56,7 +57,7 @@ class FakeContext extends EventTarget {
   async resume() {}
 }
 
-class FakeTrack {
+class MediaStreamTrack {
   isLive = true;
   getSettings = () => ({ sampleRate: 48000 });
   stop() {
@@ -64,8 +65,8 @@ class FakeTrack {
   }
 }
 
-class FakeStream {
-  track = new FakeTrack();
+class MediaStream {
+  track = new MediaStreamTrack();
   getAudioTracks = () => [this.track];
 }
 
@@ -76,7 +77,7 @@ let context;
 test.beforeEach(() => {
   FakeWorker.count = 0;
   FakeWorker.error = null;
-  stream = new FakeStream();
+  stream = new MediaStream();
   context = new FakeContext();
   const getUserMedia = () => new Promise((resolve) => (answerPrompt = () => resolve(stream)));
   Object.defineProperty(globalThis, "navigator", { value: { mediaDevices: { getUserMedia } }, configurable: true });
@@ -84,11 +85,6 @@ test.beforeEach(() => {
     document: new EventTarget(),
     location: { href: "http://localhost/" },
     Worker: FakeWorker,
-    AudioNode: FakeAudioNode,
-    AudioBuffer: FakeBuffer,
-    HTMLMediaElement: class {},
-    MediaStreamTrack: FakeTrack,
-    MediaStream: FakeStream,
     AudioWorkletNode: FakeNode,
     MediaStreamAudioSourceNode: FakeNode,
     AudioBufferSourceNode: FakeNode,
@@ -127,14 +123,28 @@ test("the URL of the models may lack the slash at its end", async () => {
 
 test("a closed lip sync, a closed context and a source of another context give a clear error", async () => {
   const lips = await LipSync.create({ context });
-  const other = Object.assign(new FakeAudioNode(), { context: new FakeContext() });
+  const other = Object.assign(new AudioNode(), { context: new FakeContext() });
   await assert.rejects(lips.listenTo(other), /belongs to another audio context; pass that context/);
   context.state = "closed";
-  await assert.rejects(lips.listenTo(new FakeBuffer()), /the audio context is closed/);
+  await assert.rejects(lips.listenTo(new AudioBuffer()), /the audio context is closed/);
   lips.close();
-  for (const call of [() => lips.open(16000), () => lips.listenTo(new FakeBuffer()), () => lips.listenToMicrophone()]) {
+  for (const call of [() => lips.open(16000), () => lips.listenTo(new AudioBuffer()), () => lips.listenToMicrophone()]) {
     await assert.rejects(call, /this lip sync is closed; create another one/);
   }
+});
+
+test("sources of another realm, such as an iframe, are followed", async () => {
+  const lips = await LipSync.create({ context });
+  const follow = async (source) => {
+    const listening = lips.listenTo(source);
+    await open();
+    await listening;
+  };
+  await follow(runInNewContext("class MediaStream { getAudioTracks() { return [1]; } } new MediaStream()"));
+  const node = runInNewContext("class AudioNode { connect() {} disconnect() {} } class GainNode extends AudioNode {} new GainNode()");
+  await follow(Object.assign(node, { context }));
+  assert.equal(lips.node, node);
+  await assert.rejects(lips.listenTo(Object.assign(node, { context: new FakeContext() })), /belongs to another audio context/);
 });
 
 test("an error of another call does not reject open()", async () => {
@@ -226,7 +236,7 @@ test("close() also works while the user is asked for the microphone", async () =
 test("the source that was chosen last is followed, even if an earlier one takes longer to open", async () => {
   const lips = await LipSync.create({ context });
   const first = lips.listenToMicrophone();
-  const second = lips.listenTo(new FakeBuffer());
+  const second = lips.listenTo(new AudioBuffer());
   await open();
   await second;
   const { node } = lips;
@@ -249,11 +259,11 @@ test("a buffer that is replaced does not report its end", async () => {
   const lips = await LipSync.create({ context });
   let numEnded = 0;
   lips.addEventListener("ended", () => numEnded++);
-  const first = lips.listenTo(new FakeBuffer());
+  const first = lips.listenTo(new AudioBuffer());
   await open();
   await first;
   const { node } = lips;
-  const second = lips.listenTo(new FakeBuffer());
+  const second = lips.listenTo(new AudioBuffer());
   await opening();
   node.onended?.(); // browsers report it after node.stop()
   assert.equal(numEnded, 0);
@@ -264,7 +274,7 @@ test("a buffer that is replaced does not report its end", async () => {
 });
 
 test("HeadAudio loads its models once if loadModel() is called twice", async () => {
-  globalThis.GainNode = class extends FakeAudioNode {
+  globalThis.GainNode = class extends AudioNode {
     context = context;
     connect() {}
   };
