@@ -138,7 +138,7 @@ export class KouxingFace extends HTMLElement {
     const bytes = await fetchFile(url).catch(({ message }) => {
       throw new Error(`${url}: ${message}`);
     });
-    const { names, frames } = readRecording(new TextDecoder().decode(bytes));
+    const { names, frames } = readRecording(bytes);
     const set = names === null ? "faps" : chooseSet(names);
     if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);
     const startMs = performance.now();

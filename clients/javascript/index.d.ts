@@ -112,10 +112,10 @@ export class Speaker {
 
 /**
  * Read a `.csv` or `.jsonl` file of `kouxing listen -o` or `kouxing render`, or a take (`.csv`) of the
- * app Live Link Face. Throws an error if the recording has no times or no frames, a value
+ * app Live Link Face. Bytes are UTF-8, or UTF-16 with a byte order mark. Throws an error if the recording has no times or no frames, a value
  * is not a number, or a time is earlier than the previous one.
  */
-export function readRecording(text: string): {
+export function readRecording(content: string | ArrayBuffer | Uint8Array): {
   /** names of the shapes; null: the values are the 68 FAPs */
   names: string[] | null;
   frames: [MediaTime, Float32Array][];

@@ -1,6 +1,7 @@
 // Reads the .csv and .jsonl files of `kouxing listen -o` and `kouxing render`, with FAPs or shapes,
 // and takes (.csv) of the app Live Link Face. Frames of a take without a face, with a count of 0, are left out.
-// The values of these tables are numbers, times and names without commas or quotes, so no CSV package is needed.
+// Tables of spreadsheet programs may be in UTF-16, and have semicolons or tabs with decimal commas.
+// The values of these tables are numbers, times and names without quotes, so no CSV package is needed.
 
 const RATE_HZ = 16000;
 // A time code counts frames, but the file does not name their rate. It is the lowest of these above
@@ -11,12 +12,13 @@ const DAY_S = 86400;
 /**
  * Read a recording.
  *
- * @param {string} text content of the file
+ * @param {string | ArrayBuffer | Uint8Array} content of the file
  * @returns { names: of the shapes, or null for the 68 FAPs, frames: [[media time, Float32Array]] }
  * @throws {Error} if the table has no times or no frames, a value is not a number, or a time is earlier than the previous one
  */
-export function readRecording(text) {
-  const lines = text.replace(/^\uFEFF/, "").split(/\r?\n/).filter((line) => /[^ ,]/.test(line));
+export function readRecording(content) {
+  const text = typeof content === "string" ? content.replace(/^\uFEFF/, "") : decodeText(new Uint8Array(content));
+  const lines = text.split(/\r?\n/).filter((line) => /[^ ,;\t]/.test(line) && !line.startsWith("sep=")); // "sep=" is from Excel
   if (lines.length === 0) throw new Error("the recording is empty; record it again");
   const recording = lines[0].startsWith("{") ? readJsonLines(lines) : readCsv(lines);
   if (recording.frames.length === 0) throw new Error("the recording has no frames with a face; record it again");
@@ -27,6 +29,11 @@ export function readRecording(text) {
   const early = recording.frames.findIndex(([time], number, frames) => time < frames[number - 1]?.[0]);
   if (early >= 0) throw new Error(`frame ${early + 1} of the recording: its time is earlier than the previous frame's; sort the frames by time`);
   return recording;
+}
+
+function decodeText(bytes) {
+  const encodings = { 0xfffe: "utf-16le", 0xfeff: "utf-16be" }; // by byte order mark
+  return new TextDecoder(encodings[(bytes[0] << 8) | bytes[1]]).decode(bytes);
 }
 
 function readJsonLines(lines) {
@@ -47,8 +54,16 @@ function readJsonLines(lines) {
   return { names, frames };
 }
 
-function readCsv([header, ...lines]) {
-  const titles = header.split(",").map((title) => title.trim());
+/** Return the cells of each line, separated by commas, semicolons or tabs. */
+function splitCells(lines) {
+  const count = (separator) => lines[0].split(separator).length;
+  const delimiter = [",", ";", "\t"].reduce((most, separator) => (count(separator) > count(most) ? separator : most));
+  return lines.map((line) => (delimiter === "," ? line : line.replaceAll(",", ".")).split(delimiter));
+}
+
+function readCsv(lines) {
+  const [header, ...cells] = splitCells(lines);
+  const titles = header.map((title) => title.trim());
   const timeColumn = titles.findIndex((title) => /^(time_s|timecode)$/i.test(title));
   if (timeColumn < 0) throw new Error("the recording has no times; add a column time_s or Timecode");
   const isTake = titles[timeColumn].toLowerCase() === "timecode";
@@ -59,7 +74,7 @@ function readCsv([header, ...lines]) {
     isTake ? titles[column][0].toLowerCase() + titles[column].slice(1) : titles[column],
   );
   const countColumn = titles.findIndex((title) => /^blendshapecount$/i.test(title));
-  const rows = lines.map((line) => line.split(",")).filter((row) => row[countColumn]?.trim() !== "0");
+  const rows = cells.filter((row) => row[countColumn]?.trim() !== "0");
   const times = rows.map((row) => row[timeColumn]);
   const timesS = isTake ? readTimeCodes(times) : times.map(Number);
   return {

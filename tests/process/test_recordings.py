@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from base64 import b64encode
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,16 @@ JAW = FAP_NUMBER["open_jaw"] - 1
 JAW_PER_WEIGHT = float(ARKIT.basis[ARKIT.names.index("jawOpen"), JAW])
 FAPS = json.dumps([0.0] * JAW + [0.5 * JAW_PER_WEIGHT] + [0.0] * (NUM_FAPS - JAW - 1))
 TAKE = "Timecode,BlendShapeCount,JawOpen,HeadYaw\n"
+TABS = "time_s\tjawOpen\r\n0\t0\r\n0,02\t0,5\r\n\t\r\n"
 FIRST_LINE = '{"time_s": 0, "arkit": {"jawOpen": 0}}\n'
-RECORDINGS = {
+RECORDINGS: dict[str, str | bytes] = {
     "shapes": "time_s,jawOpen\n0,0\n0.02,0.5\n",
     "case of the titles": "Time_S,jawOpen,Phone\n0,0,a\n0.02,0.5,a\n",
     "empty lines": "time_s,jawOpen\r\n\r\n0,0\r\n0.02,0.5\r\n,\r\n",
+    "semicolons, from Excel": "sep=;\ntime_s;jawOpen\n0;0\n0,02;0,5\n;\n",
+    "tabs": TABS,
+    "UTF-16": TABS.encode("utf-16"),
+    "UTF-16, big-endian": ("\ufeff" + TABS).encode("utf-16-be"),
     "json": FIRST_LINE + '\n{"time_s": 0.02, "arkit": {"jawOpen": 0.5}}\n',
     "json of FAPs": f'{{"time_s": 0, "faps": {FAPS}}}\n{{"time_s": 0.02, "faps": {FAPS}}}\n',
     "take": TAKE + "13:13:04:59.5,61,0,0\n13:13:05:00.7,61,0.5,0\n",
@@ -30,7 +36,7 @@ RECORDINGS = {
     "take over midnight": TAKE + "23:59:59:59.0,61,0,0\n00:00:00:00.0,61,0.5,0\n",
     "take that loses the face": TAKE + "1:0:0:00.0,61,0,0\n1:0:0:01.0,0,,\n1:0:0:02.0,61,0.5,0\n",
 }
-REJECTED = {
+REJECTED: dict[str, str | bytes] = {
     "an empty file": "",
     "no times": "frame,jawOpen\n0,0.5\n",
     "no frames": "time_s,jawOpen\n",
@@ -50,46 +56,51 @@ REJECTED = {
 JAVASCRIPT = """
 import { readFileSync } from "node:fs";
 import { readRecording } from "./recording.js";
-const read = (text) => {
+const read = (base64) => {
   try {
-    return readRecording(text);
+    return readRecording(Buffer.from(base64, "base64"));
   } catch ({ name, message }) {
     return { error: `${name}: ${message}` };
   }
 };
-const texts = JSON.parse(readFileSync(0, "utf8"));
+const recordings = JSON.parse(readFileSync(0, "utf8"));
 const toArray = (_, value) => ArrayBuffer.isView(value) ? [...value] : value;
-console.log(JSON.stringify(texts.map(read), toArray));
+console.log(JSON.stringify(recordings.map(read), toArray));
 """
 
 
 @pytest.fixture(scope="module")
-def in_javascript() -> dict[str, Any]:
-    """Return what JavaScript reads from all recordings, by their texts."""
-    texts = [*RECORDINGS.values(), *REJECTED.values()]
+def in_javascript() -> dict[str | bytes, Any]:
+    """Return what JavaScript reads from all recordings, by their contents."""
+    recordings = [*RECORDINGS.values(), *REJECTED.values()]
     result = subprocess.run(
         [NODE, "--input-type=module", "-e", JAVASCRIPT],
-        input=json.dumps(texts),
+        input=json.dumps([b64encode(to_bytes(recording)).decode() for recording in recordings]),
         stdout=subprocess.PIPE,
         encoding="utf-8",
         cwd=ROOT / "clients" / "javascript",
         check=True,
     )
-    return dict(zip(texts, json.loads(result.stdout), strict=True))
+    return dict(zip(recordings, json.loads(result.stdout), strict=True))
 
 
-def write(folder: Path, text: str) -> Path:
-    path = folder / ("face.jsonl" if text.startswith("{") else "face.csv")
-    path.write_text(text, encoding="utf-8", newline="")
+def to_bytes(recording: str | bytes) -> bytes:
+    return recording.encode() if isinstance(recording, str) else recording
+
+
+def write(folder: Path, recording: str | bytes) -> Path:
+    content = to_bytes(recording)
+    path = folder / ("face.jsonl" if content.startswith(b"{") else "face.csv")
+    path.write_bytes(content)
     return path
 
 
-@pytest.mark.parametrize("text", RECORDINGS.values(), ids=RECORDINGS)
+@pytest.mark.parametrize("recording", RECORDINGS.values(), ids=RECORDINGS)
 def test_both_read_the_same_frames(
-    tmp_path: Path, in_javascript: dict[str, Any], text: str
+    tmp_path: Path, in_javascript: dict[str | bytes, Any], recording: str | bytes
 ) -> None:
-    animation = read_table(write(tmp_path, text))
-    read = in_javascript[text]
+    animation = read_table(write(tmp_path, recording))
+    read = in_javascript[recording]
     column, unit = (JAW, 1.0) if read["names"] is None else (0, JAW_PER_WEIGHT)
     first, *_, (last_time, last) = read["frames"]
     assert read["names"] is None or read["names"][0] == "jawOpen"
@@ -100,10 +111,10 @@ def test_both_read_the_same_frames(
     assert last[column] * unit == pytest.approx(0.5 * JAW_PER_WEIGHT)
 
 
-@pytest.mark.parametrize("text", REJECTED.values(), ids=REJECTED)
+@pytest.mark.parametrize("recording", REJECTED.values(), ids=REJECTED)
 def test_both_reject_an_unclear_recording(
-    tmp_path: Path, in_javascript: dict[str, Any], text: str
+    tmp_path: Path, in_javascript: dict[str | bytes, Any], recording: str | bytes
 ) -> None:
     with pytest.raises(UserError):
-        read_table(write(tmp_path, text))
-    assert in_javascript[text].get("error", "").startswith("Error: "), in_javascript[text]
+        read_table(write(tmp_path, recording))
+    assert in_javascript[recording].get("error", "").startswith("Error: "), in_javascript[recording]

@@ -28,7 +28,7 @@ viewer.send({ expressions: { joy: 0.5 } });
 viewer.close();
 
 const [[time, values]] = readRecording("").frames;
-console.log(time, values.length);
+console.log(time, values.length, readRecording(new ArrayBuffer(0)).names);
 
 const face: KouxingFace = document.createElement("kouxing-face");
 face.addEventListener("session", ({ detail }) => console.log(detail.epoch));
