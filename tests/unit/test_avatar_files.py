@@ -62,6 +62,11 @@ def transform(kind: str, document: dict[str, Any], _binary: bytearray) -> None:
     wrap_scene(document, **TRANSFORMS[kind])
 
 
+def no_scenes(document: dict[str, Any], _binary: bytearray) -> None:
+    wrap_scene(document, **TRANSFORMS["sideways"])
+    del document["scene"], document["scenes"]
+
+
 def one_eye_mirrored(document: dict[str, Any], binary: bytearray) -> None:
     node = next(node for node in document["nodes"] if node["name"] == "eye_right")
     primitive = document["meshes"][node["mesh"]]["primitives"][0]
@@ -160,7 +165,7 @@ def _replace_by_compressed(
 @pytest.mark.parametrize(
     "change",
     [
-        *(names_in_primitives, names_in_accessors, one_eye_mirrored, lights),
+        *(names_in_primitives, names_in_accessors, no_scenes, one_eye_mirrored, lights),
         *(texture_of_an_extension, null_binds, data_uri, draco),
         partial(draco, create_metadata=True),
         partial(compress_with_meshopt, "NONE", "TRIANGLES"),

@@ -232,10 +232,14 @@ class GlbFile:
         return self._uri(str(image["uri"])) if "uri" in image else b""
 
     def nodes(self) -> list[tuple[int, Float64]]:
-        """Return the nodes of the scene with their world matrices (4, 4), parents first."""
-        scenes = self.json.get("scenes", [])
+        """Return the nodes of the scene with their world matrices (4, 4), parents first.
+
+        A file without scenes has one scene, with all nodes.
+        """
+        nodes, scenes = self.json.get("nodes", []), self.json.get("scenes", [])
+        children = {child for node in nodes for child in node.get("children", [])}
         scene = scenes[self.json.get("scene", 0)] if scenes else {}
-        roots = scene.get("nodes", range(len(self.json.get("nodes", []))))
+        roots = scene.get("nodes", [node for node in range(len(nodes)) if node not in children])
         queue = [(int(root), np.eye(4)) for root in roots]
         worlds: dict[int, Float64] = {}
         while queue:
