@@ -30,7 +30,7 @@ class SendersApi:
     def __init__(
         self, urls: Iterable[str], on_started: Callable[[], None], *, idle_motion: bool
     ) -> None:
-        self._configured = {url: parse_target(url) for url in urls}
+        self._configured = {target.url: target for target in map(parse_target, urls)}
         self._on_started = on_started
         self.pool = SenderPool(_log_problem, idle_motion=idle_motion)
         for target in self._configured.values():
@@ -54,7 +54,7 @@ class SendersApi:
                     self.pool.start(self._allowed_target(url))
                     self._on_started()
                 case [("stop", str(url))]:
-                    self.pool.stop(url)
+                    self.pool.stop(parse_target(url).url)
                 case [("delay_ms", int() | float() as delay_ms)] if not isinstance(delay_ms, bool):
                     self.pool.set_delay(parse_delay_s(delay_ms))
                 case _:
@@ -68,7 +68,7 @@ class SendersApi:
 
     def _allowed_target(self, url: str) -> Target:
         target = parse_target(url)
-        if target.is_local or url in self._configured:
+        if target.is_local or target.url in self._configured:
             return target
         if not is_loopback(target.host):
             raise UserError(

@@ -6,7 +6,7 @@ has the name of the protocol. Its value is the ``package:Class`` of a ``TargetCo
 
 from functools import lru_cache
 from pkgutil import resolve_name
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
 
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
@@ -68,7 +68,7 @@ def parse_target(url: str) -> Target:
     options = _parse_options(url, parts.query, protocol)
     try:
         target = Target(
-            url=url,
+            url=_normalize(parts, host, protocol.default_port),
             protocol=parts.scheme,
             frame_contents=protocol.contents,
             host=host,
@@ -80,6 +80,14 @@ def parse_target(url: str) -> Target:
     except UserError as error:
         raise UserError(f"{url}: {error}") from None
     return target
+
+
+def _normalize(parts: SplitResult, host: str, default_port: int) -> str:
+    """Return the one spelling of an address: always with the host, and without the default port."""
+    address = f"[{host}]" if ":" in host else host
+    if parts.port not in (None, default_port):
+        address += f":{parts.port}"
+    return urlunsplit((parts.scheme, address, "", parts.query, ""))
 
 
 def _address_error(url: str) -> UserError:

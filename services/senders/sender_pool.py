@@ -34,7 +34,7 @@ Result = TypeVar("Result")
 class SenderState:
     """The state of a sender for display."""
 
-    target: str  # address, as given
+    target: str  # its ``url``
     delay_ms: float  # additional delay of each frame
     contents: str  # description of the data
     rate_hz: float  # frames per second, over the last 2 s
@@ -111,7 +111,7 @@ class SenderPool:
         self._call(lambda: self._start(target))
 
     def stop(self, url: str) -> None:
-        """Stop sending to a target."""
+        """Stop sending to a target, given by its ``Target.url``."""
         self._call(lambda: self._stop(url))
 
     def set_delay(self, delay_s: float) -> None:

@@ -13,7 +13,7 @@ MAX_DELAY_MS = 10_000.0
 class Target:
     """A program that receives the face."""
 
-    url: str  # as entered; identifies the target
+    url: str  # identifies the target; equal for all spellings of its address
     protocol: str  # one of ``protocols.protocols``
     frame_contents: str  # what a frame contains; empty: the shapes
     host: str

@@ -388,7 +388,7 @@ async def test_the_newest_face_is_sent_to_another_program(
             assert state["delay_ms"] == 0
             async with http.post(senders, json={"delay_ms": 90}) as answer:
                 assert [sender["delay_ms"] for sender in (await answer.json())["senders"]] == [90]
-            async with http.post(senders, json={"stop": url}) as answer:
+            async with http.post(senders, json={"stop": f"{url}/"}) as answer:
                 assert await answer.json() == {"senders": [], "stopped": []}
 
 

@@ -176,6 +176,7 @@ def test_only_trusted_origins_may_connect(
     ("url", "headers", "status"),
     [
         ("vmc://192.0.2.7", {}, 200),  # in the configuration
+        ("VMC://192.0.2.7:39540/", {}, 200),
         ("vmc://192.0.2.7:39539", {}, 422),
         ("vmc://evil.example", {}, 422),
         ("vmc://127.0.0.1:39539", {"Origin": "https://evil.example"}, 403),

@@ -164,6 +164,20 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
 
 
 @pytest.mark.parametrize(
+    ("url", "others"),
+    [
+        ("vmc://127.0.0.1", ["vmc://", "VMC://127.0.0.1/", "vmc://127.0.0.1:39540?"]),
+        ("vmc://127.0.0.1:39541", ["vmc://:39541", "vmc://127.0.0.1:39541/"]),
+        ("osc://pc.local?prefix=/A/&delay=2", ["OSC://PC.local:9000/?prefix=/A/&delay=2"]),
+        ("vts://[::1]", ["vts://[::1]:8001", "VTS://[::1]/"]),
+    ],
+)
+def test_all_spellings_of_an_address_are_one_target(url: str, others: list[str]) -> None:
+    assert [parse_target(other) for other in others] == [parse_target(url)] * len(others)
+    assert parse_target(url).url == url
+
+
+@pytest.mark.parametrize(
     ("url", "reason"),
     [
         ("vmc", "write vmc://HOST"),
