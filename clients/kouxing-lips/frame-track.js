@@ -1,15 +1,19 @@
 // The newest frames, from which the face at any time is interpolated.
 
-const MAX_S = 60; // older frames are dropped
-
 export class FrameTrack {
   #frames = []; // by ascending time
+  #durationS;
+
+  /** Frames older than a duration are dropped. */
+  constructor(durationS) {
+    this.#durationS = durationS;
+  }
 
   /** Append frames { timeS, faps, ... } of the engine. */
   push(frames) {
     for (const frame of frames) this.#frames.push(frame); // may be too many for spread arguments
-    const first = this.#frames.findIndex(({ timeS }) => timeS >= this.#frames.at(-1).timeS - MAX_S);
-    this.#frames.splice(0, first);
+    const startS = this.endS - this.#durationS;
+    this.#frames.splice(0, this.#frames.findIndex(({ timeS }) => timeS >= startS));
   }
 
   /** Time of the newest frame, seconds; minus infinity before the first. */
@@ -21,8 +25,12 @@ export class FrameTrack {
   at(timeS) {
     const frames = this.#frames;
     if (frames.length === 0) return null;
-    let after = frames.length; // the newest frames are near the end
-    while (after > 0 && frames[after - 1].timeS > timeS) after--;
+    let [first, after] = [0, frames.length]; // the first frame after the time is in this range
+    while (first < after) {
+      const middle = Math.floor((first + after) / 2);
+      if (frames[middle].timeS > timeS) after = middle;
+      else first = middle + 1;
+    }
     if (after === 0) return frames[0];
     if (after === frames.length) return frames.at(-1);
     return mix(frames[after - 1], frames[after], timeS);

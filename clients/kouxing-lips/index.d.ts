@@ -30,7 +30,10 @@ export class LipSync extends EventTarget {
   readonly node: AudioNode | null;
   /** The face to show now; null before the first frame. */
   readonly current: LipFrame | null;
-  /** Return the face at a time of the session, seconds; null before the first frame. */
+  /**
+   * Return the face at a time of the session, seconds, or the nearest face that is kept; null before the first frame.
+   * The last hour of pushed audio is kept, and the last minute of a source of listenTo().
+   */
   at(timeS: number): LipFrame | null;
   /**
    * Follow the microphone. Rejects with a message for the user if it cannot be opened, and with an AbortError in the same cases as

@@ -7,7 +7,10 @@ const SHOW_AFTER_S = 0.1; // time from the sound to its face: the lips' delay, b
 const DEFAULT_SHAPES = ["arkit"];
 const OPTIONS = ["models", "phones", "context", "shapes", "expressiveness", "feeling", "delayMs"];
 const MAX_LATE_S = 0.5; // maximum time from the sound to its face
+const LIVE_TRACK_S = 60; // duration of the frames that are kept
+const PUSHED_TRACK_S = 3600; // of push(), whose audio may arrive long before its face is shown
 const TELEPHONE_HZ = 8000;
+const CLICKS = ["pointerdown", "keydown"]; // events in which browsers allow sound to start
 const MODELS = new URL("models/", import.meta.url);
 
 const TEXTS = {
@@ -30,7 +33,7 @@ export class LipSync extends EventTarget {
   #context;
   #ownsContext;
   #session = 0; // number of the newest
-  #track = new FrameTrack();
+  #track = new FrameTrack(LIVE_TRACK_S);
   #source = null; // { node, release() }
   #choice = 0; // number of the newest choice of a source, or of none
   #startS = null; // start of the session on the context's clock; null before the first sound, and for push()
@@ -152,10 +155,9 @@ export class LipSync extends EventTarget {
     if (this.context.state === "running") return;
     const started = this.context.resume();
     const isBlocked = await Promise.race([started.then(() => false), new Promise((done) => setTimeout(done, 300, true))]);
-    if (!isBlocked) return;
+    if (!isBlocked || this.#isClosed) return;
     this.#report(TEXTS.suspended);
-    const retry = () => this.#context?.resume();
-    for (const type of ["pointerdown", "keydown"]) document.addEventListener(type, retry, { once: true });
+    for (const type of CLICKS) document.addEventListener(type, this.#resumeContext, { once: true });
   }
 
   /** The face to show now, for sound from listenTo(): { faps, arkit, ... }; null before the first. */
@@ -182,6 +184,7 @@ export class LipSync extends EventTarget {
     this.stop();
     this.#supersede();
     document.removeEventListener("visibilitychange", this.#onVisibility);
+    for (const type of CLICKS) document.removeEventListener(type, this.#resumeContext);
     this.#worker.terminate();
     this.#context?.removeEventListener("statechange", this.#onContextState);
     if (this.#ownsContext) this.#context?.close();
@@ -245,7 +248,7 @@ export class LipSync extends EventTarget {
   }
 
   async #open(options, input = null) {
-    this.#track = new FrameTrack();
+    this.#track = new FrameTrack(input ? LIVE_TRACK_S : PUSHED_TRACK_S);
     this.#startS = null;
     const session = ++this.#session;
     const message = { type: "open", session, options: { ...this.#options, ...options }, input };
@@ -321,7 +324,11 @@ export class LipSync extends EventTarget {
   #onVisibility = () => {
     if (this.#source === null) return;
     if (document.hidden) this.#report(TEXTS.hidden);
-    else this.#context?.resume();
+    else this.#resumeContext();
+  };
+
+  #resumeContext = () => {
+    this.#context.resume().catch(() => {}); // the page has closed its context
   };
 
   #report(text) {

@@ -3,7 +3,7 @@
 import { LipEngine } from "./engine/engine.js";
 import { loadModel } from "./engine/model.js";
 
-let model = null; // a promise
+let model = null;
 let engine = null; // the engine of the newest session
 let port = null; // port of the audio thread
 

@@ -273,6 +273,50 @@ test("a buffer that is replaced does not report its end", async () => {
   assert.equal(numEnded, 1);
 });
 
+test("the face of two pushed minutes is known from the start", async () => {
+  const lips = await LipSync.create();
+  const opened = lips.open(16000);
+  FakeWorker.newest.answer("opened");
+  await opened;
+  const frames = [0, 1, 119, 120].map((timeS) => ({ timeS, faps: Float32Array.of(timeS) }));
+  FakeWorker.newest.onmessage({ data: { type: "frames", session: 1, frames, phones: [], startS: null } });
+  assert.equal(lips.at(0.5).faps[0], 0.5);
+});
+
+const closedContext = async () => {
+  throw new DOMException("the context is closed", "InvalidStateError");
+};
+
+test("a click after close() does not resume the sound", async (t) => {
+  const lips = await LipSync.create({ context });
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  context.state = "suspended";
+  context.resume = () => new Promise(() => {});
+  const resuming = lips.resume();
+  t.mock.timers.tick(1000);
+  await resuming;
+  lips.close();
+  context.resume = t.mock.fn(closedContext);
+  globalThis.document.dispatchEvent(new Event("pointerdown"));
+  assert.equal(context.resume.mock.callCount(), 0);
+});
+
+test("a click or a visible tab has no effect if the page has closed its context", async (t) => {
+  const lips = await LipSync.create({ context });
+  await followMicrophone(lips);
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  context.state = "suspended";
+  context.resume = () => new Promise(() => {});
+  const resuming = lips.resume();
+  t.mock.timers.tick(1000);
+  await resuming;
+  context.resume = t.mock.fn(closedContext);
+  globalThis.document.dispatchEvent(new Event("visibilitychange"));
+  globalThis.document.dispatchEvent(new Event("keydown"));
+  await new Promise(setImmediate); // an unhandled rejection fails the test
+  assert.equal(context.resume.mock.callCount(), 2);
+});
+
 test("HeadAudio loads its models once if loadModel() is called twice", async () => {
   globalThis.GainNode = class extends AudioNode {
     context = context;
