@@ -33,7 +33,7 @@ class SessionFollower(Follower):
             session_start.session,
             handlers.keys(),
             self._handle,
-            live=session_start.opening.paced,
+            is_paced=session_start.opening.paced,
             on_complete=lambda: service.session_started(self.session_start),
             on_new_epoch=on_new_epoch,
         )

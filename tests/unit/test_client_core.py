@@ -236,7 +236,7 @@ def test_an_unknown_session_ends_unless_it_moves() -> None:
 @pytest.mark.parametrize("cause", ["moved", "replaced", "ended"])
 def test_asks_where_a_silent_session_of_another_program_is(cause: str) -> None:
     harness = CoreHarness()
-    following = harness.core.follow("other", is_live=True)
+    following = harness.core.follow("other", is_paced=True)
     endpoints = {"audio": "a", "phones": "phones 1", "faps": "faps 1"}
     state = {**STATE, "session": "other", "session_id": ID, "endpoints": endpoints}
     harness.answer("status-report", services=[CONTROL_STATE], sessions=[state])

@@ -52,7 +52,7 @@ class AsyncClient(BaseClient):
 
     async def follow(self, name: str = "", *, paced: bool = True) -> AsyncSession:
         """Follow another program's session, as ``Client.follow``."""
-        followed = self._thread.submit(lambda core: core.follow(name, is_live=paced))
+        followed = self._thread.submit(lambda core: core.follow(name, is_paced=paced))
         return AsyncSession(self._thread, await asyncio.wrap_future(followed), None)
 
     async def status(self, session: str = "") -> Status:

@@ -243,7 +243,7 @@ class BaseSession:
         """
         check_results(classes, shape_set)
         thread, core = self._thread, self._core
-        inbox = Inbox(MAX_UNREAD_RESULTS if core.is_live and not keep_all else None)
+        inbox = Inbox(MAX_UNREAD_RESULTS if core.is_paced and not keep_all else None)
         subscription = Subscription(core, classes, shape_set, inbox, on_result)
         thread.call(lambda: core.subscribe(subscription))
         inbox.errors = core.errors

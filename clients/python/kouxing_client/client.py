@@ -67,7 +67,7 @@ class Client(BaseClient):
         If ``paced`` is true and this process was stalled, outdated frames are dropped. Use this
         to show a live face. If ``paced`` is false, every result is delivered, even if it is late.
         """
-        core = self._thread.submit(lambda core: core.follow(name, is_live=paced)).result()
+        core = self._thread.submit(lambda core: core.follow(name, is_paced=paced)).result()
         return Session(self._thread, core, None)
 
     def status(self, session: str = "") -> Status:

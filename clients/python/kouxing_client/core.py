@@ -113,17 +113,17 @@ class ClientCore:
 
     def open_session(self, options: Fields) -> Future[SessionCore]:
         """Open a session; the options are the fields of ``open-session``."""
-        is_live = bool(options.get("paced", True))
+        is_paced = bool(options.get("paced", True))
         return map_future(
             self.request("open-session", **options),
-            lambda opened: self._add(opened, options, is_live=is_live),
+            lambda opened: self._add(opened, options, is_paced=is_paced),
         )
 
-    def follow(self, name: str, *, is_live: bool) -> Future[SessionCore]:
+    def follow(self, name: str, *, is_paced: bool) -> Future[SessionCore]:
         """Follow a session that another program opened; if the name is empty, the newest."""
 
         def add(status: Status) -> SessionCore:
-            return self._add(newest_session(status, name), None, is_live=is_live)
+            return self._add(newest_session(status, name), None, is_paced=is_paced)
 
         return map_future(self.status(""), add)  # with the endpoint of control's events
 
@@ -228,8 +228,8 @@ class ClientCore:
             else "rejects this client: 'insecure' is set here but not there, or its log says why"
         )
 
-    def _add(self, opened: Fields, options: Fields | None, *, is_live: bool) -> SessionCore:
-        session = SessionCore(self._sockets, opened, options, is_live=is_live)
+    def _add(self, opened: Fields, options: Fields | None, *, is_paced: bool) -> SessionCore:
+        session = SessionCore(self._sockets, opened, options, is_paced=is_paced)
         if self._events is None:
             self._events = self._sockets.connect_events(opened["events"], self._on_event)
         self.sessions.append(session)

@@ -60,9 +60,10 @@ class Follower:
     ----------
     classes
         Classes of messages to subscribe to.
-    live
-        Whether late frames are worthless. If so, and this process was stalled, only the newest
-        ``MAX_HELD_FRAMES`` of the queued frames are delivered.
+    is_paced
+        Whether the session's audio arrives in real time, so that late frames are worthless. If so,
+        and this process was stalled, only the newest ``MAX_HELD_FRAMES`` of the queued frames are
+        delivered.
     on_complete
         Called when every publisher has confirmed: no later message is missed. Called again after
         each ``start``.
@@ -77,7 +78,7 @@ class Follower:
         classes: Collection[type[Message]],
         on_message: Callable[[Any], None],
         *,
-        live: bool = True,
+        is_paced: bool = True,
         on_complete: Callable[[], None] = lambda: None,
         on_new_epoch: Callable[[], None] = lambda: None,
     ) -> None:
@@ -91,7 +92,7 @@ class Follower:
         self._transport = transport
         self._classes = classes
         self._on_message = on_message
-        self._live = live
+        self._is_paced = is_paced
         self._on_complete = on_complete
         self._on_new_epoch = on_new_epoch
         self._connection: object | None = None
@@ -131,7 +132,7 @@ class Follower:
         stays = bool(addresses & self._addresses)
         has_incomplete = self._old_connection is not None and not self.is_complete
         replaced, self._live_addresses = self._connection, set()
-        if self._live and "faps" in names:
+        if self._is_paced and "faps" in names:
             self._live_addresses = {endpoints["faps"]}
         self._addresses = addresses
         if has_incomplete and replaced is not None:
@@ -235,7 +236,7 @@ class Follower:
                 self._receive(message)
 
     def _receive(self, message: Message) -> None:
-        if self._live and isinstance(message, FapFrame) and self._is_catching_up():
+        if self._is_paced and isinstance(message, FapFrame) and self._is_catching_up():
             self._held_frames.append(message)
         else:
             self._deliver_held()

@@ -81,7 +81,7 @@ class Subscription:
             session.name,
             needed | {Speech} if Phone in classes else needed,
             self._on_message,
-            live=session.is_live,
+            is_paced=session.is_paced,
             on_complete=self._on_complete,
         )
         self._end_deadline_s = math.inf
@@ -174,8 +174,8 @@ class SessionCore:
         Control's answer: ``session``, ``epoch``, and endpoints by name.
     options
         Fields of ``open-session``; None if another program opened the session.
-    is_live
-        Whether results are worthless when they are late.
+    is_paced
+        Whether the audio arrives in real time, so that late results are worthless.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class SessionCore:
         opened: Fields,
         options: Fields | None,
         *,
-        is_live: bool,
+        is_paced: bool,
     ) -> None:
         self.sockets = sockets
         self.endpoints = opened
@@ -192,10 +192,10 @@ class SessionCore:
         self.epoch: int = opened["epoch"]
         self.session_id: str | None = opened.get("session_id")
         self.token: str = opened.get("token", "")
-        self.is_live = is_live
+        self.is_paced = is_paced
         self.stream: AudioStream | None = None
         if options is not None:
-            self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_live)
+            self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_paced)
         self.signal = Signal()  # notified of changes
         self.errors: deque[Refused] = deque()  # errors about the audio
         self.failure: KouxingError | None = None  # reason for the end; None: closed
