@@ -146,7 +146,7 @@ def check_output(
             continue
         path, *others = [output] if isinstance(output, Path) else output
         if str(path) == "-":
-            raise UserError("-: the output needs a name; standard output is not supported")
+            raise UserError("-: cannot write to standard output; name a file")
         is_new = not _exists(path)
         for file in () if is_new else (path, *others):
             if any(file.samefile(source) for source in sources):

@@ -109,7 +109,7 @@ def test_shows_the_measured_delay(browser: Browser) -> None:
     browser.click("microphone")
     browser.wait_for(IS_LIVE)
     browser.wait_for(rf"/(live \d+ m|behind.* \d+\.\d )s/.test({STATUS})")
-    # A frame is made 60 ms after its sound; the first number of the label is the delay.
+    # Each frame comes 60 ms after its sound; the first number of the label is the delay.
     assert browser.evaluate("window.kouxing.state.voiceToImageMs") > 60
     assert browser.evaluate(rf"Number(({STATUS}.match(/live (\d+) ms/) ?? [0, 61])[1])") > 60
 

@@ -132,7 +132,7 @@ def test_pictures_of_heads_are_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_standard_output_is_not_a_file() -> None:
-    with pytest.raises(UserError, match="the output needs a name"):
+    with pytest.raises(UserError, match="cannot write to standard output; name a file"):
         check_output(Path("-"))
 
 

@@ -112,7 +112,7 @@ const CHINESE = {
   "VTube Studio is asking whether kouxing may move the model; press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
   "VTube Studio's API is off; turn on 'Start API (allow plugins)' in its settings":
     "VTube Studio 的 API 未打开，请在其设置中打开“Start API (allow plugins)”",
-  "access to VTube Studio was denied; to be asked again, stop sending and start again": "VTube Studio 拒绝了访问；停止后再开始发送会重新询问",
+  "access to VTube Studio was denied; to get the prompt again, stop and restart sending": "VTube Studio 拒绝了访问；停止后再开始发送会重新询问",
   "the program at this address is not VTube Studio": "此地址的程序不是 VTube Studio",
   "another plugin sets the same parameters: {text}": "另一个插件在设置同样的参数：{text}",
   "VTube Studio closed the connection; trying again": "VTube Studio 断开了连接，正在重试",
