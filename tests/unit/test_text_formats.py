@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from kouxing.services.cli.texts.spoken_text import read_spoken_text, read_transcript
-from kouxing.services.cli.texts.text_formats import decode_text, extract_text
+from kouxing.services.cli.texts.text_encoding import decode_text
+from kouxing.services.cli.texts.text_formats import extract_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
 from tests.languages import MANDARIN
@@ -171,6 +172,10 @@ def test_extracts_the_spoken_text(form: str) -> None:
         ("00:01～00:03 你好", "你好"),
         ("00:30出发", "零点三十分出发"),
         ("0:30 --> 0:40 你好", "你好"),
+        ("0:30 --> 0:40 你好\n0:40 --> 0:50 再见\n", "你好再见"),
+        ("1\n00:00:00,400 --> 00:00:01,000\n2\n00:00:01,200 --> 00:00:02,000\n你好\n", "你好"),
+        ("WEBVTT\n\n00:00.400 --> 00:01.000\n00:01.200 --> 00:02.000\n你好\n", "你好"),
+        ("[0.4 - 3.0] 大家好\n(0:03) 你好\n", "大家好你好"),
         ("[00:01.00]大[00:01.40]家 [00:02.00]好\n[00:03.00]你好", "大家好你好"),
         ("SPEAKER_00: 大家好\nSPEAKER_01: 你好", "大家好你好"),
         ("Speaker 1  00:05: 大家好", "大家好"),
@@ -201,6 +206,11 @@ def test_reads_times_only_where_they_are_spoken(text: str, spoken_text: str) -> 
     assert "".join(syllable.text for syllable in transcript.syllables) == spoken_text
 
 
+def test_text_next_to_the_times_of_a_cue_is_spoken() -> None:
+    cues = "00:00.400 --> 00:01.000 align:start line:80%\nHello\n\n0:01 --> 0:02 Anna: hi\n"
+    assert extract_text(cues).text == "Hello\nAnna: hi"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -208,6 +218,7 @@ def test_reads_times_only_where_they_are_spoken(text: str, spoken_text: str) -> 
         ("Scenarist_SCC V1.0\n\n00:00:00:00 9420", "SCC captions"),
         ('{"phones": []}', "JSON without"),
         ('{"text": ', "not valid JSON"),
+        ('{"text":' + "[" * 900 + '"a"' + "]" * 900 + "}", "JSON without"),
         ("大家好 at 00:00:03.200 请看", "times in an unknown format"),
         (
             TEXTS["TextGrid"].replace(ONE, "da").replace('"请看我的""嘴唇""。"', '"jia"'),
@@ -235,7 +246,46 @@ def test_rejects_a_format_by_its_name(text: str, message: str) -> None:
 )
 def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
     text = "歡迎收聽，我們會請你看嘴唇怎麼動。" if encoding == "big5" else f"\n{ONE}{TWO} 123"
-    assert decode_text(text.encode(encoding)) == (text, form)
+    assert decode_text(text.encode(encoding), "mandarin") == (text, form)
+
+
+@pytest.mark.parametrize(
+    ("language", "text", "encoding"),
+    [
+        ("french", "La fenêtre est grande", "cp1252"),
+        ("german", "Übung macht den Meister", "cp1252"),
+        ("spanish", "¿Qué tal? ¡Él!", "cp1252"),
+        ("polish", "Zażółć gęślą jaźń", "cp1250"),
+        ("russian", "Доброе утро", "cp1251"),
+        ("turkish", "İyi günler, ağabey", "cp1254"),
+        ("japanese", "おはようございます。", "cp932"),
+        ("japanese", "おはようございます。", "euc-jp"),
+        ("korean", "안녕하세요", "cp949"),
+        ("universal", "La fenêtre est grande", "cp1252"),
+        ("universal", "niños y año", "cp1252"),
+        ("universal", "A和B都有iPhone", "gb18030"),
+        ("mandarin", "x和y都大。", "gb18030"),
+        ("mandarin", "歡迎看 Unity、Godot 的人", "big5"),
+        ("cantonese", "歡迎收聽", "big5"),
+    ],
+)
+def test_an_encoding_depends_on_the_language(language: str, text: str, encoding: str) -> None:
+    assert decode_text(text.encode(encoding), language) == (text, encoding.upper())
+
+
+def test_rejects_an_encoding_that_the_language_does_not_have() -> None:
+    with pytest.raises(UserError, match=r"encoding is unknown; save .* in UTF-8"):
+        decode_text("été".encode("cp1252"), "hindi")
+
+
+def test_reads_a_file_in_the_encoding_of_its_language(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "said.txt"
+    path.write_bytes("Mädchen".encode("cp1252"))
+    transcript = read_transcript(str(path), load_inventory("german"))
+    assert [syllable.text for syllable in transcript.syllables] == ["Mädchen"]
+    assert "said.txt was read as CP1252" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -256,7 +306,7 @@ def test_rejects_a_file_that_is_not_text(content: bytes, name: str, tmp_path: Pa
 
 
 def test_a_text_may_start_like_an_audio_file() -> None:
-    assert decode_text(b"FORM and caffeine") == ("FORM and caffeine", "")
+    assert decode_text(b"FORM and caffeine", "english") == ("FORM and caffeine", "")
 
 
 def test_reads_a_subtitle_file_and_names_its_format(
@@ -336,8 +386,9 @@ def test_reads_pinyin_with_any_punctuation(text: str) -> None:
         ("<html>" + "<!--" * 500_000, ""),
         ("<html>" + "<title>" * 200_000 + "</x>" * 200_000, ""),
         ("# a\n" + "![" * 500_000, "a\n" + "![" * 500_000),
+        ("1.1" + " " * 500_000 + "a", "1.1" + " " * 500_000 + "a"),
     ],
 )
-def test_reads_damaged_markup_in_linear_time(text: str, spoken: str) -> None:
+def test_reads_damaged_text_in_linear_time(text: str, spoken: str) -> None:
     """The test would need hours otherwise."""
     assert extract_text(text).text.strip() == spoken.strip()

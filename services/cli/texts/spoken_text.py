@@ -4,7 +4,8 @@ import os
 import re
 from pathlib import Path
 
-from kouxing.services.cli.texts.text_formats import SpokenText, decode_text, extract_text
+from kouxing.services.cli.texts.text_encoding import DecodedText, decode_text
+from kouxing.services.cli.texts.text_formats import SpokenText, extract_text
 from kouxing.services.recognizer.offline.alignment import MIN_FIT, Alignment
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
@@ -38,7 +39,7 @@ def read_transcript(text: str, inventory: PhoneInventory) -> Transcript:
     Prints a message about words that cannot be read, and about a format with more than the text.
     Raises ``UserError`` if the file or the text cannot be read, or the text has no syllables.
     """
-    spoken = read_spoken_text(text)
+    spoken = read_spoken_text(text, inventory.language)
     for kind, limit, number in (
         ("characters", _MAX_CHARACTERS, len(spoken)),
         ("digits", _MAX_DIGITS, sum(map(str.isdigit, spoken))),
@@ -79,23 +80,24 @@ def print_mismatch(audio: Path, reason: str) -> None:
     )
 
 
-def read_spoken_text(text: str) -> str:
-    """Extract the spoken text from a text, or from the file that it names.
+def read_spoken_text(text: str, language: str = DEFAULT_LANGUAGE) -> str:
+    """Extract the spoken text from a text in a language, or from the file that it names.
 
     Prints the format if it is not plain text. Raises ``UserError`` if the file cannot be read, or
     its format is not supported.
     """
     path = _find_file(text)
     if path is None:
-        given = SpokenText(text) if _is_unicode(text) else decode_text(os.fsencode(text))
-        spoken, encoding = extract_text(given.text), given.format_name
+        is_unicode = _is_unicode(text)
+        decoded = DecodedText(text) if is_unicode else decode_text(os.fsencode(text), language)
+        spoken = extract_text(decoded.text)
     else:
         content = read_file(path, MAX_TEXT_BYTES)
         try:
-            spoken, encoding = _extract_from(content, path.suffix.lower())
+            decoded, spoken = _extract_from(content, path.suffix.lower(), language)
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
-    formats = [name for name in (spoken.format_name, encoding) if name]
+    formats = [name for name in (spoken.format_name, decoded.encoding) if name]
     if formats:
         name = "the text" if path is None else str(path)
         print_message(f"{name} was read as {' in '.join(formats)}")
@@ -124,9 +126,8 @@ def _find_file(text: str) -> Path | None:
     return None
 
 
-def _extract_from(content: bytes, suffix: str) -> tuple[SpokenText, str]:
+def _extract_from(content: bytes, suffix: str, language: str) -> tuple[DecodedText, SpokenText]:
     if suffix in _TABLE_SUFFIXES:
         raise UserError(f"this is a table ({suffix}); save the spoken text as a plain text file")
-    decoded = decode_text(content)
-    is_markdown = suffix in _MARKDOWN_SUFFIXES
-    return extract_text(decoded.text, is_markdown=is_markdown), decoded.format_name
+    decoded = decode_text(content, language)
+    return decoded, extract_text(decoded.text, is_markdown=suffix in _MARKDOWN_SUFFIXES)

@@ -1,0 +1,88 @@
+"""Extracts the spoken text from SSML, TTML, HTML, Markdown, and commands of a synthesizer."""
+
+import html
+import re
+
+from kouxing.services.cli.texts.text_columns import remove_columns
+from kouxing.shared.errors import UserError
+
+COMMAND = re.compile(  # [laughter], [pause:500], [S1], <#0.5#>, <|zh|>, and prosody: #1 to #4
+    r"\[/?[A-Za-z_]\w*(?:[ :=]+[\w.]+)?\]|<#[\d.]+#>|<\|[^|<>]*\|>|(?<=[^\0-\x7f])#[1-4](?!\d)"
+)
+MARKDOWN = re.compile(r"^#{1,6} |^```|\]\([^)\s]+\)", re.MULTILINE)
+TAG = re.compile(
+    r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--|&(?:[A-Za-z]{2,8}|#\d+|#x[0-9A-Fa-f]+);"
+)
+TIME_TAG = re.compile(r"<\d{1,3}:[\d:.]+>")
+_MARKUP = re.compile(  # matches in linear time
+    r"<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*)(?P<rest>[^<>]*)>|<[!?/][^<>]*>"
+    r"|(?P<data><?[^<]+|<)"
+)
+_ALIAS = re.compile(r"""\balias\s*=\s*(["'])(.*?)\1""", re.DOTALL)
+_UNSPOKEN_ELEMENTS = {
+    *("script", "style", "title", "template", "rt", "rp"),
+    *("metadata", "desc", "copyright", "lexicon", "styling", "layout"),
+}
+_LINE_ELEMENTS = {"br", "div", "h1", "h2", "h3", "h4", "li", "p", "s", "td", "text", "tr"}
+_MAX_OPEN = 100  # nested elements; each end tag searches all of them
+
+
+def read_commands(text: str) -> str:
+    """Remove commands of a synthesizer."""
+    return remove_columns(COMMAND.sub("", text))
+
+
+def read_markdown(text: str) -> str:
+    """Extract the text from Markdown, without metadata, code, pictures and rules."""
+    text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)  # metadata
+    text = re.sub(r"^(```|~~~).*?^\1[^\n]*$", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"!\[[^][]*\]\([^()]*\)", "", text)  # pictures
+    text = re.sub(r"\[([^][]*)\](?:\([^()]*\)|\[[^][]*\])", r"\1", text)  # links
+    lines = (line for line in text.split("\n") if "-" not in line or line.strip(" \t:|-"))
+    text = "\n".join(lines)  # without rules
+    text = re.sub(r"^[ \t]*(?:#{1,6}|>+|[-*+]|\d+[.)])[ \t]+", "", text, flags=re.MULTILINE)
+    return read_markup(re.sub(r"[*`|]|~~", "", text))
+
+
+def read_markup(text: str) -> str:
+    """Extract the text from SSML, TTML, HTML and subtitles with tags.
+
+    ``html.parser`` is not used, because it needs quadratic time for a damaged text. Entities that
+    a document defines are not expanded, so they cannot exhaust memory.
+    """
+    first, *others = TIME_TAG.sub("", text).split("<!--")
+    text = first + "".join(comment.partition("-->")[2] for comment in others)
+    first, *others = text.split("<![CDATA[")
+    sections = (other.partition("]]>") for other in others)
+    text = first + "".join(html.escape(plain) + rest for plain, _, rest in sections)
+    spoken: list[str] = []
+    unspoken: list[str] = []  # open elements whose text is not spoken
+    for match in _MARKUP.finditer(text):
+        if match["tag"]:
+            _handle_tag(match, spoken, unspoken)
+        elif not unspoken:
+            spoken.append(html.unescape(match["data"] or ""))
+    return "".join(spoken)
+
+
+def _handle_tag(tag: re.Match[str], spoken: list[str], unspoken: list[str]) -> None:
+    name = tag["tag"].lower().rpartition(":")[2]
+    if tag["end"]:
+        if name in unspoken:
+            del unspoken[unspoken.index(name) :]
+        return
+    if name in _LINE_ELEMENTS:
+        spoken.append("\n")
+    alias = _ALIAS.search(tag["rest"]) if name == "sub" else None
+    if alias and not unspoken:
+        spoken.append(html.unescape(alias[2]))
+    is_open = not tag["rest"].endswith("/") and len(unspoken) < _MAX_OPEN
+    if is_open and (name in _UNSPOKEN_ELEMENTS or alias):
+        unspoken.append(name)
+
+
+def reject_xml(text: str) -> str:
+    """Raise ``UserError`` with the name of the root element."""
+    root = re.search(r"<([A-Za-z][\w:.-]*)", text)
+    name = f" with the root element {root[1]!r}" if root else ""
+    raise UserError(f"this is XML{name}; keep only the spoken text")
