@@ -8,7 +8,7 @@ import { Player } from "./page/player.js";
 import { FapTrack } from "./page/playout.js";
 import { Sound } from "./page/sound.js";
 import { fetchFile, loadPuppet } from "./puppet.js";
-import { readRecording } from "./recording.js";
+import { readRecording, recordingClock } from "./recording.js";
 import { chooseSet } from "./shape-names.js";
 import { Viewer } from "./viewer.js";
 
@@ -141,11 +141,10 @@ export class KouxingFace extends HTMLElement {
     const { names, frames } = readRecording(bytes);
     const set = names === null ? "faps" : chooseSet(names);
     if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);
-    const startMs = performance.now();
     await audio?.play();
     await new Promise((onEnded) => {
       this.#recording?.onEnded();
-      const nowS = () => (audio ? audio.currentTime : (performance.now() - startMs) / 1000);
+      const nowS = recordingClock(audio);
       this.#recording = { names, frames, nowS, onEnded };
     });
   }
@@ -165,7 +164,7 @@ export class KouxingFace extends HTMLElement {
 
   async #loadLips() {
     const id = ++this.#lipsId;
-    const { LipSync } = await import("kouxing-lips");
+    const LipSync = await importLipSync();
     const [models, phones] = ["local", "phones"].map((name) => this.getAttribute(name));
     const lips = await LipSync.create({ shapes: ["arkit", "oculus", "vrm"], ...(models && { models }), ...(phones && { phones }) });
     if (id !== this.#lipsId) {
@@ -332,4 +331,15 @@ export class KouxingFace extends HTMLElement {
   }
 }
 
-customElements.define("kouxing-face", KouxingFace);
+/** Import the optional package. Bundlers only accept that it is missing inside a try block. */
+async function importLipSync() {
+  try {
+    const { LipSync } = await import("kouxing-lips");
+    return LipSync;
+  } catch (error) {
+    throw new Error(`the attribute local needs the package kouxing-lips; install it (${error.message})`, { cause: error });
+  }
+}
+
+// A page may load this module twice, for example in two bundles. The first element is kept.
+if (!customElements.get("kouxing-face")) customElements.define("kouxing-face", KouxingFace);

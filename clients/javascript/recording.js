@@ -36,6 +36,22 @@ function decodeText(bytes) {
   return new TextDecoder(encodings[(bytes[0] << 8) | bytes[1]]).decode(bytes);
 }
 
+/**
+ * Return a function that returns the time to show, seconds since the start of the recording.
+ *
+ * A recording may be longer than its audio, because the face returns to rest. After the audio, time continues.
+ *
+ * @param audio HTMLAudioElement that plays the sound; null for silence
+ * @param nowMs function that returns the page's time, ms
+ */
+export function recordingClock(audio, nowMs = () => performance.now()) {
+  let startMs = nowMs(); // of the silent part
+  return () => {
+    if (audio && !audio.ended) startMs = nowMs();
+    return (audio?.currentTime ?? 0) + (nowMs() - startMs) / 1000;
+  };
+}
+
 function readJsonLines(lines) {
   let [set, names] = ["", null];
   const frames = lines.map((line, number) => {

@@ -290,6 +290,12 @@ def test_the_web_component_reports_wrong_addresses(faces: Browser) -> None:
     faces.page_errors.clear()
 
 
+def test_a_page_may_load_the_web_component_twice(faces: Browser) -> None:
+    before = "customElements.get('kouxing-face') === own.constructor"
+    load = "import('/node_modules/kouxing-client/face.js?second')"
+    assert faces.evaluate(f"{load}.then(() => {before})")
+
+
 def test_the_web_component_turns_the_eyes_of_a_vrm_with_eye_bones(faces: Browser) -> None:
     script = """
         import('/node_modules/kouxing-client/puppet.js').then(async ({ loadPuppet }) => {

@@ -31,7 +31,7 @@ export async function loadModel(base, { phones = false } = {}) {
   const files = [...FILES, ...(phones ? [PHONES_FILE] : []), ...(phones === FINAL ? [BLOCKS_FILE] : [])];
   const folder = String(base).replace(/\/?$/, "/");
   const [encoder, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, folder))));
-  const model = JSON.parse(new TextDecoder().decode(header));
+  const model = parseHeader(header, folder);
   if (model.format !== FORMAT) {
     throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; export them again`);
   }
@@ -44,6 +44,15 @@ export async function loadModel(base, { phones = false } = {}) {
     encoder: new Network(encoder),
     blocks: blocks ? new Network(blocks) : null,
   };
+}
+
+/** A server may answer a wrong address with its start page, so a file that was loaded may be no model. */
+function parseHeader(bytes, folder) {
+  try {
+    return JSON.parse(new TextDecoder().decode(bytes));
+  } catch (error) {
+    throw new Error(`${folder}model.json is not a model; set the option models to the folder that contains the models`, { cause: error });
+  }
 }
 
 /** Return { shape, values } by name. */
@@ -60,7 +69,7 @@ function unpack(blob, entries) {
 async function readBytes(url) {
   try {
     if (url.protocol === "file:") {
-      const { readFile } = await import("node:fs/promises");
+      const { readFile } = await import(/* webpackIgnore: true */ "node:fs/promises");
       return new Uint8Array(new Uint8Array(await readFile(url)).buffer); // its own buffer starts at 0
     }
     const answer = await fetch(url);

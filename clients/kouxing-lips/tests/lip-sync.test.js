@@ -1,6 +1,7 @@
 // Sources that are stopped, closed or replaced while they open. The browser's parts are fakes.
 
 import assert from "node:assert/strict";
+import { readFile, readdir } from "node:fs/promises";
 import test from "node:test";
 import { runInNewContext } from "node:vm";
 import { loadModel } from "../engine/model.js";
@@ -118,6 +119,19 @@ test("a failed load ends the worker", async () => {
 test("the URL of the models may lack the slash at its end", async () => {
   for (const url of ["file:///nowhere/models", "file:///nowhere/models/"]) {
     await assert.rejects(loadModel(url), /cannot load file:\/\/\/nowhere\/models\/\w+\.\w+ .*set the option models/);
+  }
+});
+
+test("a start page instead of the models gives a clear error", async (t) => {
+  t.mock.method(globalThis, "fetch", async () => new Response("<!doctype html>"));
+  await assert.rejects(loadModel("http://localhost/models"), /http:\/\/localhost\/models\/model.json is not a model; set the option models/);
+});
+
+test("webpack leaves out the modules of Node", async () => {
+  const folder = new URL("../engine/", import.meta.url);
+  for (const name of await readdir(folder)) {
+    const source = await readFile(new URL(name, folder), "utf8");
+    assert.doesNotMatch(source, /(from |import\()"node:/, name);
   }
 });
 
