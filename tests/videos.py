@@ -17,4 +17,4 @@ def write_video(path: Path, *, has_sound: bool = True) -> None:
     with VideoWriter(path, 64, 48, _RATE_HZ, MEDIA_RATE_HZ if has_sound else None) as video:
         for _ in range(round(DURATION_S * _RATE_HZ)):
             video.write_image(np.full((48, 64, 3), 128, np.uint8))
-        video.write_sound((0.1 * np.sin(2 * np.pi * 440.0 * time_s)).astype(np.float32))
+        video.write_audio((0.1 * np.sin(2 * np.pi * 440.0 * time_s)).astype(np.float32))

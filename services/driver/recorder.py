@@ -68,12 +68,12 @@ class Recorder:
             )
             self._report("short", number, reason)
 
-    def add_sound(self, number: int, media_time: int, pcm: bytes) -> None:
-        """Add 16-bit sound, 16 kHz, unless the video has ended."""
+    def add_audio(self, number: int, media_time: int, pcm: bytes) -> None:
+        """Add 16-bit audio, 16 kHz, unless the video has ended."""
         if self._is_open(number):
             samples = as_floats(np.frombuffer(pcm, "<i2"))
             with self._reports_failure(number):
-                self._videos[number].add_sound(media_time, samples)
+                self._videos[number].add_audio(media_time, samples)
 
     def end(self, number: int) -> None:
         """Finish a video once the frames that have arrived are drawn."""

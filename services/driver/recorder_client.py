@@ -55,7 +55,7 @@ class _RecorderProcess:
 
 
 class RecorderClient:
-    """Passes each session's frames and sound to its video.
+    """Passes each session's frames and audio to its video.
 
     ``on_written`` receives the start of the session and its video's path. ``on_short`` receives
     the start and the reason why its video ends early; ``on_written`` follows. ``on_failed``
@@ -124,9 +124,9 @@ class RecorderClient:
         """Add a FAP frame (68 values), if the session is recorded."""
         self._send(session, "add_frame", time_s, values)
 
-    def add_sound(self, session: str, media_time: int, pcm: bytes) -> None:
-        """Add 16-bit sound, 16 kHz, if the session is recorded."""
-        self._send(session, "add_sound", media_time, pcm)
+    def add_audio(self, session: str, media_time: int, pcm: bytes) -> None:
+        """Add 16-bit audio, 16 kHz, if the session is recorded."""
+        self._send(session, "add_audio", media_time, pcm)
 
     def end(self, session: str) -> None:
         """Finish a session's video with the frames that have arrived."""

@@ -162,7 +162,7 @@ class DriverService(SessionService):
         self.recorder.add_frame(frame.session, to_seconds(frame.media_time), frame.packed_values)
 
     def _on_sound(self, sound: Sound) -> None:
-        self.recorder.add_sound(sound.session, sound.media_time, sound.pcm)
+        self.recorder.add_audio(sound.session, sound.media_time, sound.pcm)
 
     def _on_end(self, end: EndOfFaps) -> None:
         self.poses.end(end.session)

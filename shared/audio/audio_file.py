@@ -16,13 +16,13 @@ from kouxing.shared.audio.audio_formats import (
     NUM_BEGIN_BYTES,
     NUM_MARK_BYTES,
     audio_file_kind,
-    find_sound_start,
+    find_media_start,
     needs_more,
     needs_whole_file,
     non_audio_kind,
     read_stated_size,
 )
-from kouxing.shared.audio.media_file import MediaSound, has_video
+from kouxing.shared.audio.media_file import MediaAudio, has_video
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.audio.phase_cancellation import PhaseCancellationGuard, Samples
 from kouxing.shared.audio.raw_format import RawFormat, WavPcm, pcm_of_wav
@@ -115,8 +115,8 @@ def _open_file(
         if wav := pcm_of_wav(begin):
             return _wav_audio(file, begin, wav, path)
         raise UserError(f"{path}: the file has several audio parts; convert them separately")
-    sound = MediaSound(file, path, begin, track, is_pipe=False)
-    return _make_source(sound, path, name, block_s, begin, lambda: num_bytes)
+    media = MediaAudio(file, path, begin, track, is_pipe=False)
+    return _make_source(media, path, name, block_s, begin, lambda: num_bytes)
 
 
 def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -> AudioSource:
@@ -126,7 +126,7 @@ def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -
     begin = pipe.peek()
     if not begin:
         raise UserError(f"{name}: no audio arrived; check the command that writes it")
-    start = find_sound_start(begin)
+    start = find_media_start(begin)
     if start is None:
         if kind := non_audio_kind(begin):
             raise UserError(f"{name}: this is {kind}")
@@ -144,8 +144,8 @@ def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -
         return _with_file(file, lambda: _open_file(file, name, name, block_s, track))
     if wav := pcm_of_wav(begin):  # without FFmpeg's delay of 64 KiB
         return _wav_audio(pipe, begin, wav, name)
-    sound = MediaSound(pipe, name, begin, track, is_pipe=True)  # type: ignore[arg-type]
-    return _make_source(sound, name, name, block_s, begin, lambda: pipe.num_bytes)
+    media = MediaAudio(pipe, name, begin, track, is_pipe=True)  # type: ignore[arg-type]
+    return _make_source(media, name, name, block_s, begin, lambda: pipe.num_bytes)
 
 
 def _open_raw(stream: BinaryIO, raw: RawFormat, name: str) -> AudioSource:
@@ -304,34 +304,34 @@ def raw_audio(
 
 
 def _make_source(
-    sound: MediaSound,
+    media: MediaAudio,
     path: str,
     name: str,
     block_s: float,
     begin: bytes,
     num_bytes: Callable[[], int],
 ) -> AudioSource:
-    _check_rate(path, sound.sample_rate_hz)
-    rate_hz = min(sound.sample_rate_hz, MAX_RATE_HZ)
+    _check_rate(path, media.sample_rate_hz)
+    rate_hz = min(media.sample_rate_hz, MAX_RATE_HZ)
 
     def blocks() -> Iterator[Samples]:
         num_read = 0
-        for block in _blocks(sound.blocks, path, rate_hz, sound.num_channels, block_s):
+        for block in _blocks(media.blocks, path, rate_hz, media.num_channels, block_s):
             num_read += len(block)
             yield block
-        if not sound.warnings:  # the header may state more bytes than the file has
+        if not media.warnings:  # the header may state more bytes than the file has
             read_s = num_read / rate_hz
             stated_s = read_s * (read_stated_size(begin) or 0) / num_bytes()
-            sound.warnings.extend(_cut_off_warnings(path, read_s, stated_s))
+            media.warnings.extend(_cut_off_warnings(path, read_s, stated_s))
 
     return AudioSource(
         name=name,
         sample_rate_hz=rate_hz,
-        num_channels=sound.num_channels,
-        duration_s=sound.duration_s,
+        num_channels=media.num_channels,
+        duration_s=media.duration_s,
         blocks=blocks(),
-        warnings=sound.warnings,
-        notices=sound.notices,
+        warnings=media.warnings,
+        notices=media.notices,
     )
 
 

@@ -22,7 +22,7 @@ _COMMON = {
     (0, b"\x1a\x45\xdf\xa3"): "WebM, the format of MediaRecorder",
 }  # fmt: skip
 NUM_MARK_BYTES = max(offset + len(mark) for offset, mark in _COMMON)  # enough for `audio_file_kind`
-_SOUND = (
+_MEDIA = (
     *_COMMON, (0, b"RIFX"), (0, b"BW64"), (0, b"riff\x2e\x91\xcf\x11"), (0, b"#!AMR"),
     (0, b"\x30\x26\xb2\x75\x8e\x66\xcf\x11"), (0, b"FLV"), (0, b"wvpk"), (0, b"TTA1"),
     (0, b"MAC "), (0, b"\0\0\1\xba"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b".RMF"),
@@ -80,10 +80,10 @@ _OTHER = {
 }
 
 
-def is_sound(begin: bytes) -> bool:
-    """Return whether a sound or video format starts with these bytes."""
+def is_media_format(begin: bytes) -> bool:
+    """Return whether an audio or video format starts with these bytes."""
     return (
-        any(begin.startswith(mark, offset) for offset, mark in (*_SOUND, *_UNPROBED.values()))
+        any(begin.startswith(mark, offset) for offset, mark in (*_MEDIA, *_UNPROBED.values()))
         or (begin.startswith(b"\x80\0") and b"(c)CRI" in begin)  # ADX
         or is_transport_stream(begin)
         or _consists_of_frames(begin)
@@ -91,25 +91,27 @@ def is_sound(begin: bytes) -> bool:
 
 
 def audio_file_kind(begin: bytes) -> str:
-    """Return the kind of a common file of sound or video in words; empty for all other data."""
+    """Return the kind of a common audio or video file in words; empty for all other data."""
     kinds = (kind for (offset, mark), kind in _COMMON.items() if begin.startswith(mark, offset))
     return next(kinds, "")
 
 
-def find_sound_start(begin: bytes) -> int | None:
-    """Return the offset at which sound starts in the first bytes of a pipe; None if not found.
+def find_media_start(begin: bytes) -> int | None:
+    """Return the offset of audio or video in the first bytes of a pipe; None if not found.
 
     Zeros may precede it. An MP3 or ADTS stream may begin within a frame.
     """
     num_zeros = len(begin) - len(begin.lstrip(b"\0"))
     offsets = [0, *range(max(1, num_zeros - _MAX_LEADING_ZEROS), num_zeros + 1)]
     offsets += [match.start() for match in _FRAME.finditer(begin, num_zeros)]
-    return next((start for start in offsets if is_sound(begin[start:][:NUM_BEGIN_BYTES])), None)
+    return next(
+        (start for start in offsets if is_media_format(begin[start:][:NUM_BEGIN_BYTES])), None
+    )
 
 
 def unprobed_format(begin: bytes) -> str | None:
     """Return FFmpeg's name of a format that FFmpeg does not recognize by its first bytes."""
-    if begin.startswith(b"\x9c") and is_sound(begin):
+    if begin.startswith(b"\x9c") and is_media_format(begin):
         return "sbc"
     names = (name for name, (offset, mark) in _UNPROBED.items() if begin.startswith(mark, offset))
     return next(names, None)
@@ -126,11 +128,11 @@ def needs_more(begin: bytes) -> bool:
     content = begin.lstrip(b"\0")
     may_be = _TS_SYNC in (begin[0], begin[4]) or begin.startswith(b"\x80\0")
     may_be |= len(content) < _NUM_FRAMED_BYTES or _framed_codec(content) is not None
-    return may_be and find_sound_start(begin) is None
+    return may_be and find_media_start(begin) is None
 
 
 def non_audio_kind(begin: bytes) -> str:
-    """Describe a file without sound, with a remedy; empty if the type is unknown."""
+    """Describe a file without audio, with a remedy; empty if the type is unknown."""
     for mark, kind in _OTHER.items():
         if begin.startswith(mark):
             return kind
@@ -146,7 +148,7 @@ def why_unreadable(begin: bytes, reason: str) -> str:
         return "cannot read audio: the file has only zeros; copy or record it again"
     if begin[4:8] in (b"ftyp", b"mdat"):
         return "cannot read audio: the file is cut off before its index; copy or record it again"
-    if is_sound(begin):
+    if is_media_format(begin):
         return f"cannot read audio: the file is damaged or cut off ({reason}); copy it again"
     return (
         f"cannot read audio from this file ({reason}); use wav, flac, mp3, m4a, mp4, webm or ogg."

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, audio_file_kind, find_sound_start
+from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, audio_file_kind, find_media_start
 from kouxing.shared.audio.pcm import FULL_SCALE
 from kouxing.shared.errors import UserError
 
@@ -171,7 +171,7 @@ class EncodingCheck:
             and len(set(starts)) == 1
             and np.bincount(low_bytes).max() < _MAX_LOW_BYTE_SHARE * len(low_bytes)
         )
-        return has_packets or find_sound_start(self._begin) is not None
+        return has_packets or find_media_start(self._begin) is not None
 
     def _measure_loudest(self, samples: NDArray[np.floating]) -> Measure:
         """Measure the loudest channel. Far beyond full scale, the flatness is infinite."""

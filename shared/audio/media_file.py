@@ -12,7 +12,7 @@ from kouxing.shared.audio.audio_formats import (
     MAX_OGG_PAGE_BYTES,
     codec_of_padded_wav,
     is_cut_ogg,
-    is_sound,
+    is_media_format,
     is_transport_stream,
     misread_wav_codec,
     unprobed_format,
@@ -42,7 +42,7 @@ _TIMES_COUNT_FROM_ZERO = re.compile("mov|matroska")
 _HEADERS_STATE_LENGTH = re.compile("mov|matroska|flac|mp3|asf|flv|caf|ape|tta|wv|au|w64")
 
 
-class MediaSound:
+class MediaAudio:
     """One audio track of a media file, with one or two channels.
 
     ``track`` counts from 1. Without a number, the default track is read, or the first track if no
@@ -111,7 +111,7 @@ class MediaSound:
 
     def _choose(self, track: int | None, begin: bytes) -> Any:
         tracks = self._container.streams.audio
-        if not self._container.streams or not (tracks or is_sound(begin)):
+        if not self._container.streams or not (tracks or is_media_format(begin)):
             raise UserError(f"{self._name}: {why_unreadable(begin, 'no audio')}")
         if not tracks or len(self._container.streams) > _MAX_STREAMS:
             kinds = {stream.type for stream in self._container.streams}
@@ -302,7 +302,7 @@ def start_of(container: Any) -> float | None:
 
 
 def has_video(file: BinaryIO, name: str, begin: bytes) -> bool:
-    """Return whether a media file has moving pictures and sound.
+    """Return whether a media file has moving images and audio.
 
     Raises ``UserError`` if FFmpeg cannot read it.
     """

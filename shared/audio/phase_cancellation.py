@@ -17,7 +17,7 @@ class PhaseCancellationGuard:
 
     This has three causes. A microphone cable inverts one of two channels. The mix of a film omits
     a channel. Only one of nine channels contains a voice. Other mixes are returned unchanged.
-    ``name`` is the name of the sound in the warning that is added to ``warnings``.
+    ``name`` is the name of the audio in the warning that is added to ``warnings``.
     """
 
     def __init__(self, name: str, num_channels: int, warnings: list[str]) -> None:

@@ -72,7 +72,7 @@ class WavParts:
 
 
 def count_parts(file: BinaryIO) -> int:
-    """Return the number of parts of sound, or 0 if this is not a WAV file; rewind the file."""
+    """Return the number of audio parts, or 0 if this is not a WAV file; rewind the file."""
     count = offset = file.seek(0)
     while (kind := file.read(4)).strip().isalnum():
         size = int.from_bytes(file.read(4), "little")

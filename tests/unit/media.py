@@ -35,7 +35,7 @@ def write_media(
     write_tracks(path, codec, [[(start_s, samples)]], rate_hz, video_s=video_s, options=options)
 
 
-def write_sound(path: Path, samples: NDArray[np.float32], rate_hz: int, **options: str) -> bytes:
+def write_audio(path: Path, samples: NDArray[np.float32], rate_hz: int, **options: str) -> bytes:
     """Write mono samples in the format of the name's suffix; return the bytes of the file."""
     if codec := CODECS.get(path.suffix[1:]):
         write_media(path, codec, samples, rate_hz, options=options)

@@ -38,7 +38,7 @@ def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "me.mp4", 192, 144, 25.0, 16_000) as writer:
         for image in [*[shut] * 30, *[wide] * 25, *[nobody] * 3]:
             writer.write_image(image)
-            writer.write_sound(np.zeros(640, np.float32))
+            writer.write_audio(np.zeros(640, np.float32))
     run(track_app, tmp_path / "me.mp4", "-o", tmp_path / "me")
     clip = read_clip(tmp_path / "me.json")
     assert clip.time_s == pytest.approx(np.arange(58) / 25, abs=0.03)

@@ -12,11 +12,11 @@ import soundfile
 from numpy.typing import NDArray
 
 from kouxing.shared.audio.audio_file import AudioSource, open_audio, read_audio
-from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, is_sound
+from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, is_media_format
 from kouxing.shared.audio.raw_format import RawFormat
 from kouxing.shared.errors import UserError
 from tests.system import DEMO
-from tests.unit.media import CODECS, samples_of, write_sound
+from tests.unit.media import CODECS, samples_of, write_audio
 
 SPEECH = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
 RATE_HZ = 16_000
@@ -85,9 +85,9 @@ def test_decodes_a_pipe_like_a_file(tmp_path: Path, open_pipe: Open, name: str) 
     path, suffix = tmp_path / name, name.rpartition(".")[2]
     options = {"movflags": "faststart"} if name == "fast.m4a" else {}
     rate_hz = RATES_HZ.get(suffix, 48_000 if suffix in CODECS else RATE_HZ)
-    data = write_sound(path, SPEECH, rate_hz, **options)
+    data = write_audio(path, SPEECH, rate_hz, **options)
     expected, rate_hz = read_audio(path)
-    assert is_sound(data[:NUM_BEGIN_BYTES])
+    assert is_media_format(data[:NUM_BEGIN_BYTES])
     source = open_pipe(data)
     samples = samples_of(source)
     assert source.sample_rate_hz == rate_hz
@@ -106,7 +106,7 @@ def test_finds_a_format_after_padding_and_within_an_mp3_frame(
     tmp_path: Path, open_pipe: Open, name: str, num_zeros: int, num_lost: int
 ) -> None:
     path = tmp_path / name
-    data = write_sound(path, SPEECH, RATE_HZ, movflags="faststart")
+    data = write_audio(path, SPEECH, RATE_HZ, movflags="faststart")
     expected, _ = read_audio(path)
     source = open_pipe(bytes(num_zeros) + data[num_lost:])
     samples = samples_of(source)[:, 0]
@@ -180,7 +180,7 @@ def test_reports_the_length_of_a_cut_wav_pipe_with_a_high_rate(open_pipe: Open) 
 @pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a.webm"])
 def test_samples_arrive_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
-    data = write_sound(path, SPEECH.repeat(3), 48_000)
+    data = write_audio(path, SPEECH.repeat(3), 48_000)
     os.mkfifo(tmp_path / "fifo")
     writer = os.open(tmp_path / "fifo", os.O_RDWR)
     os.write(writer, data[: len(data) // 3])
@@ -191,7 +191,7 @@ def test_samples_arrive_before_the_pipe_ends(tmp_path: Path, name: str) -> None:
 
 
 def test_reports_a_cut_flv_pipe(open_pipe: Open, tmp_path: Path) -> None:
-    data = write_sound(tmp_path / "a.flv", SPEECH.repeat(3), 48_000)
+    data = write_audio(tmp_path / "a.flv", SPEECH.repeat(3), 48_000)
     for share in np.linspace(0.4, 0.9, 20):  # FFmpeg takes some of these ends for a new track
         assert [*open_pipe(data[: int(len(data) * share)]).blocks]
 
@@ -218,9 +218,9 @@ def test_a_voice_in_one_of_many_raw_channels_stays_loud(open_pipe: Open) -> None
 def test_quiet_raw_samples_are_not_taken_for_frames() -> None:
     rng = np.random.default_rng(0)
     pieces = [rng.integers(-low, low + 1, 2048) for low in (1, 2, 9, 300, 3000) for _ in range(99)]
-    assert not any(is_sound(b"\xff\xfb" + piece.astype("<i2").tobytes()) for piece in pieces)
-    assert not any(is_sound(b"\xff\xff" + piece.astype("<i2").tobytes()) for piece in pieces)
-    assert not is_sound(b"\x9c\0" * 2048)
+    assert not any(is_media_format(b"\xff\xfb" + piece.astype("<i2").tobytes()) for piece in pieces)
+    assert not any(is_media_format(b"\xff\xff" + piece.astype("<i2").tobytes()) for piece in pieces)
+    assert not is_media_format(b"\x9c\0" * 2048)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_ctrl_c_ends_reading_at_any_place(
                 raise KeyboardInterrupt
             return size
 
-    pipe = InterruptedPipe(write_sound(tmp_path / name, SPEECH, RATE_HZ)[:num_bytes])
+    pipe = InterruptedPipe(write_audio(tmp_path / name, SPEECH, RATE_HZ)[:num_bytes])
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BufferedReader(pipe)))
     with pytest.raises(KeyboardInterrupt):
         [*open_audio(Path("-")).blocks]

@@ -10,7 +10,7 @@ import soundfile
 from kouxing.corpora.lip_tracking import read_video
 from kouxing.shared.audio.audio_file import AudioSource, check_video, open_audio, read_audio
 from kouxing.shared.errors import UserError
-from tests.unit.media import samples_of, write_media, write_sound, write_tracks
+from tests.unit.media import samples_of, write_audio, write_media, write_tracks
 
 RATE_HZ = 48_000
 TONE = (0.5 * np.sin(np.arange(RATE_HZ) * 0.1)).astype(np.float32)  # 1 s
@@ -144,7 +144,7 @@ def test_lists_the_tracks_and_reads_the_chosen_one(tmp_path: Path) -> None:
 )
 def test_warns_about_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
-    data = write_sound(path, np.tile(TONE, 3), RATE_HZ, movflags="faststart")
+    data = write_audio(path, np.tile(TONE, 3), RATE_HZ, movflags="faststart")
     source = open_audio(path)
     assert len(_read(source)) >= 3 * RATE_HZ
     assert source.warnings == []

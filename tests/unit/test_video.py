@@ -28,7 +28,7 @@ def test_pictures_and_sound_are_in_sync(tmp_path: Path) -> None:
     with VideoWriter(path, 64, 48, 25.0, 16_000) as writer:
         for number in range(25):
             writer.write_image(np.full((48, 64, 3), 255 * (number >= 12), np.uint8))
-            writer.write_sound(sound[640 * number : 640 * (number + 1)])
+            writer.write_audio(sound[640 * number : 640 * (number + 1)])
         assert not path.exists()  # not visible before it is complete
     assert [file.name for file in tmp_path.iterdir()] == ["out.mp4"]
     with av.open(str(path)) as container:
@@ -70,7 +70,7 @@ def test_transparent_videos_have_alpha(tmp_path: Path, name: str) -> None:
     with VideoWriter(tmp_path / name, 64, 48, 25.0, 16000, transparent=True) as writer:
         for _ in range(5):
             writer.write_image(PICTURE)
-            writer.write_sound(np.zeros(640, np.float32))
+            writer.write_audio(np.zeros(640, np.float32))
     got = first_picture(tmp_path / name)
     inner = np.zeros((48, 64), dtype=bool)
     inner[12:28, 12:38] = inner[32:38, 12:38] = inner[:8] = True  # without smoothed edges
@@ -84,7 +84,7 @@ def test_webp_is_an_animation(tmp_path: Path, channels: int) -> None:
     with VideoWriter(path, 64, 48, 20.0, 16000, transparent=channels == 4) as writer:
         for number in range(3):
             writer.write_image(np.roll(PICTURE[..., :channels], 4 * number, axis=1))
-            writer.write_sound(np.zeros(800, np.float32))
+            writer.write_audio(np.zeros(800, np.float32))
     with Image.open(path) as moving:
         images = [np.asarray(image.convert("RGBA")) for image in ImageSequence.Iterator(moving)]
         assert (len(images), moving.info["loop"], moving.info["duration"]) == (3, 0, 50)
@@ -122,7 +122,7 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) 
     writer = open_writer(tmp_path / name, (64, 48), 25.0, 16000, transparent=True)
     for _ in range(2):
         writer.write_image(PICTURE)
-        writer.write_sound(np.zeros(640, np.float32))
+        writer.write_audio(np.zeros(640, np.float32))
     writer.close()
     files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*"))
     assert files == names
@@ -216,8 +216,8 @@ def frame(value: float) -> np.ndarray:
 def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_path: Path) -> None:
     recording = VideoRenderer(tmp_path / "a.mp4", renderer, 25.0)
     loud = np.full(8000, 0.5, np.float32)
-    recording.add_sound(8000, loud)
-    recording.add_sound(12000, loud)
+    recording.add_audio(8000, loud)
+    recording.add_audio(12000, loud)
     recording.add_frame(0.0, frame(0))
     recording.step()
     recording.close()

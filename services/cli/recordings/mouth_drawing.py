@@ -275,7 +275,7 @@ def _write_video(output: Path, mouth: _MouthMotion) -> str:
         num_sent = 0
         for time_s, opening, width in progress.track(frames, description="drawing"):
             end = round((time_s + 1.0 / FRAME_RATE_HZ) * MEDIA_RATE_HZ)
-            writer.write_sound(mouth.samples[num_sent:end])
+            writer.write_audio(mouth.samples[num_sent:end])
             num_sent = end
             moment = drawing.LabeledMouth(
                 time_s, opening, _label_at(time_s, phone_labels), _label_at(time_s, labels), width

@@ -66,7 +66,7 @@ def render_video(
     Raises ``UserError`` if the file cannot be written.
     """
     video = VideoRenderer(
-        path, renderer, frame_rate_hz, sound=samples is not None, captions=captions
+        path, renderer, frame_rate_hz, with_audio=samples is not None, captions=captions
     )
     sound = np.zeros(0, np.float32) if samples is None else samples
     num_sent = 0
@@ -77,10 +77,10 @@ def render_video(
             video.add_frame(time_s, faps)
         while video.step():
             end = round(video.duration_s * MEDIA_RATE_HZ)
-            video.add_sound(num_sent, sound[num_sent:end])
+            video.add_audio(num_sent, sound[num_sent:end])
             num_sent = min(end, len(sound))
             on_progress(min(1.0, video.duration_s / max(frames[-1][0], 1e-9)))
-        video.add_sound(num_sent, sound[num_sent:])
+        video.add_audio(num_sent, sound[num_sent:])
     except BaseException:
         video.discard()
         raise

@@ -15,7 +15,7 @@ _MIN_SAMPLES = 4096  # atempo returns nothing for fewer samples
 
 
 def stretch_time(samples: Float32, speed: float) -> Float32:
-    """Return sound (n,), 16 kHz, at a speed of 0.25 to 1: (round(n / speed),)."""
+    """Return audio (n,), 16 kHz, at a speed of 0.25 to 1: (round(n / speed),)."""
     if speed == 1.0:
         return samples
     num_samples = round(len(samples) / speed)

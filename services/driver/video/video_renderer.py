@@ -17,12 +17,12 @@ from kouxing.services.driver.video.video_writer import open_writer
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
-MAX_SILENCE_S = 600.0  # longest gap in the sound that is filled with silence
+MAX_SILENCE_S = 600.0  # longest gap in the audio that is filled with silence
 Faps = NDArray[np.float32]
 
 
 class VideoRenderer:
-    """Renders FAP frames to images, and writes them and the sound to a video.
+    """Renders FAP frames to images, and writes them and the audio to a video.
 
     The file appears when the video is closed. A renderer with a transparent background makes a
     transparent video. Unless ``overwrite`` is set, ``close`` adds a number to the name of an
@@ -37,7 +37,7 @@ class VideoRenderer:
         renderer: Renderer | SideBySideRenderer,
         frame_rate_hz: float,
         *,
-        sound: bool = True,
+        with_audio: bool = True,
         overwrite: bool = True,
         captions: CaptionDrawer | None = None,
     ) -> None:
@@ -52,7 +52,7 @@ class VideoRenderer:
         self._frames: deque[tuple[float, Faps]] = deque()
         self._num_samples = 0
         self._writer = open_writer(
-            path, (width_px, height_px), frame_rate_hz, MEDIA_RATE_HZ if sound else None,
+            path, (width_px, height_px), frame_rate_hz, MEDIA_RATE_HZ if with_audio else None,
             transparent=renderer.transparent, overwrite=overwrite,
         )  # fmt: skip
 
@@ -71,8 +71,8 @@ class VideoRenderer:
         if not self._frames or time_s > self._frames[-1][0]:
             self._frames.append((time_s, faps))
 
-    def add_sound(self, media_time: int, samples: NDArray[np.float32]) -> None:
-        """Add sound (n,); a gap before it is filled with silence.
+    def add_audio(self, media_time: int, samples: NDArray[np.float32]) -> None:
+        """Add audio (n,); a gap before it is filled with silence.
 
         Raises ``UserError`` if the gap is too long, or the file cannot be written.
         """
@@ -86,7 +86,7 @@ class VideoRenderer:
             samples = np.concatenate([np.zeros(missing, np.float32), samples])
         elif missing < 0:
             samples = samples[-missing:]
-        self._writer.write_sound(samples)
+        self._writer.write_audio(samples)
         self._num_samples += len(samples)
 
     def step(self) -> bool:

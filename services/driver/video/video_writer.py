@@ -1,6 +1,6 @@
 """Writes images with audio in sync (MP4, MOV, WebM) or only images (WebP, PNG files).
 
-Picture ``n`` is shown at ``n / frame_rate_hz`` and sound sample ``n`` is played at
+Picture ``n`` is shown at ``n / frame_rate_hz`` and audio sample ``n`` is played at
 ``n / sample_rate_hz``, both from the start of the file.
 
 ======================  ====================================  ==============================
@@ -9,8 +9,8 @@ file                    opaque                                with a transparent
 ``.mp4``                H.264 and AAC                         not possible
 ``.mov``                H.264 and AAC                         ProRes 4444 and AAC
 ``.webm``               VP9 and Opus                          VP9 with alpha and Opus
-``.webp``               WebP, loops forever, no sound         WebP with alpha, no sound
-folder, ``name%05d``    PNG, no sound                         PNG with alpha, no sound
+``.webp``               WebP, loops forever, no audio         WebP with alpha, no audio
+folder, ``name%05d``    PNG, no audio                         PNG with alpha, no audio
 ======================  ====================================  ==============================
 """
 
@@ -61,7 +61,7 @@ class _Format:
 
     opaque: _Codec
     transparent: _Codec | None
-    sound: str | None  # codec
+    audio_codec: str | None
     options: dict[str, str] = field(default_factory=dict)  # options of the container
 
 
@@ -153,7 +153,7 @@ class VideoWriter:
     """A video that appears under its name when it is complete.
 
     Width and height are even, the frame rate is 1 to 1000 Hz. ``sample_rate_hz`` is the rate of the
-    sound, or None for no sound; ``.webp`` never has sound. Pictures are ``transparent`` if they
+    audio, or None for no audio; ``.webp`` never has audio. Pictures are ``transparent`` if they
     have an alpha channel. Unless ``overwrite`` is set, ``close`` adds a number to the name of an
     existing file.
 
@@ -180,7 +180,7 @@ class VideoWriter:
             raise UserError(
                 f"{self._path}: MP4 cannot be transparent; write .mov, .webm or pictures (a folder)"
             )
-        sound_codec = None if sample_rate_hz is None else form.sound
+        audio_codec = None if sample_rate_hz is None else form.audio_codec
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz
         self._num_images = self._num_samples = 0
@@ -206,12 +206,12 @@ class VideoWriter:
         # players guess the color space of a file from its size unless the file states it
         context.color_primaries = context.color_trc = context.colorspace = Colorspace.ITU709
         context.color_range = ColorRange.MPEG
-        self._sound: Any = None
-        if sound_codec is not None:
-            self._sound = self._container.add_stream(
-                sound_codec, rate=sample_rate_hz, layout="mono"
+        self._audio: Any = None
+        if audio_codec is not None:
+            self._audio = self._container.add_stream(
+                audio_codec, rate=sample_rate_hz, layout="mono"
             )
-            self._sample_format = "fltp" if sound_codec == "aac" else "flt"
+            self._sample_format = "fltp" if audio_codec == "aac" else "flt"
 
     def __enter__(self) -> VideoWriter:
         return self
@@ -238,9 +238,9 @@ class VideoWriter:
         self._num_images += 1
         self._encode(self._video, frame)
 
-    def write_sound(self, samples: Float32) -> None:
-        """Append mono sound (N,), -1 to 1."""
-        if not len(samples) or self._sound is None:
+    def write_audio(self, samples: Float32) -> None:
+        """Append mono audio (N,), -1 to 1."""
+        if not len(samples) or self._audio is None:
             return
         block = np.ascontiguousarray(samples, dtype=np.float32)[None, :]
         frame = av.AudioFrame.from_ndarray(block, format=self._sample_format, layout="mono")
@@ -248,7 +248,7 @@ class VideoWriter:
         frame.pts = self._num_samples
         frame.time_base = Fraction(1, self._sample_rate_hz or 1)
         self._num_samples += len(samples)
-        self._encode(self._sound, frame)
+        self._encode(self._audio, frame)
 
     def _encode(self, stream: Any, frame: Any) -> None:
         with self._discards_on_error():
@@ -266,7 +266,7 @@ class VideoWriter:
         """Finish the file under its final name; return its path."""
         self._encode(self._video, None)
         if self._num_samples:
-            self._encode(self._sound, None)
+            self._encode(self._audio, None)
         with self._discards_on_error():
             self._container.close()
             path = self._path if self._overwrite else _create_unique(self._path)
@@ -308,8 +308,8 @@ class PictureSequence:
             file.write(picture.encode(image))
         self._num_images += 1
 
-    def write_sound(self, samples: Float32) -> None:
-        """Ignore the sound."""
+    def write_audio(self, samples: Float32) -> None:
+        """Ignore the audio."""
 
     def close(self) -> Path:
         """Delete older pictures beyond the last one; return the folder or the name pattern."""
