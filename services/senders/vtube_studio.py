@@ -118,7 +118,8 @@ class VTubeStudioProtocol:
         number, text = data["errorID"], str(data["message"])[:200]
         if number == _DENIED:
             raise AccessDenied(
-                "access to VTube Studio was denied; to get the prompt again, stop and restart sending"
+                "access to VTube Studio was denied; to get the prompt again, stop and restart"
+                " sending"
             )
         if number == _ACCESS_OFF:
             text = "VTube Studio's API is off; turn on 'Start API (allow plugins)' in its settings"
