@@ -43,7 +43,7 @@ from kouxing.shared.face import expression_motion, shapes
 from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
-FORMAT = "kouxing-lips 5"
+FORMAT = "kouxing-lips 6"
 
 _ALIGNMENT_BYTES = 8
 # the constants that kouxing-lips and ovrlipsync use, by module
@@ -91,7 +91,7 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         "_HOLD_S _LEAD_S _LAUGH_EASE_S _LOUDNESS_DB _FORGET_DB_S _BREATH _SMILING _LOUD_NOTE",
     ),
     "pcm": (slices, "MEDIA_RATE_HZ SLICE_SAMPLES"),
-    "resample": (resample, "SAMPLE_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA"),
+    "resample": (resample, "SAMPLE_RATE_HZ _HALF_WIDTH _CUTOFF _KAISER_BETA _MAX_PHASES"),
     "rest": (
         resting_lips,
         "HOLD_S LEAD_S PART_S CLOSE_S CERTAIN _YIELD_S _END_S _MIN_PAUSE_S _RANGE_DB "

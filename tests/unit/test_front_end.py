@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from kouxing.services.recognizer.front_end import resample
 from kouxing.services.recognizer.front_end.features import (
     NUM_BANDS,
     NUM_STATIC,
@@ -36,7 +37,7 @@ def test_level_is_the_rms_in_decibels_of_full_scale() -> None:
     assert level_db(np.zeros(0, np.float32)) == -120.0
 
 
-RATES = (8_000, 11_025, 16_000, 22_050, 24_000, 32_000, 44_100, 48_000)
+RATES = (8_000, 11_025, 16_000, 22_050, 24_000, 32_000, 44_100, 47_999, 48_000)
 
 
 def tone(rate_hz: int, hz: float = 440.0, seconds: float = 1.0) -> np.ndarray:
@@ -51,6 +52,21 @@ def test_resampling_keeps_a_tone(rate_hz: int) -> None:
     assert abs(len(resampled) - 16_000) <= 1
     inner = slice(1000, 15_000)
     np.testing.assert_allclose(resampled[inner], tone(16_000)[inner], atol=2e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [8_001, 44_101, 47_999])
+def test_the_filter_of_an_odd_rate_is_small(rate_hz: int) -> None:
+    """A row for each of 16,000 phases would take seconds, while all sessions wait."""
+    assert len(resample._filter_table(rate_hz)) <= 641
+
+
+def test_interpolated_filters_are_accurate(monkeypatch: pytest.MonkeyPatch) -> None:
+    rate_hz, num_phases = 12_345, 3_200
+    noise = np.random.default_rng(0).uniform(-1, 1, 4_000).astype(np.float32)
+    resampled = to_16_khz(noise, rate_hz)
+    monkeypatch.setattr(resample, "_MAX_PHASES", num_phases)
+    monkeypatch.setattr(resample, "_filter_table", resample._filter_table.__wrapped__)
+    np.testing.assert_allclose(resampled, to_16_khz(noise, rate_hz), atol=1e-5)
 
 
 def test_clips_16_khz_audio_and_passes_it_through() -> None:

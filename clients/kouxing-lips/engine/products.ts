@@ -175,20 +175,27 @@ export function activate(x: usize, out: usize, count: i32, factor: f32, offset: 
   }
 }
 
+/** Return the sum of the products of two rows of floats, size a multiple of 4. */
+function dot(x: usize, weights: usize, size: u32): f32 {
+  let sum = f32x4.splat(0);
+  for (let end = weights + FLOAT_BYTES * size; weights < end; weights += 16, x += 16) sum = addProduct(sum, v128.load(x), weights);
+  return f32x4.extract_lane(sum, 0) + f32x4.extract_lane(sum, 1) + (f32x4.extract_lane(sum, 2) + f32x4.extract_lane(sum, 3));
+}
+
 /**
  * Filter a signal at the positions (first + i * down) / up, whose phase is the remainder.
- * x: float, from the sample at position 0 of the filter on; table: (up, size) float, size a multiple of 4;
- * out: (count,) float
+ * x: float, from the sample at position 0 of the filter on; out: (count,) float
+ * table: (phases + 1, size) float, size a multiple of 4; the last row is for the next sample. The filter is
+ * interpolated between the rows.
  */
-export function resample(x: usize, table: usize, out: usize, count: i32, size: u32, up: u32, down: u32, first: u32): void {
+export function resample(x: usize, table: usize, out: usize, count: i32, size: u32, phases: u32, up: u32, down: u32, first: u32): void {
   for (let i = 0; i < count; i++, first += down) {
-    let from = x + FLOAT_BYTES * (first / up);
-    const row = table + FLOAT_BYTES * (first % up) * size;
-    let sum = f32x4.splat(0);
-    for (let at = row, end = row + FLOAT_BYTES * size; at < end; at += 16, from += 16) sum = addProduct(sum, v128.load(from), at);
-    store<f32>(
-      out + FLOAT_BYTES * i,
-      f32x4.extract_lane(sum, 0) + f32x4.extract_lane(sum, 1) + (f32x4.extract_lane(sum, 2) + f32x4.extract_lane(sum, 3)),
-    );
+    const from = x + FLOAT_BYTES * (first / up);
+    const phase = (first % up) * phases;
+    const row = table + FLOAT_BYTES * (phase / up) * size;
+    const rest = phase % up;
+    let value = dot(from, row, size);
+    if (rest) value += (f32(rest) / f32(up)) * (dot(from, row + FLOAT_BYTES * size, size) - value);
+    store<f32>(out + FLOAT_BYTES * i, value);
   }
 }

@@ -14,7 +14,8 @@ export class Resampler {
   #down;
   #memory;
   #numTaps; // a multiple of LANES: zeros follow the filter
-  #table; // rows of the filter, one for each phase
+  #numPhases;
+  #table; // rows of the filter, one for each phase and one for the next sample
   #known; // newest samples; only the first #numKnown are valid
   #out;
   #half;
@@ -35,12 +36,13 @@ export class Resampler {
     [this.#up, this.#down] = [c.SAMPLE_RATE_HZ / common, rateHz / common];
     const lower = Math.min(1, c.SAMPLE_RATE_HZ / rateHz);
     this.#half = Math.ceil(c.HALF_WIDTH / lower);
-    const rows = filterRows(this.#up, this.#half, lower * c.CUTOFF, c.KAISER_BETA);
+    this.#numPhases = Math.min(this.#up, c.MAX_PHASES);
+    const rows = filterRows(this.#numPhases, this.#half, lower * c.CUTOFF, c.KAISER_BETA);
     this.#numTaps = Math.ceil((2 * this.#half) / LANES) * LANES;
     this.#maxChunk = Math.ceil(CHUNK_S * rateHz);
     const numOut = Math.ceil((this.#maxChunk * this.#up) / this.#down) + 1;
     const numKept = 2 * this.#half + Math.ceil(this.#down / this.#up); // between chunks
-    const sizes = [this.#up * this.#numTaps, numKept + this.#maxChunk, numOut];
+    const sizes = [rows.length * this.#numTaps, numKept + this.#maxChunk, numOut];
     this.#memory = new ProductMemory(sizes.reduce((sum, size) => sum + alignedBytes(Float32Array, size), 0));
     [this.#table, this.#known, this.#out] = sizes.map((size) => this.#memory.array(Float32Array, size));
     rows.forEach((row, phase) => this.#table.set(row, phase * this.#numTaps));
@@ -80,7 +82,7 @@ export class Resampler {
     const begin = this.#firstNeeded(this.#numOut);
     const input = known.byteOffset + begin * known.BYTES_PER_ELEMENT;
     const phase = (this.#numOut * down) % up;
-    this.#memory.resample(input, this.#table.byteOffset, out.byteOffset, numReady, this.#numTaps, up, down, phase);
+    this.#memory.resample(input, this.#table.byteOffset, out.byteOffset, numReady, this.#numTaps, this.#numPhases, up, down, phase);
     this.#numOut += numReady;
     const numOld = Math.max(0, this.#firstNeeded(this.#numOut));
     known.copyWithin(0, numOld, this.#numKnown);
@@ -96,7 +98,7 @@ export class Resampler {
 }
 
 function filterRows(numPhases, half, cutoff, beta) {
-  return Array.from({ length: numPhases }, (_, phase) => {
+  return Array.from({ length: numPhases + 1 }, (_, phase) => {
     const row = Float64Array.from({ length: 2 * half }, (_value, tap) => {
       const time = phase / numPhases - (tap + 1 - half);
       return sinc(cutoff * time) * bessel(beta * Math.sqrt(Math.max(0, 1 - (time / half) ** 2)));

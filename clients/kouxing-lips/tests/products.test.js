@@ -89,16 +89,24 @@ test("sigmoid and hyperbolic tangent", () => {
   }
 });
 
-test("filters at fractional positions", () => {
-  const memory = new ProductMemory(MEMORY_BYTES);
-  const [size, up, down, first, count] = [8, 3, 4, 2, 5];
-  const x = stored(memory, Float32Array, table(1, 32, integer));
-  const filters = stored(memory, Float32Array, table(up, size, integer));
-  const out = memory.array(Float32Array, count);
-  memory.resample(...[x, filters, out].map(({ byteOffset }) => byteOffset), count, size, up, down, first);
-  const expected = table(1, count, (_, i) => {
-    const [begin, phase] = [Math.floor((first + i * down) / up), (first + i * down) % up];
-    return sum(size, (tap) => x[begin + tap] * filters[phase * size + tap]);
+for (const [phases, up] of [
+  [3, 3],
+  [2, 3],
+]) {
+  test(`filters at fractional positions, with ${phases} of ${up} phases`, () => {
+    const memory = new ProductMemory(MEMORY_BYTES);
+    const [size, down, first, count] = [8, 4, 2, 5];
+    const x = stored(memory, Float32Array, table(1, 32, integer));
+    const filters = stored(memory, Float32Array, table(phases + 1, size, integer));
+    const out = memory.array(Float32Array, count);
+    memory.resample(...[x, filters, out].map(({ byteOffset }) => byteOffset), count, size, phases, up, down, first);
+    const expected = table(1, count, (_, i) => {
+      const begin = Math.floor((first + i * down) / up);
+      const phase = (((first + i * down) % up) * phases) / up;
+      const row = Math.floor(phase);
+      const filtered = (offset) => sum(size, (tap) => x[begin + tap] * filters[(row + offset) * size + tap]);
+      return filtered(0) + (phase - row) * (filtered(1) - filtered(0));
+    });
+    expected.forEach((value, i) => assert.ok(Math.abs(out[i] - value) <= 1e-6 * Math.abs(value), `${value}: ${out[i]}`));
   });
-  assert.deepEqual([...out], expected);
-});
+}
