@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from kouxing.services.cli.launch.supervisor import Supervisor, _console_text
+from kouxing.services.cli.launch.supervisor import Supervisor, _console_text, _Service
 
 
 @pytest.mark.parametrize(
@@ -32,3 +32,16 @@ def test_a_long_warning_is_one_line(tmp_path: Path) -> None:
     supervisor = Supervisor([], tmp_path, Console(file=output, width=40), services=())
     supervisor._warn("turn the receiver on, " * 5)
     assert len(output.getvalue().splitlines()) == 1
+
+
+def test_the_log_is_shown_and_an_error_in_the_configuration_is_kept(tmp_path: Path) -> None:
+    output = io.StringIO()
+    supervisor = Supervisor([], tmp_path, Console(file=output), services=())
+    service = _Service("gateway", tmp_path / "gateway.log", {})
+    expired = json.dumps({"level": "warning", "message": "gateway.https: k.pem is expired"})
+    supervisor._copy_log(service, io.BytesIO(expired.encode() + b"\n"))
+    assert output.getvalue() == "gateway.https: k.pem is expired\n"
+    assert service.error == ""
+    supervisor._copy_log(service, io.BytesIO(b"gateway.port: 0 is too small\n"))
+    assert output.getvalue().count("\n") == 1
+    assert service.error == "gateway.port: 0 is too small"

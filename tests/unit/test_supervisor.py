@@ -38,7 +38,9 @@ def test_a_service_whose_process_cannot_be_started_is_started_again_later(
 
     console = Console(file=io.StringIO())
     watched = supervisor.Supervisor([], tmp_path, console, services=())
-    service = supervisor._Service("control", tmp_path / "control.log", {}, restart_at_s=now_s)
+    service = supervisor._Service(
+        "control", tmp_path / "control.log", {}, restart_at_s=now_s, error="of an earlier process"
+    )
     watched._services["control"] = service
     monkeypatch.setattr(supervisor, "ServiceProcess", start_process)
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
@@ -52,3 +54,4 @@ def test_a_service_whose_process_cannot_be_started_is_started_again_later(
     watched.check()
     assert started == [100.0, 100.0 + supervisor.MAX_BACKOFF_S]
     assert service.process is not None
+    assert service.error == ""

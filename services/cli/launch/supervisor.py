@@ -46,7 +46,7 @@ class _Service:
     restart_at_s: float = math.inf
     backoff_s: float = 0.0  # delay before the restart after an early crash
     is_restarting: bool = False  # restarted, but not ready yet
-    error: str = ""  # newest error in the configuration
+    error: str = ""  # error in the configuration that the process printed
 
     @property
     def hang_limit_s(self) -> float:
@@ -246,6 +246,7 @@ class Supervisor:
             start_new_session=True,  # Ctrl-C must reach only the supervisor
         )
         service.started_s = time.monotonic()
+        service.error = ""
         service.log_thread = threading.Thread(
             target=self._copy_log_until_end, args=(service, process), daemon=True
         )
@@ -264,10 +265,10 @@ class Supervisor:
         with stream, contextlib.closing(log):
             for line in stream:
                 log.write(line)
-                text = _console_text(line)
-                if text.startswith((f"{kind}:", f"{kind}.")):
-                    service.error = text  # `check` raises it
-                elif text:
+                # Log lines are JSON, so this is the text that `services.process` prints at its end.
+                if line.startswith((f"{kind}:".encode(), f"{kind}.".encode())):
+                    service.error = line.decode("utf-8", "replace").rstrip()  # `check` raises it
+                elif text := _console_text(line):
                     self._print(prefix_name(service.name, text))
 
     def _warn(self, text: str) -> None:
