@@ -17,7 +17,7 @@ _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:
 def _check_origins(values: tuple[str, ...]) -> tuple[str, ...]:
     if not all(_ORIGIN.fullmatch(origin) for origin in values):
         raise ValueError
-    return values
+    return tuple(origin.lower() for origin in values)  # as browsers send them
 
 
 def _check_https(value: str) -> str:

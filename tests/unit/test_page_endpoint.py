@@ -1,4 +1,6 @@
-"""The address of the page."""
+"""The address of the page, and its host names."""
+
+import socket
 
 import pytest
 from kouxing_client.field_types import MAX_ENDPOINT
@@ -34,3 +36,24 @@ def test_the_url_fits_into_a_message() -> None:
     for token in (longest + "t", 30 * "口"):  # each has 9 characters in a URL
         with pytest.raises(UserError, match=r"gateway\.token: .* use a shorter token"):
             heartbeat(token)
+
+
+@pytest.mark.parametrize(
+    ("local_name", "names"),
+    [
+        ("DESKTOP-Ab1", {"desktop-ab1", "desktop-ab1.local", "face.example.org"}),
+        ("Johns-Mac.local", {"johns-mac", "johns-mac.local", "face.example.org"}),
+    ],
+)
+def test_host_names_may_have_capital_letters(
+    local_name: str, names: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: local_name)
+    endpoint = make_page_endpoint(GatewayConfig(names=("Face.example.org",)), 8080)
+    others = {"johns-mac.local.local", "evil.example"}
+    assert {name for name in names | others if endpoint.access.is_gateway_host(name)} == names
+
+
+def test_trusted_origins_may_have_capital_letters() -> None:
+    config = GatewayConfig(trusted_origins=("https://Face.example.org:8443",))
+    assert config.trusted_origins == ("https://face.example.org:8443",)

@@ -34,8 +34,9 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     """
     host = config.advertise or (config.advertised_host if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
-    local_name = socket.gethostname()
-    names = {host, local_name, f"{local_name}.local", *config.names}
+    local_name = socket.gethostname().removesuffix(".local")  # macOS includes it
+    own_names = (host, local_name, f"{local_name}.local", *config.names)
+    names = {name.lower() for name in own_names}  # as `AccessPolicy` gets a request's host
     tls = None
     if config.certificate:
         tls = load_tls_context(config.certificate, [*sorted(names), "localhost", "127.0.0.1"])
