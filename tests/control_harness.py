@@ -20,6 +20,7 @@ from kouxing.shared.wire.session import Error, OpenSession
 from tests.system import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
+IDLE_LIMIT_S = 90.0
 ENDPOINTS_BY_SERVICE = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 
 
@@ -37,7 +38,12 @@ class ControlHarness:
     def __init__(self, *, insecure: bool) -> None:
         self.control = ControlService(
             ControlConfig(
-                control=LOCAL, events=LOCAL, insecure=insecure, lost_after_s=60.0, max_load=1000.0
+                control=LOCAL,
+                events=LOCAL,
+                insecure=insecure,
+                lost_after_s=60.0,
+                idle_limit_s=IDLE_LIMIT_S,
+                max_load=1000.0,
             )
         )
         self.refusal: Error | None = None  # of the services, instead of starting a session

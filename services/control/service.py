@@ -259,6 +259,7 @@ class ControlService(Service):
             control_instance=self._process_id,
             keys=self._keys.keys_for(heartbeat),
             missing=self._placement.missing_kinds(),
+            idle_limit_s=self._idle_limit_s,
         )
         self._commands.send(reply, to=sender)
         if heartbeat.state == "draining" and heartbeat.role == "worker":

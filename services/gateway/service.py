@@ -258,6 +258,7 @@ class GatewayService(SessionService):
     def on_heartbeat_reply(self, reply: HeartbeatReply, sender: Peer) -> None:
         """Announce missing services to the viewers."""
         super().on_heartbeat_reply(reply, sender)
+        self._audio_client.idle_limit_s = reply.idle_limit_s
         self._replied_s = time.monotonic()
         since_s = min(self._missing_since_s, self._replied_s) if reply.missing else math.inf
         self._missing_since_s = since_s

@@ -100,6 +100,7 @@ class HeartbeatReply(RegisteredMessage, frozen=True, kw_only=True):
     )
     # kinds of worker that every session needs but that are not running
     missing: Annotated[list[Name], Meta(max_length=16)] = field(default_factory=list)
+    idle_limit_s: Seconds = 60.0  # duration without audio after which control closes a session
 
 
 class StartSession(RegisteredMessage, frozen=True, kw_only=True):

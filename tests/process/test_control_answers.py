@@ -16,10 +16,10 @@ from kouxing.shared.network.bus import Bus
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.settings.keys import add_key, load_user_key, read_key, revoke_key
 from kouxing.shared.wire.codec import encode
-from kouxing.shared.wire.control import SessionProgress
+from kouxing.shared.wire.control import HeartbeatReply, SessionProgress
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import CloseSession, Error, OpenSession, SessionOpened
-from tests.control_harness import ControlHarness
+from tests.control_harness import IDLE_LIMIT_S, ControlHarness
 from tests.system import wait_until
 
 
@@ -28,6 +28,12 @@ def harness(request: pytest.FixtureRequest, new_keys: None) -> Iterator[ControlH
     new_harness = ControlHarness(insecure=request.param)
     yield new_harness
     new_harness.close()
+
+
+def test_a_reply_to_a_heartbeat_states_the_idle_limit(harness: ControlHarness) -> None:
+    (reply,) = harness.receive(harness.services[0])
+    assert isinstance(reply, HeartbeatReply)
+    assert reply.idle_limit_s == IDLE_LIMIT_S
 
 
 def test_a_repeated_request_gets_the_same_answer(harness: ControlHarness) -> None:

@@ -83,6 +83,8 @@ def test_rejects_audio_in_text_messages() -> None:
 class FakeSession:
     """Collects the audio that it receives."""
 
+    idle_limit_s = 60.0
+
     def __init__(self, frame_bytes: int = 2) -> None:
         self.pcm = b""
         self.num_flushes = 0
@@ -119,6 +121,19 @@ def test_early_audio_is_passed_on_completely_in_real_time(rate_hz: int, chunk: i
         assert set(session.pcm[len(pcm) :]) == {0}, "silence keeps a paused stream open"
 
     run(speak())
+
+
+def test_silence_keeps_a_session_open_at_any_idle_limit() -> None:
+    async def pause() -> None:
+        session = FakeSession()
+        session.idle_limit_s = 6.0
+        audio_input = AudioInput(session, PCM16, is_synthesized=True)  # type: ignore[arg-type]
+        async with audio_input.running():
+            for num_chunks in (1, 2, 3):
+                await asyncio.sleep(2.1)
+                assert session.pcm == num_chunks * bytes(2 * 640)
+
+    run(pause())
 
 
 def test_push_waits_while_the_queue_is_full_and_a_flush_empties_it() -> None:

@@ -16,7 +16,6 @@ from kouxing.shared.audio.encoding_check import EncodingCheck
 MAX_QUEUED_BYTES = 6 * 1024 * 1024  # 16 s of 48 kHz stereo floats
 MAX_LIVE_S = 1.0  # a longer message is not from a microphone
 CHUNK_S = 0.04  # duration of the chunks in which queued audio is forwarded
-KEEP_ALIVE_S = 20.0  # interval between the silent chunks that keep a session without audio open
 _END_TYPES = {WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR}
 
 
@@ -122,7 +121,8 @@ class RealTimeQueue:
         self._session = session
         self._format = pcm_format
         self._chunk_bytes = round(CHUNK_S * pcm_format.sample_rate_hz) * pcm_format.frame_bytes
-        self._keep_alive_s = KEEP_ALIVE_S if keep_alive else None
+        # interval between the silent chunks that keep a session without audio open
+        self._keep_alive_s = session.idle_limit_s / 3 if keep_alive else None
         self._queued = bytearray()
         self._num_forwarded = 0  # bytes
         self._gaps = deque[tuple[int, int]]()  # bytes before skipped samples, number of samples

@@ -22,10 +22,14 @@ Warn = Callable[[str, str, str], None]  # reason, text, session
 
 
 class AudioSession:
-    """One session that the gateway has opened."""
+    """One session that the gateway has opened.
 
-    def __init__(self, session: AsyncSession, warn: Warn) -> None:
+    Control closes it after ``idle_limit_s`` without audio.
+    """
+
+    def __init__(self, session: AsyncSession, warn: Warn, idle_limit_s: float) -> None:
         self.name = session.name
+        self.idle_limit_s = idle_limit_s
         self.is_closed = False  # control has closed it
         self._session = session
         self._warn = warn
@@ -89,6 +93,7 @@ class AudioClient:
         self._client: AsyncClient | None = None
         self._open: dict[str, AudioSession] = {}
         self.num_opening = 0  # sessions that control has not confirmed yet
+        self.idle_limit_s = 60.0  # of control; updated by its heartbeats
 
     @contextlib.asynccontextmanager
     async def open(self, session: str = "", **options: object) -> AsyncIterator[AudioSession]:
@@ -109,6 +114,7 @@ class AudioClient:
             opened = AudioSession(
                 await self._client.open_session(session, **options),  # type: ignore[arg-type]
                 self._warn,
+                self.idle_limit_s,
             )
         finally:
             self.num_opening -= 1
