@@ -162,10 +162,10 @@ class GatewayService(SessionService):
         return self._closing.done() and not is_uploading and not is_connected
 
     def on_shutdown(self) -> None:
-        """Stop HTTP and the senders."""
-        self._senders.pool.close()
+        """Stop HTTP, then what its requests use."""
         self._loop.run_until_complete(self._server.stop())
         self._loop.run_until_complete(self._audio_client.close())
+        self._senders.pool.close()
         self._runner.close()
 
     def send_to_control(self, message: Message) -> None:

@@ -5,9 +5,13 @@ from collections.abc import Iterator
 
 import aiohttp
 import pytest
+from aiohttp import web
+from aiohttp.test_utils import make_mocked_request
 from kouxing_client.base import MAX_UNACKNOWLEDGED_MESSAGES
 from kouxing_client.messages import EndOfFaps
 
+from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.gateway.service import GatewayService
 from kouxing.shared.wire.control import SessionStarted
 from kouxing.shared.wire.session import AudioChunk, CloseSession, FlushSession
 from tests.fake_control import EPOCH, FakeControl
@@ -119,3 +123,21 @@ async def test_without_control_browsers_are_told_to_start_it() -> None:
     assert "does not answer" in text
     assert "kouxing run" in text
     assert gateway.stop() == 0
+
+
+def test_requests_are_answered_until_http_stops(
+    control: FakeControl, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gateway = GatewayService(GatewayConfig(control=control.address, port=0, insecure=True))
+    stop = gateway._server.stop
+
+    async def answer_and_stop() -> None:
+        answers.append(await gateway._senders.serve_get(make_mocked_request("GET", "/senders")))
+        await stop()
+
+    answers: list[web.StreamResponse] = []
+    monkeypatch.setattr(gateway._server, "stop", answer_and_stop)
+    gateway.on_startup()
+    gateway.on_shutdown()
+    gateway.bus.close()
+    assert [answer.status for answer in answers] == [200]
