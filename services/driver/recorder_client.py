@@ -6,11 +6,11 @@ import multiprocessing
 import threading
 from collections.abc import Callable
 from itertools import count
+from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from kouxing.services.driver import recorder
 from kouxing.services.driver.config import DriverConfig
 from kouxing.shared.files.output_file import remove_unfinished
 from kouxing.shared.settings.keys import MAX_KEY_SHARE
@@ -31,12 +31,19 @@ EXIT_REASON = (
 _SPAWN = multiprocessing.get_context("spawn")
 
 
+def _run_recorder(connection: Connection, config: DriverConfig) -> None:
+    """Run the recorder in its process; only this process needs the slow imports."""
+    from kouxing.services.driver import recorder
+
+    recorder.run(connection, config)
+
+
 class _RecorderProcess:
     """The recorder's process. A thread sends its commands, so the driver never blocks."""
 
     def __init__(self, config: DriverConfig) -> None:
         self.connection, child_end = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=recorder.run, args=(child_end, config), daemon=True)
+        self.process = _SPAWN.Process(target=_run_recorder, args=(child_end, config), daemon=True)
         self.process.start()
         child_end.close()
         self.commands: SimpleQueue[tuple[object, ...] | None] = SimpleQueue()

@@ -91,11 +91,16 @@ def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> 
         ),
         ("import kouxing.services.gateway.service", "scipy onnxruntime prometheus_client"),
         (
+            "from kouxing.services.driver.service import DriverConfig, View;"
+            " View(DriverConfig(view='none'), print)",
+            "scipy av moderngl glfw",
+        ),
+        (
             "import kouxing.services.recognizer.service as service; service.load_numba()",
             "scipy.linalg pycparser aiohttp prometheus_client",
         ),
     ],
-    ids=["command", "settings", "gateway", "recognizer"],
+    ids=["command", "settings", "gateway", "driver", "recognizer"],
 )
 def test_a_start_imports_nothing_slow_that_it_does_not_need(start: str, slow: str) -> None:
     code = f"import sys\n{start}\nprint(*sorted({{*{slow.split()}}} & {{*sys.modules}}))"

@@ -8,13 +8,14 @@ import moderngl
 import numpy as np
 import pytest
 
-from kouxing.services.driver.config import Framing
+from kouxing.services.driver.config import DriverConfig, Framing
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render import renderer as render
 from kouxing.services.driver.render.renderer import BACKGROUND, Renderer
 from kouxing.services.driver.render.scene import load_head, parse_background, place_camera
 from kouxing.services.driver.render.window import Window
 from kouxing.services.driver.video.virtual_camera import VirtualCamera
+from kouxing.services.driver.view import View
 from kouxing.shared.errors import UserError
 from tests.heads import neutral_faps
 
@@ -78,6 +79,11 @@ def test_parses_backgrounds_and_rejects_others() -> None:
 def test_error_of_an_unknown_head(name: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         load_head(name)
+
+
+def test_a_driver_without_an_output_reports_a_missing_head() -> None:
+    with pytest.raises(UserError, match=r"my\.glb"):
+        View(DriverConfig(view="none", head="my.glb"), lambda _: None)
 
 
 class Device:
