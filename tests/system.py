@@ -10,6 +10,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
+from functools import cache
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -37,15 +38,22 @@ SKIP_NO_AUDIO = {  # on a busy machine
 }
 LONG_TIMEOUTS = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
 ADMIT_ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # and no session is rejected
-LIGHT_MODEL = {"KOUXING_RECOGNIZER_ACOUSTIC": "light"}
+LIGHT_MODEL = {"KOUXING_RECOGNIZER_ACOUSTIC": "light"}  # needs half of the processor time
+BLOCK_NETWORK = {"KOUXING_RECOGNIZER_ACOUSTIC": "blocks"}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
+VIDEO_RATE_HZ = 10
 MAX_RESERVATIONS = 50
 
 _reservations: deque[contextlib.ExitStack] = deque()  # of ports
 
 
 def samples_of_file(path: Path) -> NDArray[np.float32]:
-    """Return a mono recording at 16 kHz."""
+    """Return a mono recording at 16 kHz; each file is decoded only once."""
+    return _decode_file(path).copy()
+
+
+@cache
+def _decode_file(path: Path) -> NDArray[np.float32]:
     samples, rate_hz = read_audio(path)
     assert rate_hz == 16_000
     return samples[:, 0]
@@ -106,11 +114,12 @@ def own_environment(folder: Path) -> dict[str, str]:
 
 
 def headless_settings(folder: Path) -> dict[str, str]:
-    """Return the settings of a driver that has no window and writes small videos."""
+    """Return the settings of a driver that has no window and writes small, cheap videos."""
     return {
         "KOUXING_DRIVER_VIEW": "none",
         "KOUXING_DRIVER_OUT": str(folder),
         "KOUXING_DRIVER_SIZE": "160x120",
+        "KOUXING_DRIVER_FRAME_RATE_HZ": str(VIDEO_RATE_HZ),
     }
 
 
@@ -170,7 +179,10 @@ def start_python(
 
 
 class System(LocalSystem):
-    """Services in processes. A service that ends restarts only if ``restarts`` is set."""
+    """Services in processes, with the light model unless ``settings`` name another.
+
+    A service that ends restarts only if ``restarts`` is set.
+    """
 
     def __init__(
         self,
@@ -197,6 +209,7 @@ class System(LocalSystem):
                 **LONG_TIMEOUTS,
                 **SKIP_NO_AUDIO,
                 **ADMIT_ANY_LOAD,
+                **LIGHT_MODEL,
                 **addresses,
                 **{variable_name(name, "instance"): name for name in named},
                 **(settings or {}),

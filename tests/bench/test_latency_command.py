@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from kouxing.evaluation.system.commands import app
+from kouxing.evaluation.system.costs import CASES
 from tests.system import VOWELS_FILE
 
 
@@ -16,6 +17,8 @@ def test_the_command_prints_and_writes_the_same_figures(
     monkeypatch.setattr("kouxing.evaluation.system.latency.NUM_REPEATS", 1)
     monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_IMAGES", 3)
     monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_SESSIONS", (1,))
+    small = [(name, detail, (64, 48), *rest) for name, detail, _, *rest in CASES]
+    monkeypatch.setattr("kouxing.evaluation.system.costs.CASES", small)
     monkeypatch.setattr("kouxing.evaluation.system.page.SIZE_PX", (320, 240))
     monkeypatch.setattr("kouxing.evaluation.system.page.SETTLE_S", 0.5)
     monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 1.0)

@@ -2,7 +2,7 @@
 
 import csv
 import itertools
-from collections.abc import Collection
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,16 @@ from kouxing.shared.wire.events import event_to_message
 from tests.e2e.conftest import CommandRunner
 from tests.e2e.streaming import StreamedSession, stream_audio
 from tests.lips import LIPS
-from tests.system import CHAIN, DEMO, LIMIT_S, VOWELS_FILE, System, samples_of_file, start_python
+from tests.system import (
+    BLOCK_NETWORK,
+    CHAIN,
+    DEMO,
+    LIMIT_S,
+    VOWELS_FILE,
+    System,
+    samples_of_file,
+    start_python,
+)
 
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
 OPEN_JAW = 2  # index of FAP 3
@@ -44,8 +53,9 @@ def opening(frame: FapFrame) -> float:
 
 
 @pytest.fixture(scope="module")
-def services() -> Collection[str]:
-    return CHAIN
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    with System(CHAIN, tmp_path_factory.mktemp("system"), BLOCK_NETWORK) as running:
+        yield running
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,12 @@ from kouxing.shared.errors import UserError
 from tests.browser import Browser
 from tests.documents import code_blocks
 from tests.e2e.streaming import StreamedSession, stream_audio
-from tests.system import DEMO, LIGHT_MODEL, ROOT, System, samples_of_file, wait_until
+from tests.system import DEMO, ROOT, System, samples_of_file, wait_until
 
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    with System(KINDS, tmp_path_factory.mktemp("logs"), LIGHT_MODEL, restarts=True) as running:
+    with System(KINDS, tmp_path_factory.mktemp("logs"), restarts=True) as running:
         yield running
 
 

@@ -18,6 +18,7 @@ from tests.system import (
     CTRL_C_COMMAND,
     LIGHT_MODEL,
     LIMIT_S,
+    VIDEO_RATE_HZ,
     VOWELS_FILE,
     child_environment,
     kouxing,
@@ -50,7 +51,7 @@ def test_the_demo_writes_a_video_and_stops(tmp_path: Path) -> None:
     assert "demo.mp4" in result.stderr
     with av.open(str(tmp_path / "demo.mp4")) as film:
         assert len(film.streams.audio) == 1
-        assert sum(1 for _ in film.decode(video=0)) >= 2.2 * 25
+        assert sum(1 for _ in film.decode(video=0)) >= 2.2 * VIDEO_RATE_HZ
 
 
 def test_runs_on_free_ports_until_it_is_interrupted(

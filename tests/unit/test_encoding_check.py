@@ -53,7 +53,6 @@ def tone(frequency_hz: float) -> Samples:
     return wave
 
 
-@pytest.mark.parametrize("num_bytes", [640, 999, 100_000])
 @pytest.mark.parametrize(
     ("subtype", "endian", "kind"),
     [
@@ -67,7 +66,9 @@ def tone(frequency_hz: float) -> Samples:
         ("DOUBLE", "LITTLE", "64-bit float samples"),
     ],
 )
-@pytest.mark.parametrize("gain", [0.1, 0.89])
+@pytest.mark.parametrize(
+    ("gain", "num_bytes"), [(0.1, 640), (0.89, 640), (0.89, 999), (0.89, 100_000)]
+)
 def test_the_error_names_the_encoding_of_speech(
     subtype: str, endian: str, kind: str, gain: float, num_bytes: int
 ) -> None:

@@ -101,7 +101,10 @@ def test_every_scheme_shows_the_feeling_of_the_voice(scheme: int) -> None:
     assert brow(1.0) > 20.0
 
 
-def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
+def test_the_command_scores_and_films_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("kouxing.evaluation.lips.scheme_videos.VIDEO_PX", (64, 64))
     samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=11_200)
     soundfile.write(tmp_path / "hello.wav", samples, rate_hz)
     row = "hello\thello.wav\tA\ttest\t你好"

@@ -8,6 +8,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+import soundfile
 
 from kouxing.services.cli import rhubarb
 from kouxing.services.cli.recordings.animation import FaceMotion
@@ -19,7 +20,7 @@ from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.high_level_faps import VISEMES as MPEG4_VISEMES
 from kouxing.shared.face.mouth_shapes import Cue, mouth_cues, mouth_shape, oculus_cues
 from kouxing.shared.face.shapes import OCULUS
-from tests.system import VOWELS_FILE
+from tests.system import VOWELS_FILE, samples_of_file
 
 REST, OPEN, WIDE = np.zeros((3, NUM_FAPS), np.float32)
 OPEN[4], WIDE[4] = -400.0, -600.0  # the lower lip
@@ -198,12 +199,13 @@ def test_the_result_is_complete_when_the_success_is_reported(
 def test_a_text_that_does_not_fit_is_ignored(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    dialog = tmp_path / "dialog.txt"
-    rhubarb.main(["--machineReadable", str(VOWELS_FILE)])
+    dialog, vowels = tmp_path / "dialog.txt", tmp_path / "vowels.wav"
+    soundfile.write(vowels, samples_of_file(VOWELS_FILE)[:16_000], 16_000)
+    rhubarb.main(["--machineReadable", str(vowels)])
     without_text, _ = capsys.readouterr()
     for text in ("मर", "مرحبا", "bibidi bobidi bu"):
         dialog.write_text(text)
-        rhubarb.main(["--machineReadable", "-d", str(dialog), str(VOWELS_FILE)])
+        rhubarb.main(["--machineReadable", "-d", str(dialog), str(vowels)])
         with_text, status = capsys.readouterr()
         assert with_text == without_text
         events = [json.loads(line) for line in status.splitlines()]

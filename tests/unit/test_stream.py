@@ -41,6 +41,12 @@ def model() -> AcousticModel:
     return load_model()
 
 
+@cache
+def results_of_vowels(chunk: int | None = None, *, with_lips: bool = True) -> list[StreamOutput]:
+    """Return the results of an undisturbed session, which several tests compare with theirs."""
+    return recognize_live(model(), SAMPLES, chunk, **(FACE if with_lips else {}))
+
+
 def of_kind(kind: type[E], outputs: Sequence[StreamOutput]) -> list[E]:
     return [output for output in outputs if isinstance(output, kind)]
 
@@ -71,7 +77,7 @@ def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
 
 
 def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
-    alone = of_kind(Phone, recognize_live(model(), SAMPLES))
+    alone = of_kind(Phone, results_of_vowels(with_lips=False))
     stream = LiveStream(model(), **FACE)
     gap = len(SAMPLES) + MAX_JITTER_SAMPLES + 1
     stream.stream.accept_waveform(SAMPLES, 0)
@@ -112,7 +118,7 @@ def test_skips_to_newer_audio() -> None:
 
 @pytest.mark.parametrize("cuts", [[9600, 14_400], [320, 10_240], [0, 50_000]])
 def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
-    expected = recognize_live(model(), SAMPLES, 320, **FACE)
+    expected = results_of_vowels(320)
     stream = LiveStream(model(), **FACE)
     outputs = []
     for number, part in enumerate(np.split(SAMPLES, cuts)):
@@ -135,7 +141,7 @@ def test_jitter_is_not_a_gap() -> None:
         SAMPLES[8000:], 8000 + MAX_JITTER_SAMPLES
     )
     assert stream.stream.num_gaps == 0
-    expected = recognize_live(model(), SAMPLES)
+    expected = results_of_vowels(with_lips=False)
     assert messages_of(outputs + stream.finish()) == messages_of(expected)
 
 
@@ -151,7 +157,7 @@ def test_a_flush_ends_the_speech_and_drops_it() -> None:
     later = of_kind(Phone, rest)
     assert min(phone.index for phone in later) == 1 + max(phone.index for phone in spoken)
     assert [(p.symbol, p.duration_s) for p in later] == [
-        (p.symbol, p.duration_s) for p in of_kind(Phone, recognize_live(model(), SAMPLES))
+        (p.symbol, p.duration_s) for p in of_kind(Phone, results_of_vowels(with_lips=False))
     ]
     assert min(phone.onset_s for phone in later) > 1.0
     assert rest[-1] == EndOfSound(time_s=1.0 + len(SAMPLES) / RATE_HZ)
@@ -182,7 +188,7 @@ def test_other_sessions_do_not_affect_results() -> None:
 
 
 def test_lips_may_be_early_and_phones_are_the_same() -> None:
-    expected = recognize_live(model(), SAMPLES, 320, **FACE)
+    expected = results_of_vowels(320)
     recognizer = Recognizer(model())
     stream = recognizer.create_stream(**FACE)
     outputs: list[StreamOutput] = []
@@ -261,7 +267,7 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
 
 
 def test_a_longer_hop_changes_only_the_phones() -> None:
-    expected = recognize_live(model(), SAMPLES, 320, **FACE)
+    expected = results_of_vowels(320)
     stream = LiveStream(model(), **FACE)
     stream.stream.set_hop(4)
     outputs = [*stream.feed(SAMPLES, chunk=320), *stream.finish()]
