@@ -48,3 +48,21 @@ def test_every_named_module_exists() -> None:
     names = {name for name in names if "NAME" not in name}
     assert len(names) > 30
     assert not {name for name in names if not (ROOT / name).is_file()}
+
+
+def test_every_quoted_message_exists() -> None:
+    """Messages are quoted in the first column of the tables; "..." replaces what varies."""
+    text = (ROOT / "docs" / "clients" / "troubleshooting.md").read_text("utf-8")
+    first_columns = "\n".join(re.findall(r"^\|([^|]*)\|", text, re.MULTILINE))
+    messages = [quoted for quoted in re.findall(r"`([^`\n]+)`", first_columns) if " " in quoted]
+    assert len(messages) > 5
+    folders = ("services", "clients/python", "clients/javascript", "examples")
+    sources = "\n".join(
+        path.read_text("utf-8")
+        for folder in folders
+        for suffix in ("py", "js")
+        for path in (ROOT / folder).rglob(f"*.{suffix}")
+        if "node_modules" not in path.parts
+    )
+    parts = {part.strip() for message in messages for part in message.split("...")}
+    assert not {part for part in parts if part not in sources}
