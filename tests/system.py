@@ -251,14 +251,18 @@ class System(LocalSystem):
     def wait_until(self, condition: Callable[[Status], bool], deadline_s: float = 110.0) -> None:
         """Wait until control's report meets a condition; no service may end in the meantime."""
         end_s = time.monotonic() + deadline_s
+        newest: object = "no status report"
         with Client(self.control, timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.assert_all_alive()
                 with contextlib.suppress(KouxingError):  # control is restarting
-                    if condition(client.status()):
+                    report = client.status()
+                    if condition(report):
                         return
+                    services = {state.instance: state.state for state in report.services}
+                    newest = services, report.sessions
                 time.sleep(0.05)
-        raise AssertionError(f"the condition does not become true: {client}")
+        raise AssertionError(f"the condition does not become true: {newest}")
 
     def status(self) -> Status:
         """Return the status report of control."""
