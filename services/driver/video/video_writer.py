@@ -315,9 +315,9 @@ class PictureSequence:
         """Delete older pictures beyond the last one; return the folder or the name pattern."""
         written = {picture_name(self._path, number) for number in range(self._num_images)}
         try:
-            for picture in existing_pictures(self._path):
-                if picture not in written:
-                    picture.unlink()
+            for file in existing_pictures(self._path):
+                if file not in written:
+                    file.unlink()
         except OSError as error:
             raise write_error(self._path, error) from error
         return self._path
