@@ -44,7 +44,7 @@ EXTRA_INCOMPLETE_BYTES = 4 * KIB  # additional limit for each connection
 MAX_UNREAD_MESSAGES = 200_000  # queued for all peers; about 100 bytes of memory each
 NUM_NEW_CHECKS = 20  # checks in which a connection is new; a flood is disconnected earlier
 MAX_ENDED_CONNECTIONS = 1024  # that a service has not handled yet
-MAX_TOPIC_BYTES = 128  # of one subscription
+MAX_SUBSCRIPTION_BYTES = 128
 MAX_TOPICS_BYTES = 32 * KIB  # of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS_BYTES = 192 * KIB  # of all connections; libzmq takes up to 120 times as much memory
 TRIMS_S = (0.2, 1.0, 3.0)  # delays after a disconnect, because libzmq frees memory later
@@ -86,7 +86,7 @@ class LimitedSocket:
 
     def subscribe(self, connection: PeerConnection, topic: bytes) -> None:
         """Add a subscription; disconnect a peer with too many or too long subscriptions."""
-        if len(topic) > MAX_TOPIC_BYTES:
+        if len(topic) > MAX_SUBSCRIPTION_BYTES:
             connection.disconnect("a subscription is too long", PENALTY_S)
             return
         connection.topics.add(topic)

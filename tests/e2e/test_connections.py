@@ -12,7 +12,7 @@ from kouxing_client.messages import EndOfFaps, FapFrame, Message
 from kouxing.shared.network import connection_limits, peer_quota, sockets, tarpit
 from kouxing.shared.network.bus import Bus
 from kouxing.shared.network.connection_limits import (
-    MAX_TOPIC_BYTES,
+    MAX_SUBSCRIPTION_BYTES,
     MAX_TOPICS_BYTES,
     ConnectionLimiter,
 )
@@ -109,10 +109,10 @@ def test_a_message_may_arrive_in_pieces(bus: Bus) -> None:
 
 def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:
     faps = bus.bind_publisher(LOCAL, "faps")
-    num_topics = MAX_TOPICS_BYTES // MAX_TOPIC_BYTES + 100
+    num_topics = MAX_TOPICS_BYTES // MAX_SUBSCRIPTION_BYTES + 100
     with connect_raw(port_of(faps), "SUB") as subscriber:
         for number in range(num_topics):
-            topic = str(number).rjust(MAX_TOPIC_BYTES, "x").encode()
+            topic = str(number).rjust(MAX_SUBSCRIPTION_BYTES, "x").encode()
             subscriber.sendall(frame(b"\x01" + topic) + frame(b"\x00" + topic))
             time.sleep(0.001)
             list(faps.receive())
@@ -158,13 +158,15 @@ def test_disconnects_a_peer_with_too_many_subscriptions(
     honest = bus.connect_subscriber(faps.endpoint)
     honest.subscribe(FapFrame, "s")
     with connect_raw(port_of(faps), "SUB") as hostile:
-        for number in range(MAX_TOPICS_BYTES // MAX_TOPIC_BYTES):
-            hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_TOPIC_BYTES, "x").encode()))
+        for number in range(MAX_TOPICS_BYTES // MAX_SUBSCRIPTION_BYTES):
+            hostile.sendall(
+                frame(b"\x01" + str(number).rjust(MAX_SUBSCRIPTION_BYTES, "x").encode())
+            )
         assert not is_soon_disconnected(hostile, faps, num_checks=20)
         hostile.sendall(frame(b"\x01x"))
         assert is_soon_disconnected(hostile, faps)
     with connect_raw(port_of(faps), "SUB") as hostile:
-        hostile.sendall(frame(b"\x01" + bytes(MAX_TOPIC_BYTES + 1)))
+        hostile.sendall(frame(b"\x01" + bytes(MAX_SUBSCRIPTION_BYTES + 1)))
         assert is_soon_disconnected(hostile, faps)
     frame_ = FapFrame(session="s", packed_values=b"\0" * 272, mask=b"\0" * 9)
     faps.send(frame_)
