@@ -1,6 +1,6 @@
 """The address by which others reach this host."""
 
-import socket
+from typing import Self
 
 import pytest
 from kouxing_client.field_types import MAX_ENDPOINT
@@ -12,12 +12,19 @@ KEY_LENGTH = 40  # characters of a public key
 ROUTES = {"10.77.0.1": "10.77.0.2", "fd77::1": "fd77::2", "192.0.2.1": "10.88.0.2"}
 
 
-class Probe(socket.socket):
-    """A socket of a host with two networks and a default route; it sends nothing."""
+class Probe:
+    """The socket of a host with two networks and a default route."""
 
     routes = ROUTES
 
-    def connect(self, address: tuple[str, int]) -> None:  # type: ignore[override]
+    def __init__(self, *_: object) -> None: ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def connect(self, address: tuple[str, int]) -> None:
         if address[0] not in self.routes:
             raise OSError("no route")
         self._own = self.routes[address[0]]
@@ -37,7 +44,7 @@ class Probe(socket.socket):
 def test_advertises_the_address_on_the_way_to_control(
     monkeypatch: pytest.MonkeyPatch, control: str, bound: str, advertised: str
 ) -> None:
-    monkeypatch.setattr(socket, "socket", Probe)
+    monkeypatch.setattr("socket.socket", Probe)
     assert SynthesizerConfig(control=control).advertised_endpoint(bound) == advertised
     monkeypatch.setattr(Probe, "routes", {})
     assert local_address("10.77.0.1") == "127.0.0.1", "a host without network reaches itself"

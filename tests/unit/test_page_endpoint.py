@@ -1,7 +1,5 @@
 """The address of the page, and its host names."""
 
-import socket
-
 import pytest
 from kouxing_client.field_types import MAX_ENDPOINT
 from kouxing_client.messages import Message
@@ -48,7 +46,7 @@ def test_the_url_fits_into_a_message() -> None:
 def test_host_names_may_have_capital_letters(
     local_name: str, names: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(socket, "gethostname", lambda: local_name)
+    monkeypatch.setattr("socket.gethostname", lambda: local_name)
     endpoint = make_page_endpoint(GatewayConfig(names=("Face.example.org",)), 8080)
     others = {"johns-mac.local.local", "evil.example"}
     assert {name for name in names | others if endpoint.access.is_gateway_host(name)} == names
