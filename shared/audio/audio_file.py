@@ -33,8 +33,7 @@ from kouxing.shared.files.user_file import check_content, open_file
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # limit for a session; files above are resampled to it
 BLOCK_S = 0.02
-CLIPPED_LEVEL = 0.999
-CLIPPED_FRACTION = 0.01  # above this fraction of the samples, the user is warned
+_MAX_FLOAT = 100.0  # larger samples are integers that were written as floats
 _MIN_MISSING_S = 0.05  # a file that lacks more than this is reported as cut off
 _MAX_SPOOLED_BYTES = 64 << 20  # in memory, for a pipe that must be read completely
 MAX_FILE_BYTES = 8 << 30
@@ -257,18 +256,6 @@ def check_video(path: Path) -> None:
         raise UserError(f"{path}: the video must have images and audio; record it again with both")
 
 
-def count_clipped(samples: Samples) -> int:
-    """Return the number of samples at full scale."""
-    return int(np.count_nonzero(np.abs(samples) >= CLIPPED_LEVEL))
-
-
-def clipping_warnings(name: str, fraction: float) -> list[str]:
-    """Return a warning if the fraction of clipped samples is above ``CLIPPED_FRACTION``."""
-    if fraction <= CLIPPED_FRACTION:
-        return []
-    return [f"{name}: {fraction:.0%} of the samples are clipped; record at a lower level"]
-
-
 def raw_audio(
     stream: Readable, raw: RawFormat, name: str, num_missing: Callable[[], int] = lambda: 0
 ) -> AudioSource:
@@ -366,7 +353,7 @@ def _blocks(
 def _check_samples(
     pieces: Iterator[tuple[int, Samples]], path: str
 ) -> Iterator[tuple[int, Samples]]:
-    """Clip samples to [-1, 1]; raise ``UserError`` if some are not finite."""
+    """Clip samples to [-1, 1]; raise ``UserError`` if some are not finite, or integers."""
     read_s = 0.0
     for rate_hz, samples in pieces:
         is_number = np.isfinite(samples).all(axis=1)
@@ -375,6 +362,12 @@ def _check_samples(
             raise UserError(
                 f"{path}: NaN or infinite samples near {place_s:.2f} s; "
                 "export the file again, for example as 16-bit PCM"
+            )
+        peak = np.abs(samples).max(initial=0.0)
+        if peak > _MAX_FLOAT:
+            raise UserError(
+                f"{path}: a sample is {peak:.0f}, but full scale is 1; divide integers by 32768,"
+                " and export the file again"
             )
         read_s += len(samples) / rate_hz
         yield rate_hz, np.clip(samples, -1.0, 1.0)

@@ -13,6 +13,7 @@ PAGE_TEXTS = PAGE / "gateway-texts.js"
 SOURCES = (
     *("shared/audio/audio_file.py", "shared/audio/media_file.py", "shared/audio/audio_formats.py"),
     *("shared/audio/phase_cancellation.py", "shared/audio/wav_parts.py"),
+    "shared/audio/level_check.py",
     "services/gateway/uploads/audio_upload.py",
     *(
         "services/gateway/uploads/upload_handler.py",

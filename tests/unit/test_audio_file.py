@@ -8,7 +8,7 @@ import soundfile
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.shared.audio.audio_file import open_audio, read_audio
 from kouxing.shared.errors import UserError
-from tests.system import VOWELS_FILE
+from tests.system import VOWELS_FILE, samples_of_file
 from tests.unit.media import samples_of, write_media
 from tests.videos import write_video
 
@@ -70,6 +70,36 @@ def test_rejects_nan_and_reports_its_time(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "a.wav", samples, 16000, subtype="FLOAT")
     with pytest.raises(UserError, match=r"near 1\.50 s"):
         read_audio(tmp_path / "a.wav")
+
+
+def test_rejects_integers_in_a_file_of_floats(tmp_path: Path) -> None:
+    samples = samples_of_file(VOWELS_FILE)
+    soundfile.write(tmp_path / "a.wav", samples * 32768, 16000, subtype="FLOAT")
+    with pytest.raises(UserError, match="but full scale is 1; divide integers by 32768"):
+        read_audio(tmp_path / "a.wav")
+    soundfile.write(tmp_path / "a.wav", samples * 8, 16000, subtype="FLOAT")
+    assert np.abs(read_audio(tmp_path / "a.wav")[0]).max() == 1
+
+
+@pytest.mark.parametrize(
+    ("gain", "offset", "warning"),
+    [
+        (1.0, 0.0, ""),
+        (0.01, 0.02, "constant offset of 0.020, which hides quiet speech"),
+        (0.01, -0.02, "constant offset of -0.020"),
+        (0.0, 0.0005, ""),
+        (30.0, 0.0, "% of the samples are clipped"),
+    ],
+)
+def test_warns_about_the_level(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], gain: float, offset: float, warning: str
+) -> None:
+    samples = samples_of_file(VOWELS_FILE) * gain + offset
+    soundfile.write(tmp_path / "a.wav", np.clip(samples, -1, 1), 16000)
+    read_mono_16k(tmp_path / "a.wav")
+    printed = " ".join(capsys.readouterr().err.split())
+    assert warning in printed
+    assert bool(printed) == bool(warning)
 
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24"])

@@ -9,7 +9,8 @@ from kouxing_client import Client, KouxingError, Phone, Refused, Session
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from kouxing.shared.audio.audio_file import AudioSource, clipping_warnings, count_clipped
+from kouxing.shared.audio.audio_file import AudioSource
+from kouxing.shared.audio.level_check import LevelCheck
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.command.terminal import plural
 from kouxing.shared.errors import UserError
@@ -98,7 +99,8 @@ class _Streamer:
         self._console = console
         self._awaits_video = is_recorded
         self._video = ""  # path of the written video
-        self._duration_s = self._clipped = self._peak = 0.0  # statistics of the sent audio
+        self._duration_s = self._peak = 0.0  # of the sent audio
+        self._level = LevelCheck()
         self._num_phones = 0
         self._events = session.events()
         self._frames = session.frames()
@@ -122,7 +124,7 @@ class _Streamer:
             self._warn(f"{source.name}: no speech was found{reason}")
         if self._phones.num_missed:
             self._warn(missed_warning(self._phones.num_missed, "phone"))
-        for warning in (*source.warnings, *clipping_warnings(source.name, self._clipped)):
+        for warning in (*source.warnings, *self._level.warnings(source.name)):
             self._warn(warning)
         return StreamSummary(self._session.name, self._duration_s, self._num_phones, self._video)
 
@@ -134,7 +136,7 @@ class _Streamer:
 
     def _send_all(self, *, paced: bool) -> None:
         source = self._source
-        num_sent = num_clipping = 0
+        num_sent = 0
         is_pipe = source.duration_s is None
         due_s = time.monotonic()  # when the next block is spoken
         try:
@@ -143,7 +145,7 @@ class _Streamer:
                 with contextlib.suppress(Refused):  # `_check_errors` reports the next one
                     self._session.push(block.astype("<f4").tobytes(), PUSH_TIMEOUT_S)
                 num_sent += len(block)
-                num_clipping += count_clipped(block)
+                self._level.add(block)
                 self._peak = max(self._peak, float(np.abs(block).max()))
                 self._update(0.0)
                 if paced and not source.is_live:
@@ -157,7 +159,6 @@ class _Streamer:
             clear_interrupt()
             self._console.print("stopping; press Ctrl-C again to drop the last words")
         self._duration_s = num_sent / source.sample_rate_hz
-        self._clipped = num_clipping / max(1, num_sent * source.num_channels)
 
     def _wait_for_end(self) -> None:
         """Wait for the last frame, which may take long if much audio is queued."""

@@ -42,6 +42,10 @@ const CHINESE = {
   "damaged near {place} s; the damaged part is silent": "{place} 秒附近已损坏，损坏部分无声",
   "mixing the channels would cancel one of them; only channel {channel} is used": "如混合所有声道，会丢失其中一个声道的声音，因此只用第 {channel} 声道",
   "{share} of the samples are clipped; record at a lower level": "{share} 的采样过载失真，请降低录音音量",
+  "the samples have a constant offset of {offset}, which hides quiet speech; subtract it in an audio editor":
+    "声音有恒定的直流偏移（{offset}），会掩盖较轻的语音，请用音频编辑器去除",
+  "a sample is {value}, but full scale is 1; divide integers by 32768, and export the file again":
+    "采样值达到 {value}，而满刻度是 1；请把整数除以 32768 后重新导出",
   "{rate} Hz is too low for speech; use {least} Hz or more": "采样率 {rate} Hz 太低，请用 {least} Hz 以上",
   "NaN or infinite samples near {place} s; export the file again, for example as 16-bit PCM":
     "{place} 秒附近有无效采样，请重新导出，例如 16 位 PCM",

@@ -5,12 +5,8 @@ import sys
 import wave
 from pathlib import Path
 
-from kouxing.shared.audio.audio_file import (
-    clipping_warnings,
-    count_clipped,
-    limited_blocks,
-    open_audio,
-)
+from kouxing.shared.audio.audio_file import limited_blocks, open_audio
+from kouxing.shared.audio.level_check import LevelCheck
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import USER_ERROR, UserError
 
@@ -25,19 +21,13 @@ def decode(path: Path) -> None:
     Raises ``UserError`` if the file cannot be read or is too long.
     """
     source = open_audio(path, block_s=1.0)
-    num_samples = clipped = 0
+    level = LevelCheck()
     with wave.open(sys.stdout.buffer, "wb") as output:
         output.setparams((1, 2, source.sample_rate_hz, 0, "NONE", ""))
         for block in limited_blocks(source, MAX_DURATION_S):
-            num_samples += len(block)
-            clipped += count_clipped(block)
+            level.add(block)
             output.writeframes(as_integers(block.mean(axis=1)).tobytes())
-    clipped_fraction = clipped / max(1, num_samples * source.num_channels)
-    for warning in (
-        *source.notices,
-        *source.warnings,
-        *clipping_warnings(str(path), clipped_fraction),
-    ):
+    for warning in (*source.notices, *source.warnings, *level.warnings(str(path))):
         print(warning, file=sys.stderr)
 
 
