@@ -3,11 +3,13 @@
 Ctrl-C during slow imports ends the command without a traceback.
 """
 
+import gc
 import signal
 
 
 def main() -> None:
     """Run the command line."""
+    gc.disable()  # during the imports: it frees nothing, and takes a sixth of the startup time
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.shared.interrupt import install_interrupt_handler
 
@@ -17,6 +19,8 @@ def main() -> None:
     from kouxing.services.cli.main import main as run_command_line
 
     signal.signal(signal.SIGINT, interrupt)
+    gc.freeze()  # what was imported stays in memory
+    gc.enable()
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
     run_command_line()
 
