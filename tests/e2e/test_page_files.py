@@ -121,6 +121,7 @@ def test_reading_of_a_file_is_shown_and_can_be_stopped(page: Browser, tmp_path: 
     page.evaluate("void (window.fetch = window.realFetch)")
 
 
+@pytest.mark.usefixtures("drawing_seldom")
 def test_a_dropped_file_is_streamed(
     control: PageControl, session: Session, page: Browser, tmp_path: Path
 ) -> None:

@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -102,6 +104,14 @@ def harness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DriverH
         recorder.join()
 
 
+@pytest.fixture
+def no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let videos start no process, in a test that looks at no video."""
+    process = Mock(commands=SimpleQueue())
+    process.connection.poll.return_value = False
+    monkeypatch.setattr(recorder_client, "_RecorderProcess", lambda _: process)
+
+
 def test_shows_one_session_while_recording_another(
     harness: DriverHarness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +203,7 @@ def test_refuses_more_videos_than_the_limit(harness: DriverHarness) -> None:
     harness.start("one-more", record=True)
 
 
+@pytest.mark.usefixtures("no_process")
 def test_limits_the_videos_of_one_key(harness: DriverHarness) -> None:
     videos = harness.driver.recorder
     for number in range(3):
@@ -241,6 +252,7 @@ def test_a_stopping_driver_saves_the_finished_part_of_a_video(
     assert [path.name for path in harness.folder.iterdir()] == ["film.mp4"]
 
 
+@pytest.mark.usefixtures("no_process")
 def test_follows_only_sessions_that_it_shows_or_records(harness: DriverHarness) -> None:
     harness.is_live = False
     harness.start("heard")
