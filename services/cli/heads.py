@@ -1,8 +1,8 @@
 """The commands under ``kouxing head``, and the GLB files of the heads that the page shows.
 
-They are exported from the package's heads, because they are five times as large. A source tree and
-the container image have them in the page's folder. Otherwise ``kouxing run`` exports them once, to
-the user's cache folder.
+The package contains only its own head files (.npz), because GLB files are five times as large. A
+source tree and the container image have the GLB files in the page's folder. Otherwise
+``kouxing run`` exports them once, to the user's cache folder.
 """
 
 import os

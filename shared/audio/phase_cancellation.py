@@ -15,8 +15,8 @@ _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 class PhaseCancellationGuard:
     """Replaces the mix with the loudest channel while this channel is too weak in the mix.
 
-    This has three causes. A microphone cable inverts one of two channels. The mix of a film omits
-    a channel. Only one of nine channels contains a voice. Other mixes are returned unchanged.
+    A channel is too weak if a microphone cable inverts one of two channels, if the mix of a film
+    omits it, or if only one of nine channels contains a voice. Other mixes are returned unchanged.
     ``name`` is the name of the audio in the warning that is added to ``warnings``.
     """
 

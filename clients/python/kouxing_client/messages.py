@@ -241,7 +241,7 @@ class SessionFacts(msgspec.Struct, frozen=True, kw_only=True):
     expressiveness: Annotated[float, msgspec.Meta(ge=0.5, le=2)] | None = None
     """size of the mouth movements of a face whose settings have none"""
     feeling: Probability | None = None
-    """strength of the feeling from the voice, of a face whose settings have none"""
+    """how strongly a face without this setting shows the emotion in the voice"""
 
 
 class Lateness(msgspec.Struct, frozen=True, kw_only=True):
