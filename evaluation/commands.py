@@ -314,8 +314,8 @@ def report(
 ) -> None:
     """Run the evaluations that are out of date, and write docs/results.md.
 
-    A step is out of date if the code or the models that it depends on have changed. A quick report
-    is written to out/report.
+    A step is out of date if the code or the models that it depends on have changed. With --quick,
+    the report is written to out/report.
     """
     from kouxing.evaluation.report.page import write_page
     from kouxing.evaluation.report.run import run_steps
@@ -446,7 +446,7 @@ app.command(rich_help_panel=_SYSTEM)(faults)
 
 @plot_app.callback()
 def plot() -> None:
-    """Draw pictures and videos of the models."""
+    """Draw pictures of the heads and visemes."""
 
 
 @plot_app.command(name="heads")

@@ -36,7 +36,7 @@ class BenchGroup(TyperGroup):
 app = typer.Typer(
     cls=BenchGroup,
     add_completion=False,
-    help="Measure speed and load. The default command is latency.",
+    help="Measure speed and load. 'kouxing bench my.wav' means 'kouxing bench latency my.wav'.",
 )
 
 

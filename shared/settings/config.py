@@ -495,6 +495,6 @@ def _check_hosts(table: str, config: ServiceConfig) -> None:
         if kind is BindAddress.HOST and not is_loopback(host):
             raise UserError(
                 f"{table}.{key}: other machines can reach {host}, and nothing is encrypted; "
-                f"{config.safe_alternative}, or accept the risk on a trusted network with "
-                "insecure = true"
+                f"{config.safe_alternative}, or, for an experiment on an isolated network, set "
+                "insecure = true (not supported)"
             )

@@ -282,7 +282,11 @@ def phones(
 def align(
     audio: Audio,
     text: Annotated[
-        str, typer.Argument(help="Spoken text or a text file; Mandarin in characters or pinyin.")
+        str,
+        typer.Argument(
+            help="Spoken text or a text file, in the language of --language. Mandarin: characters,"
+            " pinyin or bopomofo."
+        ),
     ],
     language: Language = None,
     acoustic: Acoustic = None,

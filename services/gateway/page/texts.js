@@ -106,7 +106,10 @@ export const TEXTS = {
     zh: "网关关闭了连接。请再按“麦克风”重试。",
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
-  noSpeech: { en: "{file}: no speech was found", zh: "{file}：没有找到语音" },
+  noSpeech: {
+    en: "{file}: no speech was found. Choose a recording with a clear voice.",
+    zh: "{file}：没有找到语音。请选择人声清晰的录音。",
+  },
   noSpeechSilent: { en: "{file}: no speech was found; the file is silent", zh: "{file}：没有找到语音，文件是静音的" },
   oldMouthProfile: {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
@@ -126,8 +129,8 @@ export const TEXTS = {
   lips: { en: "Lips", zh: "口型" },
   speechLanguage: { en: "Speech language", zh: "说话的语言" },
   anyLanguage: {
-    en: "Lip sync works in any language.",
-    zh: "口型适用于任何语言。",
+    en: "The default lips work in any language. Captions and the other lip models need the language of the speech.",
+    zh: "默认口型适用于任何语言。字幕和其他口型需要选择说话的语言。",
   },
   expressiveness: { en: "Mouth movement", zh: "口型幅度" },
   captions: { en: "Captions", zh: "字幕" },
@@ -154,7 +157,7 @@ export const TEXTS = {
   "head.": { en: "default", zh: "默认" },
   "head.woman": { en: "woman", zh: "女士" },
   "head.man": { en: "man", zh: "男士" },
-  "head.elder": { en: "elder", zh: "老人" },
+  "head.elder": { en: "older man", zh: "老人" },
   "head.child": { en: "child", zh: "孩子" },
   "head.ada": { en: "Ada", zh: "艾达" },
   "head.leo": { en: "Leo", zh: "利奥" },
