@@ -147,3 +147,9 @@ test("sound that the sound card loses affects the age only for a while", () => {
   }
   assert.equal(uplink.ageMs(40700, 40000 * 16), 0);
 });
+
+test("the age of sound does not include a pause of the microphone, as during a change of the headset", () => {
+  const uplink = new AudioUplink(new FakeSocket(), 16000);
+  for (const ms of [20, 40, 8060]) uplink.send(ms, ms, new Int16Array(320));
+  assert.equal(uplink.ageMs(8060, 60 * 16), 0);
+});

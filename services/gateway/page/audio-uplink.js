@@ -6,6 +6,7 @@ import { SlidingWindow } from "./sliding-window.js";
 const MAX_BUFFERED_BYTES = 1 << 18; // limits the delay on a network that is slower than speech
 const MAX_AGE_MS = 500; // older chunks are dropped; the page was too busy to send them
 const CLOCK_MS = 10000; // the sound card's clock drifts, and a busy one loses sound
+const MAX_GAP_MS = 500; // after a longer pause of the microphone, older measurements of the clock are wrong
 const OPEN = 1; // WebSocket.OPEN
 
 /** Sends chunks in real time. Drops chunks for which the network or the page is too slow. */
@@ -14,6 +15,7 @@ export class AudioUplink {
   #rateHz;
   #numFrames = 0; // sent or dropped
   #numSkipped = 0; // dropped and not yet reported to the gateway
+  #recordedMs = -Infinity; // when the last chunk was recorded
   #starts = new SlidingWindow(CLOCK_MS); // page's clock at media time 0, measured at each chunk
 
   constructor(socket, rateHz) {
@@ -25,6 +27,8 @@ export class AudioUplink {
   send(nowMs, recordedMs, chunk) {
     if (this.#socket.readyState !== OPEN) return;
     this.#numFrames += chunk.length;
+    if (recordedMs - this.#recordedMs > MAX_GAP_MS) this.#starts.reset();
+    this.#recordedMs = recordedMs;
     this.#starts.add(recordedMs, recordedMs - (1000 * this.#numFrames) / this.#rateHz);
     const isTooLate = nowMs - recordedMs > MAX_AGE_MS;
     if (isTooLate || this.#socket.bufferedAmount > MAX_BUFFERED_BYTES) {
