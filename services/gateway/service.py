@@ -115,7 +115,7 @@ class GatewayService(SessionService):
         self._tasks: set[asyncio.Task[None]] = set()
         self._closing: asyncio.Task[None] | None = None
         self._resting_face = RestingFace(idle_motion=config.idle_motion)
-        self._rest_due_s = 0.0
+        self._resting_frame_due_s = 0.0
         self._replied_s = -math.inf  # time of control's newest reply
         self._missing_since_s = math.inf  # time of the first reply that lacks a service
 
@@ -245,15 +245,17 @@ class GatewayService(SessionService):
             for follower in followers:
                 if follower.session in needed and not follower.is_following:
                     follower.follow()
-        rest_due_s = max(self._rest_due_s, self._viewers.rest_due_s)
-        if now_s >= rest_due_s:
-            self._rest_due_s = rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
+        resting_frame_due_s = max(self._resting_frame_due_s, self._viewers.resting_frame_due_s)
+        if now_s >= resting_frame_due_s:
+            self._resting_frame_due_s = resting_frame_due_s = max(
+                self._resting_frame_due_s + 1.0 / RESTING_RATE_HZ, now_s
+            )
             self._viewers.show_resting_face(self._resting_face, now_s)
         missing_due_s = self._replied_s + CONTROL_MISSING_S
         if now_s > missing_due_s:
             self._viewers.announce_missing_services(("control",))
             missing_due_s = math.inf
-        return min(missing_due_s, rest_due_s)
+        return min(missing_due_s, resting_frame_due_s)
 
     def on_heartbeat_reply(self, reply: HeartbeatReply, sender: Peer) -> None:
         """Announce missing services to the viewers."""

@@ -22,7 +22,7 @@ from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.load_numba import load_numba
 from kouxing.services.recognizer.sessions.audio_intake import AudioIntake
 from kouxing.services.recognizer.sessions.live_batch_decoder import (
-    SESSIONS_TOGETHER,
+    SESSIONS_PER_RUN,
     LiveBatchDecoder,
 )
 from kouxing.services.recognizer.sessions.pending_sessions import PendingSessions
@@ -126,7 +126,7 @@ class RecognizerService(SessionService):
         """Wait for messages; with several sessions, also for those that arrive soon after."""
         sockets = super().wait(timeout_s)
         early_s = self._last_step_s + MIN_STEP_S - time.monotonic()
-        if sockets and early_s > 0.0 and len(self._sessions) >= SESSIONS_TOGETHER:
+        if sockets and early_s > 0.0 and len(self._sessions) >= SESSIONS_PER_RUN:
             time.sleep(early_s)
             sockets = super().wait(0.0)
         self._last_step_s = time.monotonic()

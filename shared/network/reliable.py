@@ -15,7 +15,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.wire.events import batch_messages
-from kouxing.shared.wire.speech import MAX_TOGETHER, Acknowledge, Progress
+from kouxing.shared.wire.speech import MAX_BATCHED_MESSAGES, Acknowledge, Progress
 
 RESEND_AFTER_S = 0.5
 MAX_RESENT = 200  # messages resent at a time; more would delay a busy receiver further
@@ -48,7 +48,7 @@ class ReliableSender:
             self._progress_s = now_s
         self.unacknowledged.append(numbered)
         self._waiting.append(numbered)
-        if isinstance(message, Progress) or len(self._waiting) == MAX_TOGETHER:
+        if isinstance(message, Progress) or len(self._waiting) == MAX_BATCHED_MESSAGES:
             self.flush()
 
     def flush(self) -> None:
@@ -72,8 +72,8 @@ class ReliableSender:
             return 0
         self._progress_s = now_s
         oldest = list(islice(self.unacknowledged, MAX_RESENT))
-        for begin in range(0, len(oldest), MAX_TOGETHER):
-            self.socket.send(batch_messages(oldest[begin : begin + MAX_TOGETHER]))
+        for begin in range(0, len(oldest), MAX_BATCHED_MESSAGES):
+            self.socket.send(batch_messages(oldest[begin : begin + MAX_BATCHED_MESSAGES]))
         return len(oldest)
 
 

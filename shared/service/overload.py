@@ -18,8 +18,8 @@ from __future__ import annotations
 import math
 
 SLOWDOWN_FRACTION = 0.5  # fraction of the limit above which the block network runs less often
-LIGHT_FROM = 0.75  # fraction of the limit above which a session uses the light model
-LIGHT_FOR_S = 2.0  # a session that is on time again still uses it for this time
+LIGHT_MODEL_FRACTION = 0.75  # fraction of the limit above which a session uses the light model
+LIGHT_MODEL_HOLD_S = 2.0  # a session that is on time again still uses it for this time
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
 REPORT_INTERVAL_S = 1.0  # interval between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
@@ -79,8 +79,8 @@ class SkipPolicy:
         late_s = self._late_s(waiting_s, now_s)
         behind_s = min(waiting_s, late_s)
         self.is_behind = behind_s > SLOWDOWN_FRACTION * self._max_lag_s
-        if behind_s > LIGHT_FROM * self._max_lag_s:
-            self._light_until_s = now_s + LIGHT_FOR_S
+        if behind_s > LIGHT_MODEL_FRACTION * self._max_lag_s:
+            self._light_until_s = now_s + LIGHT_MODEL_HOLD_S
         if behind_s <= self._max_lag_s:
             self._late_since_s = math.inf
         else:  # after a stop of this process, the session has been late for some time

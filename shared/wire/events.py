@@ -27,7 +27,7 @@ def is_state_report(message: Message) -> bool:
 
 
 def batch_messages(messages: Sequence[Message]) -> Results:
-    """Return one message with these messages of a session, at most ``MAX_TOGETHER``."""
+    """Return one message with these messages of a session, at most ``MAX_BATCHED_MESSAGES``."""
     return Results(
         session=messages[0].session,
         epoch=messages[0].epoch,

@@ -10,8 +10,8 @@ from msgspec import Meta, Struct, field
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.wire.message import RegisteredMessage
 
-MAX_TOGETHER = 8  # messages in one, so that it fits into the limit of the synthesizer's socket
-_TOGETHER = Meta(max_length=MAX_TOGETHER)
+MAX_BATCHED_MESSAGES = 8  # so that a batch fits into the limit of the synthesizer's socket
+_BATCHED = Meta(max_length=MAX_BATCHED_MESSAGES)
 LipValues = Annotated[bytes, Meta(min_length=4 * len(MOUTH_FAPS), max_length=4 * len(MOUTH_FAPS))]
 Feeling = Annotated[float, Meta(ge=-1, le=1)]
 LipDelay = Annotated[int, Meta(ge=-16_000, le=16_000)]  # samples at 16 kHz
@@ -80,10 +80,10 @@ class Progress(RegisteredMessage, frozen=True, kw_only=True):
 class Results(RegisteredMessage, frozen=True, kw_only=True):
     """Messages that the recognizer sends together; ``sequence`` is their order."""
 
-    phones: Annotated[list[Phone], _TOGETHER] = field(default_factory=list)
-    lip_positions: Annotated[list[LipPositions], _TOGETHER] = field(default_factory=list)
-    speech: Annotated[list[Speech], _TOGETHER] = field(default_factory=list)
-    progress: Annotated[list[Progress], _TOGETHER] = field(default_factory=list)
+    phones: Annotated[list[Phone], _BATCHED] = field(default_factory=list)
+    lip_positions: Annotated[list[LipPositions], _BATCHED] = field(default_factory=list)
+    speech: Annotated[list[Speech], _BATCHED] = field(default_factory=list)
+    progress: Annotated[list[Progress], _BATCHED] = field(default_factory=list)
 
 
 class Acknowledge(RegisteredMessage, frozen=True, kw_only=True):

@@ -42,10 +42,10 @@ class FakeSession:
         self.audio.clear()
         self.found.append("needs the network")
 
-    def hand_over_speech(self) -> None:
+    def begin_background_scoring(self) -> None:
         assert self.is_scoring
 
-    def take_back_speech(self) -> None:
+    def end_background_scoring(self) -> None:
         self.found.append("end of speech")
 
 

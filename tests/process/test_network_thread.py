@@ -22,10 +22,10 @@ class FakeSession:
         self.stream = self
         self.num_scored = 0
 
-    def hand_over_speech(self) -> None:
+    def begin_background_scoring(self) -> None:
         assert self.is_scoring
 
-    def take_back_speech(self) -> None:
+    def end_background_scoring(self) -> None:
         self.num_scored += 1
 
 

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from kouxing.services.cli.launch.service_process import POLL_S, SilenceMeter
+from kouxing.services.cli.launch.service_process import POLL_S, HeartbeatGapMeter
 from kouxing.services.control.fault_log import FaultLog
 from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import ClockOffset, StallDetector
@@ -38,7 +38,7 @@ def test_a_pause_beyond_the_limit_is_a_stall_unless_the_clock_restarts() -> None
 
 @pytest.mark.parametrize("waiting", [0.0, 0.5, 1.0])
 def test_time_without_a_processor_does_not_count_as_silence(waiting: float) -> None:
-    meter = SilenceMeter(0.0)
+    meter = HeartbeatGapMeter(0.0)
     for number in range(1, 21):
         meter.update(POLL_S * number, waiting * POLL_S * number)
     assert meter.duration_s == pytest.approx((1.0 - waiting) * POLL_S * 20)

@@ -271,13 +271,13 @@ def test_a_viewer_that_joins_a_moving_face_gets_the_face_at_rest_once() -> None:
     viewers.add_session("talk", 1, FaceSettings(), "zh")
     with viewers.connect_viewer("", None) as viewer:
         viewers.show_frame("talk", 1, 0, frame, now_s=0.0)
-        assert viewers.rest_due_s < 0
+        assert viewers.resting_frame_due_s < 0
         viewers.show_resting_face(face, now_s=0.01)
         assert binary_types(viewer) == [browser_messages.FAP_TYPE, browser_messages.REST_TYPE]
         viewers.show_frame("talk", 1, 1, frame, now_s=0.02)
         viewers.show_resting_face(face, now_s=0.1)
         assert binary_types(viewer) == [browser_messages.FAP_TYPE]
-        assert viewers.rest_due_s == 0.02 + PAUSE_S
+        assert viewers.resting_frame_due_s == 0.02 + PAUSE_S
         viewers.show_resting_face(face, now_s=0.5)
         assert binary_types(viewer) == [browser_messages.REST_TYPE]
 

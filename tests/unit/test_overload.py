@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.sessions.audio_queue import AudioQueue
-from kouxing.shared.service.overload import CATCH_UP_S, LIGHT_FOR_S, MAX_LATE_FOR_S, SkipPolicy
+from kouxing.shared.service.overload import (
+    CATCH_UP_S,
+    LIGHT_MODEL_HOLD_S,
+    MAX_LATE_FOR_S,
+    SkipPolicy,
+)
 
 MAX_LAG_S = 0.2
 CHUNK_S = 0.02
@@ -163,7 +168,7 @@ def test_a_session_that_is_slightly_behind_uses_the_light_model() -> None:
     session.run(1.0, speed=0.8)
     assert session.overload.needs_light_model(session.now_s)
     assert session.overload.skipped_s == 0.0
-    session.run(LIGHT_FOR_S + 1.0, speed=3.0)
+    session.run(LIGHT_MODEL_HOLD_S + 1.0, speed=3.0)
     assert not session.overload.needs_light_model(session.now_s)
 
 

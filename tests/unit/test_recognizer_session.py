@@ -124,7 +124,7 @@ def test_audio_after_a_gap_waits_for_the_end_of_scoring() -> None:
     session.accept_waveform(1.0, 0.0, hop=1)
     recognizer().decode_streams([session.stream])
     session.is_scoring = True
-    session.stream.hand_over_speech()
+    session.stream.begin_background_scoring()
     session.audio.append((3200, samples[3200:6400]), 0.0)
     session.audio.append((16_000, samples[6400:]), 0.0)
     session.accept_waveform(1.0, 0.0, hop=1)
@@ -132,7 +132,7 @@ def test_audio_after_a_gap_waits_for_the_end_of_scoring() -> None:
     assert session.audio
     assert not session.can_accept
     session.is_scoring = False
-    session.stream.take_back_speech()
+    session.stream.end_background_scoring()
     assert session.can_accept
     session.accept_waveform(1.0, 0.0, hop=1)
     assert session.stream.media_time == 19_200

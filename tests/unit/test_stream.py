@@ -229,13 +229,13 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
                 num_early += len(of_kind(LipPositions, early))
                 results += early
                 recognizer.decode_speech([stream])
-                stream.take_back_speech()
+                stream.end_background_scoring()
                 recognizer.detect_speech([stream])
             elif stream.needs_network:
                 stream.decode_early()
                 results += stream.take_results()
                 if continues:
-                    stream.hand_over_speech()
+                    stream.begin_background_scoring()
             is_scoring = stream.can_accept_while_scoring(stream.next_media_time)
             if not is_scoring:
                 recognizer.decode_speech([stream])
@@ -255,14 +255,14 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
         stream.accept_waveform(SAMPLES[begin : begin + 320])
         recognizer.detect_speech([stream])
         begin += 320
-    stream.hand_over_speech()
+    stream.begin_background_scoring()
     assert not stream.can_accept_while_scoring(begin)  # the lips of this audio are not sent yet
-    stream.take_back_speech()
+    stream.end_background_scoring()
     stream.decode_early()
-    stream.hand_over_speech()
+    stream.begin_background_scoring()
     assert stream.can_accept_while_scoring(begin)
     assert not stream.can_accept_while_scoring(begin + MAX_JITTER_SAMPLES + 1)
-    stream.take_back_speech()
+    stream.end_background_scoring()
     assert not stream.can_accept_while_scoring(begin)
 
 

@@ -19,7 +19,7 @@ from kouxing.shared.service.parent_process import (
 )
 
 POLL_S = 0.5  # interval between checks of a process
-SILENT_S = 1.0  # a loop that sends no heartbeat for longer may hang
+UNRESPONSIVE_S = 1.0  # a loop that sends no heartbeat for longer may hang
 HANG_S = 5.0  # a loop that sends no heartbeat for longer hangs
 
 
@@ -55,33 +55,33 @@ class ServiceProcess(subprocess.Popen[bytes]):
         finally:
             os.close(write_end)
         self._hang_limit_s = hang_limit_s
-        self._silence = SilenceMeter(time.monotonic())
+        self._heartbeat_gap = HeartbeatGapMeter(time.monotonic())
         self._idle_s = 0.0  # extra time until the next heartbeat of a service without sessions
         self.is_ready = False  # whether the process has sent a heartbeat
 
     def read_heartbeats(self) -> None:
         """Update the state of the process. Call this about every ``POLL_S``."""
-        self._silence.update(time.monotonic(), self._waited_s())
+        self._heartbeat_gap.update(time.monotonic(), self._waited_s())
         with contextlib.suppress(BlockingIOError):
             if heartbeats := os.read(self._heartbeats, 65536):
-                self.reset_silence()
+                self.reset_heartbeat_gap()
                 self.is_ready = True
                 is_idle = heartbeats.endswith(IDLE_HEARTBEAT)
                 self._idle_s = IDLE_HEARTBEAT_S - HEARTBEAT_S if is_idle else 0.0
 
     @property
-    def is_silent(self) -> bool:
+    def is_unresponsive(self) -> bool:
         """Whether a heartbeat is missing."""
-        return self._silence.duration_s > SILENT_S + self._idle_s
+        return self._heartbeat_gap.duration_s > UNRESPONSIVE_S + self._idle_s
 
-    def reset_silence(self) -> None:
+    def reset_heartbeat_gap(self) -> None:
         """Restart the timeout as if a heartbeat had arrived."""
-        self._silence.duration_s = 0.0
+        self._heartbeat_gap.duration_s = 0.0
 
     @property
     def is_hung(self) -> bool:
         """Whether the service's loop hangs, or the process is stopped."""
-        return self.is_ready and self._silence.duration_s > self._hang_limit_s + self._idle_s
+        return self.is_ready and self._heartbeat_gap.duration_s > self._hang_limit_s + self._idle_s
 
     def _waited_s(self) -> float:
         """Return how long the main thread has waited for a processor; 0 if unknown."""
@@ -92,7 +92,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         return int(waited_ns) / 1e9
 
 
-class SilenceMeter:
+class HeartbeatGapMeter:
     """Measures the time in which a loop could run but sent no heartbeat, in seconds."""
 
     def __init__(self, now_s: float) -> None:

@@ -156,9 +156,9 @@ class Supervisor:
         processes = self._processes()
         for process in processes:
             process.read_heartbeats()
-        if len(processes) > 1 and all(process.is_silent for process in processes):
+        if len(processes) > 1 and all(process.is_unresponsive for process in processes):
             for process in processes:  # all processes were stopped, so none of them hangs
-                process.reset_silence()
+                process.reset_heartbeat_gap()
         for service in self._services.values():
             if service.process is not None:
                 self._check_process(service, service.process, now_s)

@@ -142,7 +142,7 @@ class ViewerHandler:
 
     def show_resting_face(self, face: RestingFace, now_s: float) -> None:
         """Send the face at rest to new viewers, and to viewers without recent frames."""
-        viewers = [viewer for viewer in self._viewers if now_s >= _rest_due_s(viewer)]
+        viewers = [viewer for viewer in self._viewers if now_s >= _resting_frame_due_s(viewer)]
         faps = face.faps(now_s).astype("<f4").tobytes()
         message = browser_messages.encode_binary(browser_messages.REST_TYPE, 0, 0, faps)
         for viewer in viewers:
@@ -151,9 +151,9 @@ class ViewerHandler:
         self._put_shapes(viewers, MessageKind.REST_SHAPES, "rest", 0, 0, faps)
 
     @property
-    def rest_due_s(self) -> float:
+    def resting_frame_due_s(self) -> float:
         """When the face at rest is due for the first viewer; infinite without viewers."""
-        return min(map(_rest_due_s, self._viewers), default=math.inf)
+        return min(map(_resting_frame_due_s, self._viewers), default=math.inf)
 
     @property
     def newest_session(self) -> str:
@@ -335,7 +335,7 @@ def _check_single(command: ViewerCommand, lip_model: str | None) -> None:
         )
 
 
-def _rest_due_s(viewer: Viewer) -> float:
+def _resting_frame_due_s(viewer: Viewer) -> float:
     """Return when the face at rest is due for a viewer."""
     return viewer.last_frame_s + PAUSE_S if viewer.has_resting_face else -math.inf
 

@@ -26,7 +26,7 @@ from kouxing.shared.monitoring.metrics import trim_heap
 MAX_CONNECTIONS = 256
 IDLE_TIMEOUT_S = 10.0  # limit for the wait for the next request
 BODY_TIMEOUT_S = 70.0  # limit for the body on unlimited paths; uploads are answered earlier
-MAX_HEAD_BYTES = 64 * 1024  # limit for the first line and the headers of a request
+MAX_HEADER_BYTES = 64 * 1024  # limit for the first line and the headers of a request
 ANSWER_TIMEOUT_S = 120.0  # limit for sending a file; a head is 5 MB
 BACKLOG = 128
 KEEPALIVE_S = 20  # after this time without data, the system probes the client
@@ -107,7 +107,7 @@ class _Connection(web.RequestHandler):
         self.set_timeout(IDLE_TIMEOUT_S)
         self.request: web.BaseRequest | None = None  # while its handler runs
         self.is_lost = asyncio.Event()
-        self._head_bytes = 0
+        self._header_bytes = 0
         self._log_limit = log_limit
 
     def connection_lost(self, exc: BaseException | None) -> None:
@@ -119,8 +119,8 @@ class _Connection(web.RequestHandler):
         """Handle data; close if a request's head is too long, or too many requests are queued."""
         super().data_received(data)
         is_head = self._waiter is not None and not self._waiter.done()
-        self._head_bytes = self._head_bytes + len(data) if is_head else 0
-        is_too_long = self._head_bytes > MAX_HEAD_BYTES or len(self._messages) > 1
+        self._header_bytes = self._header_bytes + len(data) if is_head else 0
+        is_too_long = self._header_bytes > MAX_HEADER_BYTES or len(self._messages) > 1
         if is_too_long and self.transport is not None:
             self.transport.abort()
 

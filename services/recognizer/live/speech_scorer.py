@@ -182,17 +182,17 @@ class SpeechScorer:
         self._encoder_queue.popleft()
         self._detected.extend(self._segmenter.process(encoder_input, output))
 
-    def hand_over_speech(self) -> bool:
+    def begin_background_scoring(self) -> bool:
         """Hand the speech so far to another thread; return whether more audio may follow now.
 
         If so, ``detect_speech`` and ``take_early_events`` process only audio that follows, until
-        ``take_back_speech``. Queued events prevent this, because their order would change.
+        ``end_background_scoring``. Queued events prevent this, because their order would change.
         """
         if all(isinstance(item, SpeechFrames) for item in self._queue):
             self._detected = deque()
         return self._detected is not self._queue
 
-    def take_back_speech(self) -> None:
+    def end_background_scoring(self) -> None:
         """Take the speech back: this thread scores the speech that follows."""
         if self._detected is not self._queue:
             self._queue.extend(self._detected)

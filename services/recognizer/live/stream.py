@@ -165,18 +165,18 @@ class SpeechStream:
             self.decode()
             self._results += self._segments[0].decode_early()
 
-    def hand_over_speech(self) -> None:
-        """Hand the detected speech to another thread, until ``take_back_speech``.
+    def begin_background_scoring(self) -> None:
+        """Hand the detected speech to another thread, until ``end_background_scoring``.
 
         In the meantime, ``take_results`` returns only results of ``decode_early``. The stream may
         take further audio if ``can_accept_while_scoring``, and no other calls.
         """
-        if len(self._segments) == 1 and self._segments[0].scorer.hand_over_speech():
+        if len(self._segments) == 1 and self._segments[0].scorer.begin_background_scoring():
             self._early_results = []
 
-    def take_back_speech(self) -> None:
+    def end_background_scoring(self) -> None:
         """Take the speech back from the other thread: all calls are allowed again."""
-        self._segments[0].scorer.take_back_speech()
+        self._segments[0].scorer.end_background_scoring()
         self._early_results = None
 
     def can_accept_while_scoring(self, media_time: int) -> bool:

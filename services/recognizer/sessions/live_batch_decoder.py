@@ -16,7 +16,7 @@ from kouxing.shared.monitoring.metrics import LoadMeter
 
 MAX_BATCH_S = 0.3  # audio of all sessions that is decoded together
 MIN_PART_S, MAX_PART_S = 0.02, 0.06  # audio of each live session in such a batch
-SESSIONS_TOGETHER = 4  # the encoder processes these in one run
+SESSIONS_PER_RUN = 4  # the encoder processes these in one run
 NETWORK_WEIGHT = 0.25  # weight of the block network's time in the load of the service
 
 
@@ -87,8 +87,8 @@ class LiveBatchDecoder:
             self._hop_controller.update(self.work - self.unpaced_work, now_s, is_behind=is_behind)
         part_s = min(MAX_PART_S, max(MIN_PART_S, MAX_BATCH_S / max(1, len(sessions))))
         # in groups, so that the first sessions do not wait for all others
-        for begin in range(0, len(sessions), SESSIONS_TOGETHER):
-            group = sessions[begin : begin + SESSIONS_TOGETHER]
+        for begin in range(0, len(sessions), SESSIONS_PER_RUN):
+            group = sessions[begin : begin + SESSIONS_PER_RUN]
             for session in group:
                 session.accept_waveform(part_s, now_s, self._hop_controller.hop)
             self._recognizer.detect_speech([session.stream for session in group])

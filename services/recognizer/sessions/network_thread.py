@@ -16,8 +16,8 @@ class NetworkThread:
     """Decodes sessions with enough audio for the next run of the block network.
 
     While a session is on the thread (``is_scoring``), other threads may only use its stream as
-    ``SpeechStream.hand_over_speech`` describes, so that lips do not wait for the network. The
-    thread calls ``on_decoded`` when sessions are decoded.
+    ``SpeechStream.begin_background_scoring`` describes, so that lips do not wait for the network.
+    The thread calls ``on_decoded`` when sessions are decoded.
     """
 
     def __init__(self, recognizer: Recognizer, on_decoded: Callable[[], None]) -> None:
@@ -51,7 +51,7 @@ class NetworkThread:
         self._batch, self._due = self._due[:MAX_SESSIONS], self._due[MAX_SESSIONS:]
         for session in self._batch:
             session.waits_for_network, session.is_scoring = False, True
-            session.stream.hand_over_speech()
+            session.stream.begin_background_scoring()
         streams = [session.stream for session in self._batch]
         self._job = self._executor.submit(self._decode, streams)
         self._job.add_done_callback(lambda _: self._on_decoded())
@@ -64,7 +64,7 @@ class NetworkThread:
         self._job = None
         for session in self._batch:
             session.is_scoring = False
-            session.stream.take_back_speech()
+            session.stream.end_background_scoring()
         return self._batch
 
     def wait(self) -> None:
