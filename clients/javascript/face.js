@@ -45,13 +45,10 @@ export class KouxingFace extends HTMLElement {
 
   constructor() {
     super();
-    const canvas = document.createElement("canvas");
-    canvas.addEventListener("webglcontextlost", () => this.#showError(new Error(LOST_WEBGL), LOST_WEBGL));
-    canvas.addEventListener("webglcontextrestored", () => (this.#note.textContent = ""));
     const style = document.createElement("style");
     style.textContent =
       ":host { display: block; aspect-ratio: 1; contain: strict } p { position: absolute; margin: 1em } canvas { display: block; width: 100%; height: 100% }";
-    this.attachShadow({ mode: "open" }).append(style, this.#note, canvas);
+    this.attachShadow({ mode: "open" }).append(style, this.#note);
     this.#scene.add(new THREE.HemisphereLight(0xffffff, 0x8d8d99, 2));
     const key = new THREE.DirectionalLight(0xfff4ea, 2);
     key.position.set(-1, 1, 2);
@@ -59,7 +56,12 @@ export class KouxingFace extends HTMLElement {
   }
 
   connectedCallback() {
-    const canvas = this.shadowRoot.querySelector("canvas");
+    const canvas = document.createElement("canvas");
+    canvas.addEventListener("webglcontextlost", () => {
+      if (canvas.isConnected) this.#showError(new Error(LOST_WEBGL), LOST_WEBGL);
+    });
+    canvas.addEventListener("webglcontextrestored", () => (this.#note.textContent = ""));
+    this.shadowRoot.append(canvas);
     try {
       this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     } catch (error) {
@@ -86,7 +88,9 @@ export class KouxingFace extends HTMLElement {
     this.#removeAvatar();
     this.#images?.close();
     this.#renderer?.dispose();
+    this.#renderer?.forceContextLoss(); // a page may have about 16, and a removed element may stay in memory
     this.#renderer = null;
+    this.shadowRoot.querySelector("canvas").remove();
   }
 
   attributeChangedCallback(name) {

@@ -290,6 +290,18 @@ def test_the_web_component_reports_wrong_addresses(faces: Browser) -> None:
     faces.page_errors.clear()
 
 
+def test_the_web_component_releases_its_webgl_context_when_it_is_removed(faces: Browser) -> None:
+    context = "own.shadowRoot.querySelector('canvas').getContext('webgl2')"
+    faces.evaluate(
+        f"own.failure = ''; window.removed = {context};"
+        "{ const face = own, { parentElement, nextSibling } = face; face.remove();"
+        " parentElement.insertBefore(face, nextSibling); }"
+    )
+    faces.wait_for("removed.isContextLost() && own.set === 'faps'")
+    assert not faces.evaluate(f"{context}.isContextLost()")
+    assert faces.evaluate("own.failure") == ""
+
+
 def test_a_page_may_load_the_web_component_twice(faces: Browser) -> None:
     before = "customElements.get('kouxing-face') === own.constructor"
     load = "import('/node_modules/kouxing-client/face.js?second')"
