@@ -387,6 +387,9 @@ def test_reads_pinyin_with_any_punctuation(text: str) -> None:
         ("<html>" + "<title>" * 200_000 + "</x>" * 200_000, ""),
         ("# a\n" + "![" * 500_000, "a\n" + "![" * 500_000),
         ("1.1" + " " * 500_000 + "a", "1.1" + " " * 500_000 + "a"),
+        ("WEBVTT\n\n1\n" + " " * 500_000 + "a", "1\na"),
+        ("[00:01]a" + " " * 500_000 + "b", "a" + " " * 500_000 + "b"),
+        ("a" + "1" * 500_000 + "!", "a" + "1" * 500_000 + "!"),
     ],
 )
 def test_reads_damaged_text_in_linear_time(text: str, spoken: str) -> None:

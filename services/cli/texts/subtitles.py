@@ -14,11 +14,11 @@ CLOCK = r"(?:\d{1,3}[:：])?\d{1,2}[:：]\d{2}(?:[.,:]\d{1,3})?"  # 0:05, 00:00:
 _CUE = rf"[ \t]*{CLOCK}[ \t]*-->[ \t]*{CLOCK}"
 _SETTINGS = r"(?:[ \t]+(?:vertical|line|position|size|align|region|[XY][12]):\S+)*"
 CUE_TIMES = re.compile(rf"^{_CUE}{_SETTINGS}", re.MULTILINE)
-_CUE_NUMBER = re.compile(rf"^[ \t]*\d+[ \t]*\n\s*(?={_CUE})", re.MULTILINE)
+_CUE_NUMBER = re.compile(rf"^[ \t]*\d+\s*\n(?={_CUE})", re.MULTILINE)
 _SOUND_NAME = re.compile(r"\[[^][\n]*\]|【[^【】\n]*】|[♪♫]")
 _BRACES = re.compile(r"\{[^{}]*\}")
 SBV_TIMES = re.compile(r"^\d+:\d{2}:\d{2}\.\d{3},\d+:\d{2}:\d{2}\.\d{3}[ \t]*$", re.MULTILINE)
-LRC_TIME = r"[ \t]*\[(\d{1,3}):(\d{1,2}(?:[.:]\d{1,3})?)\]"
+LRC_TIME = r"\[(\d{1,3}):(\d{1,2}(?:[.:]\d{1,3})?)\]"
 _LRC_FIELD = re.compile(r"\[[A-Za-z#]+:[^\]]*\]")
 LYRICS_TIME = r"\[\d+,\d+\]"
 FRAME_NUMBERS = r"(?:\{\d+\}\{\d*\}|\[\d+\]\[\d*\])"
@@ -64,7 +64,7 @@ def read_lrc(text: str) -> str:
     for line in text.split("\n"):
         if _LRC_FIELD.fullmatch(line.strip()):
             continue
-        first = re.match(rf"(?:{LRC_TIME})*", line)
+        first = re.match(rf"(?:[ \t]*{LRC_TIME})*", line)
         times_s = [
             60 * int(minutes) + float(seconds.replace(":", "."))
             for minutes, seconds in re.findall(LRC_TIME, first[0] if first else "")

@@ -78,7 +78,7 @@ _FORMATS: tuple[tuple[str, Callable[[str], object], Callable[[str], str]], ...] 
     ("SubRip (SRT)", subtitles.CUE_TIMES.search, subtitles.read_cues),
     ("lyrics with times", _has_line(subtitles.LYRICS_TIME), subtitles.read_timed_lyrics),
     ("SBV", subtitles.SBV_TIMES.search, subtitles.read_sbv),
-    ("LRC", _has_line(subtitles.LRC_TIME), subtitles.read_lrc),
+    ("LRC", _has_line(rf"[ \t]*{subtitles.LRC_TIME}"), subtitles.read_lrc),
     ("a transcript with times", transcripts.has_times, transcripts.read_timed_lines),
     ("a transcript with speakers", _has_line(transcripts.SPEAKER), transcripts.read_speakers),
     ("MicroDVD or MPL2", _starts_with(subtitles.FRAME_NUMBERS), subtitles.read_frame_numbers),

@@ -28,7 +28,7 @@ _ZERO = re.compile(r"(?:^|[ \t])0?0[:：]")
 _MAX_LINES = 4  # from the first time to the next one
 LABEL = (  # times of Audacity or CTM, or the name of a recording
     r"(?:\d+(?:\.\d+)?\t\d+(?:\.\d+)?\t|(?:\S+ \d )?\d+\.\d+ +\d+\.\d+ +"
-    r"|[A-Za-z]+(?:[\w.-]*?\d){6}[\w.-]*[ \t]+)"
+    r"|[A-Za-z](?:(?:[^\W\d]|[.-])*\d){6}[\w.-]*[ \t]+)"
 )
 SPEAKER = (  # number of a speaker, such as SPEAKER_00: or 说话人 1：
     rf"[ \t]*(?:[A-Za-z]+[ _]?|(?:说话人|說話人|发言人|發言人)[ ]?)\d+(?:[ \t]+{CLOCK})?[ \t]*[:：]"
