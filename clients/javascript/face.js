@@ -133,15 +133,18 @@ export class KouxingFace extends HTMLElement {
    * Play the recording.
    *
    * @param audio HTMLAudioElement that plays the sound; null for silence
-   * @returns a promise that is resolved at the end, or when another recording starts
+   * @returns a promise that is resolved at the end, or when another recording starts. If the face is removed or gets
+   *   another model while the recording is loaded, it is rejected with an AbortError, which the caller can ignore.
    */
   async play(audio = null) {
     const url = this.getAttribute("recording");
     if (!url) throw new Error("<kouxing-face> needs the attribute recording; add it");
-    if (this.#avatar === null) throw new Error("the model is not loaded yet; wait for the event load");
+    const avatar = this.#avatar;
+    if (avatar === null) throw new Error("the model is not loaded yet; wait for the event load");
     const bytes = await fetchFile(url).catch(({ message }) => {
       throw new Error(`${url}: ${message}`);
     });
+    if (this.#avatar !== avatar) throw new DOMException("the face was removed, or its model changed", "AbortError");
     const { names, frames } = readRecording(bytes);
     const set = names === null ? "faps" : chooseSet(names);
     if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);

@@ -261,6 +261,20 @@ def test_the_web_component_plays_recordings_on_models_of_all_kinds(
             pass
 
 
+def test_the_web_component_plays_no_recording_after_it_was_removed(
+    faces: Browser, project: Path
+) -> None:
+    write_recording(project / "late.jsonl", "arkit", "jawOpen")
+    result = faces.evaluate(
+        "arkit.setAttribute('recording', 'late.jsonl');"
+        "{ const face = arkit, { parentElement, nextSibling } = face;"
+        " window.playing = face.play().catch(({ name }) => name); face.remove();"
+        " parentElement.insertBefore(face, nextSibling); } window.playing"
+    )
+    assert result == "AbortError"
+    faces.wait_for("arkit.set === 'arkit'")
+
+
 def test_the_web_component_reports_that_it_is_no_longer_drawn(faces: Browser) -> None:
     faces.evaluate(
         "none.failure = ''; window.context = none.shadowRoot.querySelector('canvas')"
