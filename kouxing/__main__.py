@@ -19,7 +19,7 @@ def main() -> None:
     from kouxing.services.cli.main import main as run_command_line
 
     signal.signal(signal.SIGINT, interrupt)
-    gc.freeze()  # what was imported stays in memory
+    gc.freeze()  # imported modules stay in memory
     gc.enable()
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
     run_command_line()

@@ -1,5 +1,6 @@
 """Running services for tests: real processes, real sockets, reserved ports."""
 
+import atexit
 import contextlib
 import io
 import os
@@ -94,6 +95,12 @@ def _keep(reservation: contextlib.ExitStack) -> None:
     _reservations.append(reservation)
     if len(_reservations) > MAX_RESERVATIONS:
         _reservations.popleft().close()
+
+
+@atexit.register
+def _release_ports() -> None:
+    while _reservations:
+        _reservations.pop().close()
 
 
 def child_environment() -> dict[str, str]:
