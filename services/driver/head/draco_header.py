@@ -1,6 +1,7 @@
 """Reads the size of a Draco mesh before it is decoded (Draco Bitstream Specification 2.2).
 
 DracoPy cannot limit the size of a decoded mesh, and a few bytes can describe millions of faces.
+The header does not contain the number of attributes, and only a decoder can find their headers.
 """
 
 import io
