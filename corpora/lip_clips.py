@@ -46,11 +46,12 @@ _FILMED = "tracked video"  # start of the kind of a filmed clip
 CLOSED_FRACTION = 0.1  # lips that touch open at most this fraction of their tracked range
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
 
-# Change of ``LIP_FAPS`` for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the
-# same name of MakeHuman's face (CC0), both sides of a pair together. The rig's jaw opens wider than
-# a speaker's, so it is scaled to the opening of filmed speakers. Pursed lips are scaled to half a
-# centimeter. Real pursed lips nearly touch, but the shapes' lips do not, so their heights come from
-# the filmed speakers' u. The head adds the backward swing of the jaw.
+# Change of ``LIP_FAPS`` when a shape of FACEGOOD's rig has weight 1. It was measured on the ARKit
+# shape of the same name of MakeHuman's face (CC0), with both sides of a pair together.
+# The rig's jaw opens wider than a speaker's, so it is scaled to the opening of filmed speakers.
+# Pursed lips are scaled to half a centimeter. Real pursed lips nearly touch, but the shapes' lips
+# do not, so their heights come from the filmed speakers' u. The head adds the backward swing of
+# the jaw.
 _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
 _RIG_DELAY_S = 0.04  # lag of its lips behind filmed speakers' lips

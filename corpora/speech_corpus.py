@@ -3,8 +3,8 @@
 The files in the folder determine the layout:
 
 - ``manifest.tsv``: columns ``utt_id path speaker source license split kind seconds text pinyin``.
-  Only one of ``text`` and ``pinyin`` is required; ``pinyin`` takes precedence. ``synthetic`` as the
-  ``kind``, or in the license, marks speech of a synthesizer.
+  Only one of ``text`` and ``pinyin`` is required; ``pinyin`` takes precedence. If the ``kind`` is
+  ``synthetic``, or the license contains this word, the speech is synthetic.
 - A Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``). If its name is ``dev`` or ``test``, it
   is that split.
 - AISHELL-1 (``transcript/aishell_transcript_v0.8.txt`` and ``wav/<split>/<speaker>/*.wav``).
@@ -14,11 +14,11 @@ its own language (:mod:`kouxing.corpora.universal_phones`). Bad rows are reporte
 skipped, because large corpora always contain some.
 
 Natural recordings are held out from all training, to measure recognizers on them.
-``conversation.tsv`` is a manifest of those with a text: podcasts, a talk, a web seminar and a
-prompt, with eight voices. The publishers of ``MOSS-TTSD`` and ``Step-Audio-EditX`` provide the
-texts. Other texts are the output of one large recognizer (``RapidASR``) or the majority of several
-(``vad_example``), so they contain errors. Long recordings are cut into segments that overlap by
-0.48 s, and so are their texts.
+``conversation.tsv`` lists the natural recordings that have a text: podcasts, a talk, a web seminar
+and a prompt, with eight voices. The publishers of ``MOSS-TTSD`` and ``Step-Audio-EditX`` provide
+their texts. Other texts contain errors, because they are the output of one large recognizer
+(``RapidASR``) or a majority vote of several (``vad_example``). Long recordings and their texts are
+cut into segments that overlap by 0.48 s.
 
 ``languages.tsv`` lists recordings in several languages, by speakers that no model was trained on,
 and their phones. No setting of the universal model was chosen on these recordings, except for those

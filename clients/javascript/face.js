@@ -338,7 +338,10 @@ export class KouxingFace extends HTMLElement {
   }
 }
 
-/** Import the optional package. Bundlers only accept that it is missing inside a try block. */
+/**
+ * Import the optional package. Bundlers tolerate a missing package only if the import is in a try
+ * block.
+ */
 async function importLipSync() {
   try {
     const { LipSync } = await import("kouxing-lips");

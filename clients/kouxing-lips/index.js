@@ -7,10 +7,10 @@ const SHOW_AFTER_S = 0.1; // time from the sound to its face: the lips' delay, b
 const DEFAULT_SHAPES = ["arkit"];
 const OPTIONS = ["models", "phones", "context", "shapes", "expressiveness", "feeling", "delayMs"];
 const MAX_LATE_S = 0.5; // maximum time from the sound to its face
-const LIVE_TRACK_S = 60; // duration of the frames that are kept
-const PUSHED_TRACK_S = 3600; // of push(), whose audio may arrive long before its face is shown
+const LIVE_TRACK_S = 60; // how long the frames of listenTo() are kept
+const PUSHED_TRACK_S = 3600; // of push(), because audio may arrive long before its face is shown
 const TELEPHONE_HZ = 8000;
-const CLICKS = ["pointerdown", "keydown"]; // events in which browsers allow sound to start
+const USER_GESTURES = ["pointerdown", "keydown"]; // events in which browsers allow sound to start
 const MODELS = new URL("models/", import.meta.url);
 
 const TEXTS = {
@@ -157,7 +157,7 @@ export class LipSync extends EventTarget {
     const isBlocked = await Promise.race([started.then(() => false), new Promise((done) => setTimeout(done, 300, true))]);
     if (!isBlocked || this.#isClosed) return;
     this.#report(TEXTS.suspended);
-    for (const type of CLICKS) document.addEventListener(type, this.#resumeContext, { once: true });
+    for (const type of USER_GESTURES) document.addEventListener(type, this.#resumeContext, { once: true });
   }
 
   /** The face to show now, for sound from listenTo(): { faps, arkit, ... }; null before the first. */
@@ -184,7 +184,7 @@ export class LipSync extends EventTarget {
     this.stop();
     this.#supersede();
     document.removeEventListener("visibilitychange", this.#onVisibility);
-    for (const type of CLICKS) document.removeEventListener(type, this.#resumeContext);
+    for (const type of USER_GESTURES) document.removeEventListener(type, this.#resumeContext);
     this.#worker.terminate();
     this.#context?.removeEventListener("statechange", this.#onContextState);
     if (this.#ownsContext) this.#context?.close();
@@ -328,7 +328,7 @@ export class LipSync extends EventTarget {
   };
 
   #resumeContext = () => {
-    this.#context.resume().catch(() => {}); // the page has closed its context
+    this.#context.resume().catch(() => {}); // fails if the page has closed its context
   };
 
   #report(text) {

@@ -11,7 +11,7 @@ class KeyDistributor:
         self._zap = zap
         self._versions: dict[str, tuple[int, int]] = {}  # of the sent list, by worker instance
 
-    def keys_for(self, heartbeat: Heartbeat) -> dict[str, AllowedKey] | None:
+    def next_key_update(self, heartbeat: Heartbeat) -> dict[str, AllowedKey] | None:
         """Return the list for a worker's next reply; None if the worker has the list already."""
         zap, instance = self._zap, heartbeat.instance
         if zap is None or heartbeat.role != "worker" or self._versions.get(instance) == zap.version:

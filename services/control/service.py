@@ -257,7 +257,7 @@ class ControlService(Service):
             received_ns=received_ns,
             replied_ns=now_ns(),
             control_instance=self._process_id,
-            keys=self._keys.keys_for(heartbeat),
+            keys=self._keys.next_key_update(heartbeat),
             missing=self._placement.missing_kinds(),
             idle_limit_s=self._idle_limit_s,
         )

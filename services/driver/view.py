@@ -1,7 +1,7 @@
 """Shows a face live in a window, a virtual camera, both or neither.
 
-Drawing needs slow imports. They are inside functions: a driver without an output starts twice as
-fast, and needs half of the memory.
+The imports for drawing are slow, so they are inside functions. A driver without an output then
+starts twice as fast and needs half the memory.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def parse_target(url: str) -> Target:
 
 
 def _normalize(parts: SplitResult, host: str, default_port: int) -> str:
-    """Return the one spelling of an address: always with the host, and without the default port."""
+    """Return the canonical form of an address: with the host, and without the default port."""
     address = f"[{host}]" if ":" in host else host
     if parts.port not in (None, default_port):
         address += f":{parts.port}"

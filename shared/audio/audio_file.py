@@ -33,7 +33,7 @@ from kouxing.shared.files.user_file import check_content, open_file
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000  # limit for a session; files above are resampled to it
 BLOCK_S = 0.02
-_MAX_FLOAT = 100.0  # larger samples are integers that were written as floats
+_MAX_PLAUSIBLE_SAMPLE = 100.0  # larger samples are integers that were written as floats
 _MIN_MISSING_S = 0.05  # a file that lacks more than this is reported as cut off
 _MAX_SPOOLED_BYTES = 64 << 20  # in memory, for a pipe that must be read completely
 MAX_FILE_BYTES = 8 << 30
@@ -364,7 +364,7 @@ def _check_samples(
                 "export the file again, for example as 16-bit PCM"
             )
         peak = np.abs(samples).max(initial=0.0)
-        if peak > _MAX_FLOAT:
+        if peak > _MAX_PLAUSIBLE_SAMPLE:
             raise UserError(
                 f"{path}: a sample is {peak:.0f}, but full scale is 1; divide integers by 32768,"
                 " and export the file again"

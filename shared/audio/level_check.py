@@ -5,9 +5,9 @@ import numpy as np
 from kouxing.shared.audio.phase_cancellation import Samples
 
 _CLIPPED_LEVEL = 0.999
-_CLIPPED_FRACTION = 0.01  # above this fraction of the samples, the user is warned
-_OFFSET_FRACTION = 0.1  # of the power; less than 0.001 in usual recordings
-_INAUDIBLE_OFFSET = 0.001  # silent recordings may have such an offset
+_CLIPPED_FRACTION = 0.01  # warn if a larger fraction of the samples is clipped
+_OFFSET_FRACTION = 0.1  # warn above this fraction of the power; usual recordings are below 0.001
+_INAUDIBLE_OFFSET = 0.001  # never warn up to this offset, which silent recordings may have
 
 
 class LevelCheck:

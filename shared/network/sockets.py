@@ -329,7 +329,7 @@ class Poller:
 
     def remove(self, socket: Socket) -> None:
         """Stop watching a socket."""
-        self._poller.register(socket.raw, 0)  # 0: no longer, if it was polled
+        self._poller.register(socket.raw, 0)  # 0: unregister, without an error if not registered
         del self._sockets[socket.raw]
         self._quiet.discard(socket.raw)
         self._paused.discard(socket.raw)

@@ -19,7 +19,7 @@ import math
 
 SLOWDOWN_FRACTION = 0.5  # fraction of the limit above which the block network runs less often
 LIGHT_MODEL_FRACTION = 0.75  # fraction of the limit above which a session uses the light model
-LIGHT_MODEL_HOLD_S = 2.0  # a session that is on time again still uses it for this time
+LIGHT_MODEL_HOLD_S = 2.0  # how long a session that is on time again keeps the light model
 MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
 REPORT_INTERVAL_S = 1.0  # interval between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing

@@ -18,15 +18,15 @@ def test_a_worker_receives_each_version_of_the_list_once() -> None:
     zap = Zap(lambda _changed: None)
     keys = KeyDistributor(zap)
     allowed = {lamp.public: AllowedKey(name="lamp", roles=["client"])}
-    assert keys.keys_for(replace(WORKER, role="observer")) is None
-    assert keys.keys_for(WORKER) == allowed
-    assert keys.keys_for(WORKER) is None
+    assert keys.next_key_update(replace(WORKER, role="observer")) is None
+    assert keys.next_key_update(WORKER) == allowed
+    assert keys.next_key_update(WORKER) is None
     keys.forget(WORKER.instance)
-    assert keys.keys_for(WORKER) == allowed
+    assert keys.next_key_update(WORKER) == allowed
     revoke_key("lamp")
     zap.refresh()
-    assert keys.keys_for(WORKER) == {}
+    assert keys.next_key_update(WORKER) == {}
 
 
 def test_without_encryption_there_is_no_list() -> None:
-    assert KeyDistributor(None).keys_for(WORKER) is None
+    assert KeyDistributor(None).next_key_update(WORKER) is None

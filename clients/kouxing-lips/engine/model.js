@@ -46,7 +46,7 @@ export async function loadModel(base, { phones = false } = {}) {
   };
 }
 
-/** A server may answer a wrong address with its start page, so a file that was loaded may be no model. */
+/** Parse model.json. For a wrong address, a server may return its start page instead. */
 function parseHeader(bytes, folder) {
   try {
     return JSON.parse(new TextDecoder().decode(bytes));

@@ -185,8 +185,8 @@ function dot(x: usize, weights: usize, size: u32): f32 {
 /**
  * Filter a signal at the positions (first + i * down) / up, whose phase is the remainder.
  * x: float, from the sample at position 0 of the filter on; out: (count,) float
- * table: (phases + 1, size) float, size a multiple of 4; the last row is for the next sample. The filter is
- * interpolated between the rows.
+ * table: (phases + 1, size) float, size a multiple of 4. Row p is the filter at phase p / phases,
+ * so the last row is phase 0 of the next sample. Between rows, the filter is interpolated linearly.
  */
 export function resample(x: usize, table: usize, out: usize, count: i32, size: u32, phases: u32, up: u32, down: u32, first: u32): void {
   for (let i = 0; i < count; i++, first += down) {

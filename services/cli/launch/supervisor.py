@@ -265,7 +265,7 @@ class Supervisor:
         with stream, contextlib.closing(log):
             for line in stream:
                 log.write(line)
-                # Log lines are JSON, so this is the text that `services.process` prints at its end.
+                # Log lines are JSON; only the final error of `services.process` starts like this.
                 if line.startswith((f"{kind}:".encode(), f"{kind}.".encode())):
                     service.error = line.decode("utf-8", "replace").rstrip()  # `check` raises it
                 elif text := _console_text(line):

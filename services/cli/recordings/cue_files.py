@@ -43,8 +43,8 @@ def format_cues(
 ) -> str:
     """Return the cues of a recording as a file, for a suffix in ``CUE_FORMATS``.
 
-    ``end_s`` is the end of the recording. Later cues are left out. Lips that close for a pause are
-    at rest immediately. Equal consecutive mouths become one cue.
+    ``end_s`` is the end of the recording. Later cues are omitted. A closed mouth directly before a
+    rest becomes part of the rest. Consecutive cues with the same mouth are merged.
     """
     end = math.floor(100.0 * end_s + 1e-6) / 100.0
     merged: list[Cue] = []

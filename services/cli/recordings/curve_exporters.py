@@ -39,8 +39,8 @@ Values = NDArray[np.float32]
 FrameRow = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
 _SHAPE_FORMATS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
 _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
-# The time code does not name its rate. With fewer frames, none may have a count above 50, and
-# readers take the time code for one of 50 per second.
+# The time code does not contain its rate, so readers infer it from the highest frame count. At
+# lower rates, there may be no count of 50 or more, and readers would infer 50 frames per second.
 _MIN_LIVE_LINK_FRAMES_HZ = 6
 
 

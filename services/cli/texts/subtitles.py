@@ -43,9 +43,10 @@ def read_cues(text: str) -> str:
 
 
 def _remove_repeats(cues: list[list[str]]) -> list[str]:
-    """Return the lines of cues. In rolling captions, a cue repeats the last line of the one before.
+    """Return the lines of all cues, without the repeated lines of rolling captions.
 
-    A cue of a single line may really be spoken twice. It is a repeat only if other cues roll.
+    In rolling captions, a cue starts with the last line of the previous cue. Two equal one-line
+    cues may really be spoken twice, so they are merged only if another cue shows rolling captions.
     """
     cues = [lines for cue in cues if (lines := [line.strip() for line in cue if line.strip()])]
     is_rolling = any(len(cue) > 1 and cue[0] == last[-1] for last, cue in pairwise(cues))
@@ -79,13 +80,13 @@ def read_timed_lyrics(text: str) -> str:
     return re.sub(rf"{LYRICS_TIME}|[(<]\d+(?:,\d+)+[)>]", "", text)
 
 
-def read_frame_numbers(text: str) -> str:
+def read_frame_timed_subtitles(text: str) -> str:
     """Extract the text from MicroDVD or MPL2."""
     words = re.sub(rf"^{FRAME_NUMBERS}", "", text, flags=re.MULTILINE)
     return _BRACES.sub("", words).replace("|", "\n")
 
 
-def read_events(text: str) -> str:
+def read_ass_dialogue(text: str) -> str:
     """Extract the dialogue from ASS or SSA, in the order of its times."""
     fields = ["layer", "start", "end", "style", "name", "l", "r", "v", "effect", "text"]
     events = []

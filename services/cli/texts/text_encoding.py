@@ -51,10 +51,10 @@ def decode_text(content: bytes, language: str) -> DecodedText:
     """Decode a text file in a language.
 
     charset-normalizer 3.5 is not used. Of 165 short Chinese sentences in GB 18030, it decodes 89
-    correctly, and this function all. For other languages, there is nothing to detect.
+    correctly, and this function decodes all of them. For other languages, no detection is needed.
 
-    Raises ``UserError`` if the file is not a text, or its encoding is unknown. The message names
-    the format of a file that is not a text.
+    Raises ``UserError`` if the file is not a text, or its encoding is unknown. If the file has a
+    known binary format, the message names the format.
     """
     signatures = _BINARY_SIGNATURES.items()
     kind = next((kind for begin, kind in signatures if content.startswith(begin)), "")
@@ -66,7 +66,7 @@ def decode_text(content: bytes, language: str) -> DecodedText:
     for encoding in _possible_encodings(content, language):
         with contextlib.suppress(UnicodeDecodeError):
             texts[encoding] = content.decode(encoding)
-    # bytes in Big5 are mostly valid in GB 18030 too, but give rare characters
+    # Big5 bytes are usually also valid GB 18030, but then decode to rare characters
     candidates = [
         encoding
         for encoding in texts
@@ -98,9 +98,9 @@ def _possible_encodings(content: bytes, language: str) -> tuple[str, ...]:
 
 
 def _has_accented_letters(content: bytes) -> bool:
-    """Return whether most bytes above ASCII are letters of Windows-1252, single among others.
+    """Return whether most non-ASCII bytes are isolated Windows-1252 letters in ASCII text.
 
-    In Chinese encodings, most characters have two such bytes, or a first one below C0.
+    In Chinese encodings, most characters have two non-ASCII bytes, or a first byte below C0.
     """
     runs = re.findall(rb"[\x80-\xff]+", content)
     accented = [run for run in runs if len(run) == 1 and run >= b"\xc0"]

@@ -73,7 +73,11 @@ def _has_line(pattern: str) -> Callable[[str], object]:
 _FORMATS: tuple[tuple[str, Callable[[str], object], Callable[[str], str]], ...] = (
     ("WebVTT", _starts_with("WEBVTT"), subtitles.read_cues),
     ("TextGrid", _starts_with('File type = "ooTextFile'), transcripts.read_text_grid),
-    ("ASS or SSA", _starts_with(r"\[(Script Info|V4\+? Styles|Events)\]"), subtitles.read_events),
+    (
+        "ASS or SSA",
+        _starts_with(r"\[(Script Info|V4\+? Styles|Events)\]"),
+        subtitles.read_ass_dialogue,
+    ),
     ("JSON", _starts_with(r'\{\s*"|\[\s*[{"]'), transcripts.read_json),
     ("SubRip (SRT)", subtitles.CUE_TIMES.search, subtitles.read_cues),
     ("lyrics with times", _has_line(subtitles.LYRICS_TIME), subtitles.read_timed_lyrics),
@@ -81,7 +85,11 @@ _FORMATS: tuple[tuple[str, Callable[[str], object], Callable[[str], str]], ...] 
     ("LRC", _has_line(rf"[ \t]*{subtitles.LRC_TIME}"), subtitles.read_lrc),
     ("a transcript with times", transcripts.has_times, transcripts.read_timed_lines),
     ("a transcript with speakers", _has_line(transcripts.SPEAKER), transcripts.read_speakers),
-    ("MicroDVD or MPL2", _starts_with(subtitles.FRAME_NUMBERS), subtitles.read_frame_numbers),
+    (
+        "MicroDVD or MPL2",
+        _starts_with(subtitles.FRAME_NUMBERS),
+        subtitles.read_frame_timed_subtitles,
+    ),
     (
         "a table of labels",
         _starts_with(rf"([^\n]*\n)?{transcripts.LABEL}"),

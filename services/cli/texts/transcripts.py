@@ -10,7 +10,7 @@ from kouxing.shared.files.user_file import parse_json
 _TO = r"[ \t]*(?:--?>|[-–—~～→])[ \t]*"
 _CLOCKS = rf"{CLOCK}(?:{_TO}{CLOCK})?"
 _SECONDS = r"\d+(?:\.\d+(?:[ \t]?s)?|[ \t]?s)"
-# A time with hours or decimals, at the start of a recording. Other times may be spoken.
+# A time near 0 with hours or decimals is a timestamp. Other times may be part of the spoken text.
 _EXACT_START = r"0?0[:：]\d{2}(?:[:：]\d{2}(?:[.,:]\d{1,3})?|[.,]\d{1,3})"
 _STAMP = re.compile(  # the time at the start of a line, or at the end after a speaker's name
     rf"""[ \t]*(?:
@@ -41,7 +41,7 @@ _MAX_DEPTH = 20  # of JSON
 
 
 def has_times(text: str) -> bool:
-    """Return whether the lines of a text have times of a recording, which are not spoken."""
+    """Return whether the lines of a text contain timestamps, as opposed to spoken times."""
     lines = text.split("\n")
     first, *others = stamps = [_STAMP.match(line) for line in lines]
     if any(stamp and stamp["of_recording"] for stamp in stamps):
@@ -54,7 +54,8 @@ def has_times(text: str) -> bool:
 def read_timed_lines(text: str) -> str:
     """Extract the lines without their times.
 
-    If each of several timed lines is followed by an untimed line, they contain speakers' names.
+    If several lines have a time and each is followed by a line without one, the timed lines
+    contain speaker names, and are omitted.
     """
     lines = [(_STAMP.match(line), line) for line in text.split("\n")]
     are_names = sum(stamp is not None for stamp, _ in lines) > 1 and all(

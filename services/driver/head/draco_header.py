@@ -28,7 +28,7 @@ def read_mesh_size(data: bytes) -> tuple[int, int]:
     if encoding == _SEQUENTIAL:
         return _read_number(stream), _read_number(stream)
     stream.read(1)  # Edgebreaker: the kind of traversal
-    _read_number(stream)  # vertices, of which several points can be made
+    _read_number(stream)  # number of vertices; the decoder may split one into several points
     num_faces = _read_number(stream)
     return num_faces, 3 * num_faces
 

@@ -96,7 +96,7 @@ class RecognizerSession:
         self.replay_window = ReplayWindow()
         self.last_sequence = 0  # number of the newest accepted audio message
         self._gap_since_s: float | None = None  # when messages after a gap were first dropped
-        self._flushed_s: float | None = None  # last interruption, until the client has continued
+        self._flushed_s: float | None = None  # time of a flush; cleared ``RESEND_WAIT_S`` later
         self.client = NO_PEER  # sender of the newest audio
         self.last_chunk: AudioChunk | None = None  # None until it has arrived
         self.is_finished = False  # all audio up to the end is decoded
