@@ -206,6 +206,11 @@ def test_reads_times_only_where_they_are_spoken(text: str, spoken_text: str) -> 
     assert "".join(syllable.text for syllable in transcript.syllables) == spoken_text
 
 
+def test_a_sentence_may_start_like_a_format_in_lower_case() -> None:
+    sentence = "webvtt is a format of subtitles"
+    assert extract_text(sentence) == (sentence, "")
+
+
 def test_text_next_to_the_times_of_a_cue_is_spoken() -> None:
     cues = "00:00.400 --> 00:01.000 align:start line:80%\nHello\n\n0:01 --> 0:02 Anna: hi\n"
     assert extract_text(cues).text == "Hello\nAnna: hi"

@@ -301,14 +301,19 @@ const closedContext = async () => {
   throw new DOMException("the context is closed", "InvalidStateError");
 };
 
-test("a click after close() does not resume the sound", async (t) => {
-  const lips = await LipSync.create({ context });
+/** Resume the sound while the browser blocks it, so that lip sync waits for a click or a key. */
+async function waitForGesture(lips, t) {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   context.state = "suspended";
   context.resume = () => new Promise(() => {});
   const resuming = lips.resume();
   t.mock.timers.tick(1000);
   await resuming;
+}
+
+test("a click after close() does not resume the sound", async (t) => {
+  const lips = await LipSync.create({ context });
+  await waitForGesture(lips, t);
   lips.close();
   context.resume = t.mock.fn(closedContext);
   globalThis.document.dispatchEvent(new Event("pointerdown"));
@@ -318,12 +323,7 @@ test("a click after close() does not resume the sound", async (t) => {
 test("a click or a visible tab has no effect if the page has closed its context", async (t) => {
   const lips = await LipSync.create({ context });
   await followMicrophone(lips);
-  t.mock.timers.enable({ apis: ["setTimeout"] });
-  context.state = "suspended";
-  context.resume = () => new Promise(() => {});
-  const resuming = lips.resume();
-  t.mock.timers.tick(1000);
-  await resuming;
+  await waitForGesture(lips, t);
   context.resume = t.mock.fn(closedContext);
   globalThis.document.dispatchEvent(new Event("visibilitychange"));
   globalThis.document.dispatchEvent(new Event("keydown"));

@@ -37,7 +37,7 @@ _ENCODINGS = {  # of each language, apart from Unicode; the first one that fits 
     "turkish": ("cp1254",),
     "vietnamese": ("cp1258",),
 }
-_MIN_COMMON = 0.8  # fraction of common characters in a text that was decoded correctly
+_MIN_COMMON_FRACTION = 0.8  # of the characters of a text that was decoded correctly
 
 
 class DecodedText(NamedTuple):
@@ -112,4 +112,4 @@ def _has_common_characters(text: str) -> bool:
     """Return whether most characters of a text are among the 7000 that GB 2312 has."""
     characters = [letter for letter in text if not letter.isascii()]
     common = sum(bool(letter.encode("gb2312", "ignore")) for letter in characters)
-    return common >= _MIN_COMMON * len(characters)
+    return common >= _MIN_COMMON_FRACTION * len(characters)

@@ -58,11 +58,11 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
 
 
 def _starts_with(pattern: str) -> Callable[[str], object]:
-    return re.compile(pattern, re.IGNORECASE).match
+    return re.compile(pattern).match
 
 
-def _has(pattern: str) -> Callable[[str], object]:
-    return re.compile(pattern, re.IGNORECASE).search
+def _has_tag(pattern: str) -> Callable[[str], object]:
+    return re.compile(rf"<(?:{pattern})\b", re.IGNORECASE).search
 
 
 def _has_line(pattern: str) -> Callable[[str], object]:
@@ -75,7 +75,7 @@ _FORMATS: tuple[tuple[str, Callable[[str], object], Callable[[str], str]], ...] 
     ("TextGrid", _starts_with('File type = "ooTextFile'), transcripts.read_text_grid),
     (
         "ASS or SSA",
-        _starts_with(r"\[(Script Info|V4\+? Styles|Events)\]"),
+        _starts_with(r"(?i)\[(Script Info|V4\+? Styles|Events)\]"),
         subtitles.read_ass_dialogue,
     ),
     ("JSON", _starts_with(r'\{\s*"|\[\s*[{"]'), transcripts.read_json),
@@ -95,11 +95,11 @@ _FORMATS: tuple[tuple[str, Callable[[str], object], Callable[[str], str]], ...] 
         _starts_with(rf"([^\n]*\n)?{transcripts.LABEL}"),
         transcripts.read_labels,
     ),
-    ("SSML", _has(r"<speak\b"), markup.read_markup),
-    ("TTML", _has(r"<(\w+:)?tt\b"), markup.read_markup),
-    ("SAMI", _has(r"<sami\b"), markup.read_markup),
-    ("a transcript in XML", _has(r"<(transcript|timedtext)\b"), markup.read_markup),
-    ("HTML", _has(r"<(!DOCTYPE html|html|body)\b"), markup.read_markup),
+    ("SSML", _has_tag("speak"), markup.read_markup),
+    ("TTML", _has_tag(r"(\w+:)?tt"), markup.read_markup),
+    ("SAMI", _has_tag("sami"), markup.read_markup),
+    ("a transcript in XML", _has_tag("transcript|timedtext"), markup.read_markup),
+    ("HTML", _has_tag("!DOCTYPE html|html|body"), markup.read_markup),
     ("XML", _starts_with(r"<\?xml"), markup.reject_xml),
     ("Markdown", markup.MARKDOWN.search, markup.read_markdown),
     ("text with tags", markup.TAG.search, markup.read_markup),

@@ -20,12 +20,12 @@ _STAMP = re.compile(  # the time at the start of a line, or at the end after a s
             |{_EXACT_START}(?:{_TO}{CLOCK})?(?=[ \t]|$)
         )
         |{_CLOCKS}(?=[ \t]|$)
-        |(?P<speaker>\S.{{,30}}?)[ \t]{_CLOCKS}[ \t]*$
+        |\S.{{,30}}?[ \t]{_CLOCKS}[ \t]*$
     )[ \t]*[:：]?[ \t]*""",
     re.VERBOSE,
 )
 _ZERO = re.compile(r"(?:^|[ \t])0?0[:：]")
-_MAX_LINES = 4  # from the first time to the next one
+_MAX_LINES_BETWEEN_TIMES = 4
 LABEL = (  # times of Audacity or CTM, or the name of a recording
     r"(?:\d+(?:\.\d+)?\t\d+(?:\.\d+)?\t|(?:\S+ \d )?\d+\.\d+ +\d+\.\d+ +"
     r"|[A-Za-z](?:(?:[^\W\d]|[.-])*\d){6}[\w.-]*[ \t]+)"
@@ -48,7 +48,7 @@ def has_times(text: str) -> bool:
         return True
     if first is None or not _ZERO.search(first[0]):
         return False
-    return first.end() < len(lines[0]) or any(others[:_MAX_LINES])
+    return first.end() < len(lines[0]) or any(others[:_MAX_LINES_BETWEEN_TIMES])
 
 
 def read_timed_lines(text: str) -> str:
