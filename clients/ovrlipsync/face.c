@@ -108,14 +108,18 @@ static double next_sound_s(const Rest *rest) {
 
 static void update_background(Rest *rest, double level) {
   const double level_db = fmax(level, REST_MIN_BACKGROUND_DB);
-  if (isnan(rest->background_db)) rest->background_db = level_db;
+  rest->num_processed_levels++;
+  if (rest->num_processed_levels <= REST_NUM_FIRST_LEVELS) {
+    rest->background_db = fmax(rest->background_db, level_db);
+    return;
+  }
   const double difference = level_db - rest->background_db;
   rest->background_db += difference > REST_ONSET_DB ? REST_BACKGROUND_RISE_DB : REST_BACKGROUND_RATE * difference;
 }
 
 /* Return whether an onset before the first voice activity closes the lips. */
 static bool closes_for_onset(Rest *rest, double time_s) {
-  if (rest->has_spoken || isnan(rest->background_db)) return false;
+  if (rest->has_spoken || rest->num_processed_levels < REST_NUM_FIRST_LEVELS) return false;
   if (time_s > rest->onset_until_s) {
     const double onset_db = rest->background_db + REST_ONSET_DB, end_s = time_s + REST_ONSET_LEAD_S;
     for (int i = 0; i < rest->num_levels; i++) {
@@ -410,7 +414,7 @@ void face_init(Face *face) {
   memset(face, 0, sizeof *face);
   face->rest.loudest_db = face->rest.known_s = face->rest.sound_s = face->rest.onset_until_s = -INFINITY;
   face->rest.time_s = INFINITY;
-  face->rest.background_db = NAN;
+  face->rest.background_db = REST_MIN_BACKGROUND_DB;
   face->rest.duration_s = 1.0;
 }
 

@@ -41,7 +41,8 @@ typedef struct {
   int num_changes;
   bool is_voice, has_spoken, stays_closed;
   double loudest_db, known_s, sound_s, time_s;
-  double background_db, onset_until_s; /* NAN: no background yet */
+  int num_processed_levels;
+  double background_db, onset_until_s;
   double goal, start, velocity, duration_s, elapsed_s; /* of the way to the goal */
 } Rest;
 

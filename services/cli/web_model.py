@@ -43,7 +43,7 @@ from kouxing.shared.face import expression_motion, shapes
 from kouxing.shared.face.expressions import MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
-FORMAT = "kouxing-lips 6"
+FORMAT = "kouxing-lips 7"
 
 _ALIGNMENT_BYTES = 8
 # the constants that kouxing-lips and ovrlipsync use, by module
@@ -96,7 +96,8 @@ _CONSTANTS: dict[str, tuple[ModuleType, str]] = {
         resting_lips,
         "HOLD_S LEAD_S PART_S CLOSE_S CERTAIN _YIELD_S _END_S _MIN_PAUSE_S _RANGE_DB "
         "_FADE_DB _LAST_SOUND_S _LIKELY_BEFORE_S _LIKELY _DOUBT _ONSET_DB _ONSET_LEAD_S "
-        "_ONSET_CLOSE_S _ONSET_S _MIN_BACKGROUND_DB _BACKGROUND_RATE _BACKGROUND_RISE_DB AJAR",
+        "_ONSET_CLOSE_S _ONSET_S _MIN_BACKGROUND_DB _NUM_FIRST_LEVELS _BACKGROUND_RATE "
+        "_BACKGROUND_RISE_DB AJAR",
     ),
     "segmenter": (
         speech_segmenter,

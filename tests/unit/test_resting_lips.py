@@ -123,6 +123,12 @@ def test_an_onset_before_voice_activity_closes_the_lips(rise_db: float) -> None:
     assert (at(amounts, 0.6) == 0.0) == (rise_db == 9.0)
 
 
+def test_a_low_first_level_does_not_make_the_next_levels_an_onset() -> None:
+    amounts = ajar_amounts(lambda t: -40.0 if t >= FRAME_S else -60.0, 0.6, voice=())
+    assert at(amounts, PART_S + FRAME_S) == 1.0
+    assert amounts[round(PART_S / FRAME_S) + 1 :].all()
+
+
 def test_an_onset_after_voice_activity_does_not_close_the_lips() -> None:
     def level_at(time_s: float) -> float:
         return LOUD_DB if time_s <= SOUND_S or time_s >= 1.5 else QUIET_DB

@@ -4,7 +4,7 @@ import { floats, halfToFloat } from "./math.js";
 import { Network } from "./network.js";
 import { PhoneLm } from "./phone-lm.js";
 
-const FORMAT = "kouxing-lips 6";
+const FORMAT = "kouxing-lips 7";
 const FINAL = "final"; // value of the option phones
 const FILES = ["encoder.onnx", "model.bin", "model.json"];
 const PHONES_FILE = "phones.bin";

@@ -11,7 +11,8 @@ export class RestingLips {
   #hasSpoken = false;
   #hasEnded = false;
   #loudestDb = -Infinity;
-  #backgroundDb = null;
+  #backgroundDb;
+  #numLevels = 0;
   #onsetUntilS = -Infinity;
   #knownS = -Infinity;
   #soundS = -Infinity;
@@ -24,6 +25,7 @@ export class RestingLips {
 
   constructor({ constants }) {
     this.#constants = constants.rest;
+    this.#backgroundDb = constants.rest.MIN_BACKGROUND_DB;
   }
 
   addEvent(event) {
@@ -85,7 +87,7 @@ export class RestingLips {
   /** Return whether an onset before the first voice activity closes the lips. */
   #closesForOnset(timeS) {
     const c = this.#constants;
-    if (this.#hasSpoken || this.#backgroundDb === null) return false;
+    if (this.#hasSpoken || this.#numLevels < c.NUM_FIRST_LEVELS) return false;
     if (timeS > this.#onsetUntilS) {
       const onsetDb = this.#backgroundDb + c.ONSET_DB;
       const endS = timeS + c.ONSET_LEAD_S;
@@ -97,7 +99,11 @@ export class RestingLips {
   #updateBackground(level) {
     const c = this.#constants;
     const levelDb = Math.max(level, c.MIN_BACKGROUND_DB);
-    this.#backgroundDb ??= levelDb;
+    this.#numLevels += 1;
+    if (this.#numLevels <= c.NUM_FIRST_LEVELS) {
+      this.#backgroundDb = Math.max(this.#backgroundDb, levelDb);
+      return;
+    }
     const difference = levelDb - this.#backgroundDb;
     this.#backgroundDb += difference > c.ONSET_DB ? c.BACKGROUND_RISE_DB : c.BACKGROUND_RATE * difference;
   }

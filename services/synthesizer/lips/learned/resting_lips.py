@@ -23,7 +23,8 @@ lip predictor is nearly certain of a closure, they stay closed until the next so
 
 The first voice activity is detected too late to close the lips for an initial b, p or m. So lips
 that are ajar before it also close at an *onset*: a level more than ``_ONSET_DB`` above the
-background. All times are media times.
+background. The first level of a recording is often too low to be the background, because filters
+and codecs fade in. All times are media times.
 """
 
 import math
@@ -53,6 +54,7 @@ _ONSET_DB = 8.0  # an onset's minimum level above the background
 _ONSET_LEAD_S, _ONSET_CLOSE_S = 0.065, 0.05  # lips start to close before an onset; closing time
 _ONSET_S = 0.15  # time from the start of this closing for which the goal stays 0
 _MIN_BACKGROUND_DB = -75.0  # quieter audio counts as this level
+_NUM_FIRST_LEVELS = 3  # at first, the background is the loudest of these, and nothing is an onset
 # change of the background per level: fraction of the difference, and during an onset
 _BACKGROUND_RATE, _BACKGROUND_RISE_DB = 0.1, 2.0
 
@@ -81,7 +83,7 @@ class RestingLips:
         self._is_voice = self._has_spoken = self._has_ended = False
         self._is_sounding = False  # whether the level of the last frame is a sound
         self._loudest_db = -math.inf
-        self._background_db: float | None = None
+        self._background_db, self._num_levels = _MIN_BACKGROUND_DB, 0
         self._onset_until_s = -math.inf  # the last onset closes the lips until this time
         self._known_s = -math.inf  # the levels are known up to here
         self._sound_s = -math.inf  # last sound, start of voice activity or start of the audio
@@ -178,7 +180,7 @@ class RestingLips:
 
     def _closes_for_onset(self, time_s: float) -> bool:
         """Return whether an onset before the first voice activity closes the lips."""
-        if self._has_spoken or self._background_db is None:
+        if self._has_spoken or self._num_levels < _NUM_FIRST_LEVELS:
             return False
         if time_s > self._onset_until_s:
             onset_db = self._background_db + _ONSET_DB
@@ -189,8 +191,10 @@ class RestingLips:
 
     def _update_background(self, level_db: float) -> None:
         level_db = max(level_db, _MIN_BACKGROUND_DB)
-        if self._background_db is None:
-            self._background_db = level_db
+        self._num_levels += 1
+        if self._num_levels <= _NUM_FIRST_LEVELS:
+            self._background_db = max(self._background_db, level_db)
+            return
         difference = level_db - self._background_db
         is_onset = difference > _ONSET_DB
         self._background_db += _BACKGROUND_RISE_DB if is_onset else _BACKGROUND_RATE * difference
