@@ -12,6 +12,7 @@ folder names additional clips and speakers to hold out.
 
 import csv
 import itertools
+import zipfile
 import zlib
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
@@ -34,6 +35,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_col
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS, PROTRUSION_FAPS
+from kouxing.shared.files.output_file import write_error
 from kouxing.shared.files.user_file import check_content, parse_json, read_text, split_lines
 from kouxing.shared.phones.events import Phone
 
@@ -45,6 +47,8 @@ _FULL_PERCENTILE = 98.0
 _FILMED = "tracked video"  # start of the kind of a filmed clip
 CLOSED_FRACTION = 0.1  # lips that touch open at most this fraction of their tracked range
 _OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
+_SUFFIXES = (".flac", ".csv", ".json")
+_ARCHIVE_COLUMNS = ("clip", "split", "language", "speaker", "license")
 
 # Change of ``LIP_FAPS`` when a shape of FACEGOOD's rig has weight 1. It was measured on the ARKit
 # shape of the same name of MakeHuman's face (CC0), with both sides of a pair together.
@@ -291,3 +295,34 @@ def label_clips(model: AcousticModel, clips: Iterable[LipClip]) -> dict[str, lis
 def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
     """Find the phones of a clip: aligned if its text is known, otherwise recognized."""
     return aligned_phones(model, clip) or recognize_recording(model, clip.samples)
+
+
+def write_clip_archive(folder: Path, archive: Path) -> int:
+    """Write the clips of a folder that may be shared to a ZIP file, and return their number.
+
+    ``held.txt`` names all held-out clips. ``clips.tsv`` lists split, language, speaker and license
+    of each clip. Raises ``UserError`` if no clip may be shared, or the file cannot be written.
+    """
+    clips = [clip for clip in read_clips(folder, language=None) if _may_share(clip.license)]
+    if not clips:
+        raise UserError(f"{folder}: no clip has a license that allows sharing, such as CC BY")
+    rows = [(c.name, c.split, c.language, c.speaker, c.license.replace("\t", " ")) for c in clips]
+    table = "\n".join("\t".join(row) for row in [_ARCHIVE_COLUMNS, *rows]) + "\n"
+    unfinished = archive.with_name(archive.name + ".part")
+    try:
+        with zipfile.ZipFile(unfinished, "w", zipfile.ZIP_DEFLATED) as file:
+            file.writestr("clips.tsv", table)
+            file.writestr("held.txt", "".join(f"{c.name}\n" for c in clips if c.split == "held"))
+            for clip in clips:
+                for suffix in _SUFFIXES:
+                    file.write(folder / (clip.name + suffix), clip.name + suffix)
+        unfinished.replace(archive)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise write_error(archive, error) from None
+    return len(clips)
+
+
+def _may_share(license_name: str) -> bool:
+    """Return whether the clips may be shared: a model may use footage by third parties."""
+    return may_distribute(license_name) and "third part" not in license_name

@@ -265,7 +265,7 @@ def pack_clips(
     force: Force = False,
 ) -> None:
     """Archive the clips whose licenses allow sharing, with their splits and licenses."""
-    from kouxing.corpora.clip_archive import write_clip_archive
+    from kouxing.corpora.lip_clips import write_clip_archive
 
     check_output(archive, force=force)
     num_clips = write_clip_archive(clips, archive)

@@ -302,8 +302,8 @@ def heads(
     force: Force = False,
 ) -> None:
     """Build the built-in heads from MakeHuman data."""
+    from kouxing.training.heads.assemble import build_heads
     from kouxing.training.heads.people import PEOPLE
-    from kouxing.training.heads.recipe import build_heads
 
     if unknown := sorted({*(names or [])} - {*PEOPLE}):
         raise UserError(f"unknown heads: {', '.join(unknown)}; choose from {', '.join(PEOPLE)}")

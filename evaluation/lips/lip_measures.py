@@ -12,21 +12,73 @@
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from statistics import median
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kouxing.evaluation.lips.agreement import lag_ms
-from kouxing.evaluation.lips.closures import WINDOW_S, DetectionCounts, is_closed_at
+from kouxing.evaluation.lips.closures import (
+    WINDOW_S,
+    Contact,
+    DetectionCounts,
+    closures,
+    contacts,
+    is_closed_at,
+)
 from kouxing.evaluation.lips.curves import num_turns, pooled_moments
+from kouxing.evaluation.lips.misalignment import misalignment_s
 from kouxing.evaluation.lips.mouths import CURVES, Mouth
 from kouxing.evaluation.lips.references import PAUSE, Reference
-from kouxing.evaluation.lips.scored_clip import Measure, ScoredClip, ScoredClips
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ScoredClip:
+    """A clip and the mouth to evaluate. Figures are cached, because groups of clips overlap."""
+
+    reference: Reference
+    predicted: Mouth
+
+    @property
+    def real(self) -> Mouth:
+        """The clip's real mouth."""
+        return self.reference.mouth
+
+    @cached_property
+    def in_speech(self) -> Mask:
+        """Whether there is speech, at the times of the real frames."""
+        return self.reference.is_speech(self.real.time_s)
+
+    @cached_property
+    def opening_in_speech(self) -> Array:
+        """The opening during speech, at the times of the real frames."""
+        return self.predicted.at("opening", self.real.time_s)[self.in_speech]
+
+    @cached_property
+    def closures(self) -> DetectionCounts:
+        """Real and predicted closures."""
+        return closures(self.predicted, self.real)
+
+    @cached_property
+    def contacts(self) -> list[Contact]:
+        """Predicted closures."""
+        return contacts(self.predicted, self.real)
+
+    @cached_property
+    def misalignment_s(self) -> float | None:
+        """Mean temporal misalignment."""
+        return misalignment_s(self.predicted, self.real)
+
+
+ScoredClips = Sequence[ScoredClip]
+Measure = Callable[[ScoredClips], float | None]
+
 
 _MIN_CLIPS = 3  # minimum number of clips per speaker
 # Visemes of the classes in which closures are counted. All other visemes are consonants.

@@ -12,12 +12,11 @@ from pathlib import Path
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip, aligned_phones
-from kouxing.evaluation.lips.lip_measures import MEASURES, REAL_MEASURES
+from kouxing.evaluation.lips.lip_measures import MEASURES, REAL_MEASURES, ScoredClip
 from kouxing.evaluation.lips.live_faces import Samples, live_events, live_frames
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth
 from kouxing.evaluation.lips.other_programs import MouthFunction, load_programs
 from kouxing.evaluation.lips.references import read_parts, reference_of
-from kouxing.evaluation.lips.scored_clip import ScoredClip
 from kouxing.evaluation.recognizer.disturbances import (
     BABBLE,
     CLEAN,

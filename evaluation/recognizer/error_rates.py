@@ -35,11 +35,10 @@ from kouxing.corpora.scoring import (
     final_hypothesis,
     first_hypothesis,
 )
-from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.recognizer.aligned_corpus import RATE_NAMES, AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import CLEAN, Disturb
-from kouxing.evaluation.recognizer.labials import LabialCounts
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
+from kouxing.evaluation.tables import percentiles
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.live.live_decoder import LiveDecoder
@@ -49,6 +48,36 @@ from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory
+
+_LABIAL_VISEMES = {"b", "f"}  # of b p m, and of f
+
+
+class LabialCounts:
+    """Counts spoken labials, recognized labials, and labials that are both."""
+
+    def __init__(self, inventory: PhoneInventory) -> None:
+        visemes = inventory.visemes
+        self._labials = {
+            phone for phone in inventory.phones if visemes[phone][0][0] in _LABIAL_VISEMES
+        }
+        self._num_spoken = self._num_recognized = self._num_both = 0
+
+    def add(self, reference: Sequence[str], recognized: Sequence[str]) -> None:
+        """Count the phones of a recording."""
+        for i, j in align_symbols(reference, recognized):
+            is_spoken = i is not None and reference[i] in self._labials
+            is_recognized = j is not None and recognized[j] in self._labials
+            self._num_spoken += is_spoken
+            self._num_recognized += is_recognized
+            self._num_both += is_spoken and is_recognized
+
+    def rates(self) -> dict[str, float | None]:
+        """Return recall and precision, any labial counting for any other; None without phones."""
+        return {
+            name: self._num_both / total if total else None
+            for name, total in (("recall", self._num_spoken), ("precision", self._num_recognized))
+        }
+
 
 # the paper's rule and a rule with fewer errors, which are measured in clean speech
 COMPARED_RULES = (OutputRuleConfig(3, 0.0), OutputRuleConfig(3, 0.99))

@@ -26,13 +26,11 @@ import zmq
 
 from kouxing.shared.monitoring.metrics import trim_heap
 from kouxing.shared.network import kernel_sockets
-from kouxing.shared.network.descriptor_waiter import DescriptorWaiter
-from kouxing.shared.network.peer_budget import BUDGET, MIN_BUDGET, PeerBudget
 from kouxing.shared.network.peer_connection import PENALTY_S, PeerConnection
-from kouxing.shared.network.peer_quota import PeerQuota
+from kouxing.shared.network.peer_quota import BUDGET, MIN_BUDGET, PeerBudget, PeerQuota
 from kouxing.shared.network.socket_limits import KIB, SocketLimits
 from kouxing.shared.network.tarpit import MAX_HELD_CONNECTIONS, Tarpit
-from kouxing.shared.network.waker import Waker
+from kouxing.shared.network.waker import DescriptorWaiter, Waker
 
 MIB = 1024 * KIB
 CHECK_INTERVAL_S = 0.05  # interval between checks of all connections while data arrives

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from kouxing.shared.monitoring.logs import LOG, RateLimit
 from kouxing.shared.network import kernel_sockets
 from kouxing.shared.network.kernel_sockets import Traffic
-from kouxing.shared.network.peer_budget import PeerBudget
+from kouxing.shared.network.peer_quota import PeerBudget
 from kouxing.shared.network.socket_limits import MAX_QUEUED
 
 if TYPE_CHECKING:

@@ -1,8 +1,9 @@
-"""Limits the number of connections of a process, and chooses which connections must end."""
+"""Limits the connections of a process, and the work that a peer can cause."""
 
 from __future__ import annotations
 
 import resource
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
 MAX_CONNECTIONS = 400  # limit for clients; libzmq takes up to 0.1 MB for each
 FILES_PER_CLIENT = 6  # one for the client, one for a service, and four in the tarpit
 RESERVED_FILES = 256  # files for models, pages and outgoing connections
+BUDGET = 5000.0  # work of a connection
+BUDGET_PER_S = 500.0
+MIN_BUDGET = 100.0  # budget of a new connection: enough for a good client whose key is misused
 
 
 class PeerQuota:
@@ -64,3 +68,23 @@ class PeerQuota:
                 if ranks[connection] > MAX_KEY_SHARE * limit:
                     owner = "key" if connection.key else "address"
                     yield connection, f"its {owner} has too many connections"
+
+
+class PeerBudget:
+    """The amount of work that a peer may still cause; recovers over time."""
+
+    def __init__(self, left: float = BUDGET, clock: Callable[[], float] = time.monotonic) -> None:
+        self._left, self._clock, self._since_s = left, clock, clock()
+
+    @property
+    def left(self) -> float:
+        """The remaining budget; negative if the peer overspent."""
+        return min(BUDGET, self._left + (self._clock() - self._since_s) * BUDGET_PER_S)
+
+    def spend(self, cost: float) -> None:
+        """Reduce the budget."""
+        self._left, self._since_s = self.left - cost, self._clock()
+
+    def block(self, seconds: float) -> None:
+        """Keep the budget negative for some time."""
+        self._left, self._since_s = min(self.left, -seconds * BUDGET_PER_S), self._clock()

@@ -1,8 +1,12 @@
-"""Wakes a thread that waits for file descriptors."""
+"""Wakes a thread that waits for file descriptors, such as those that libzmq owns."""
 
 import contextlib
 import os
+import select
+import sys
 import weakref
+
+_REPORTS_ARRIVALS = sys.platform == "linux"  # elsewhere, every wait returns immediately
 
 
 class Waker:
@@ -25,3 +29,31 @@ class Waker:
             return bool(os.read(self.descriptor, 4096))
         except BlockingIOError:
             return False
+
+
+class DescriptorWaiter:
+    """Waits until data arrives at one of the added descriptors.
+
+    Only new data ends a wait, whether or not libzmq has read it. The kernel removes closed
+    descriptors.
+    """
+
+    def __init__(self) -> None:
+        self._waker = Waker()
+        self._epoll = select.epoll() if _REPORTS_ARRIVALS else None
+        self.add(self._waker.descriptor)
+
+    def add(self, descriptor: int) -> None:
+        """Add a descriptor to wait for. Any thread may call this."""
+        if self._epoll is not None:
+            with contextlib.suppress(OSError):  # closed, or added before
+                self._epoll.register(descriptor, select.EPOLLIN | select.EPOLLET)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until data arrives, up to the timeout."""
+        if self._epoll is not None:
+            self._epoll.poll(max(0.0, timeout_s))
+
+    def close(self) -> None:
+        """End the wait of another thread."""
+        self._waker.wake()

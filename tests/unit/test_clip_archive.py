@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.corpora.clip_archive import write_clip_archive
-from kouxing.corpora.lip_clips import read_clips
+from kouxing.corpora.lip_clips import read_clips, write_clip_archive
 from kouxing.shared.errors import UserError
 from tests.lip_clips import write_held_out_clip
 

@@ -15,8 +15,8 @@ from kouxing.shared.network.connection_limits import (
     ConnectionLimiter,
 )
 from kouxing.shared.network.kernel_sockets import Traffic
-from kouxing.shared.network.peer_budget import BUDGET, BUDGET_PER_S, MIN_BUDGET, PeerBudget
 from kouxing.shared.network.peer_connection import PENALTY_S, PeerConnection
+from kouxing.shared.network.peer_quota import BUDGET, BUDGET_PER_S, MIN_BUDGET, PeerBudget
 from kouxing.shared.network.socket_limits import MAX_QUEUED
 from kouxing.shared.network.tarpit import GAP_S, HOLD_S
 

@@ -16,6 +16,7 @@ from kouxing.evaluation.lips.agreement import agreement_of
 from kouxing.evaluation.lips.closures import DetectionCounts, closures, contacts, is_closed_at
 from kouxing.evaluation.lips.curves import num_turns, pooled_moments
 from kouxing.evaluation.lips.lip_measures import (
+    ScoredClip,
     correlate_by_speaker,
     lip_intensity,
     opening_range,
@@ -23,7 +24,6 @@ from kouxing.evaluation.lips.lip_measures import (
 from kouxing.evaluation.lips.misalignment import match_extrema, misalignment_s, warping_path
 from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_mouth
 from kouxing.evaluation.lips.references import Reference
-from kouxing.evaluation.lips.scored_clip import ScoredClip
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.lips import INVENTORY, clip_of, phone

@@ -6,8 +6,12 @@ from hypothesis import strategies as st
 
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.phones.syllable_captions import MAX_PHONES, CaptionSyllable, SyllableCaptions
-from kouxing.shared.phones.text_captions import split_characters
+from kouxing.shared.phones.syllable_captions import (
+    MAX_PHONES,
+    CaptionSyllable,
+    SyllableCaptions,
+    split_characters,
+)
 from tests import lips
 
 MANDARIN = load_inventory("mandarin")

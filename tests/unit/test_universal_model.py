@@ -22,7 +22,7 @@ from kouxing.training.blocks.network import BlockReadout, block_layout
 from kouxing.training.model_files import save_universal
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.universal.encoder import BLOCK_LENGTH, RIGHT_CONTEXT, FeatureEncoder
-from kouxing.training.universal.export import export_extension
+from kouxing.training.universal.recipe import export_extension
 from tests.block_networks import (
     BLOCK,
     FRAMES,

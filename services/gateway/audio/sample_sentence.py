@@ -13,7 +13,7 @@ from kouxing.shared.audio.audio_file import open_audio
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.phones.text_captions import Characters, split_characters
+from kouxing.shared.phones.syllable_captions import Characters, split_characters
 
 SAMPLE_FILE = Path(str(resources.files("kouxing.shared") / "demo" / "hello-female.wav"))
 SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"

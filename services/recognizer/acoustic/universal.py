@@ -1,7 +1,7 @@
 """Universal phones: a second readout of the block network, for all languages.
 
 The file has an extension of the shipped block network instead of a network
-(:mod:`kouxing.training.universal.export`). Its phones are the universal inventory.
+(:mod:`kouxing.training.universal.recipe`). Its phones are the universal inventory.
 """
 
 import hashlib
