@@ -15,6 +15,7 @@ from kouxing.services.driver.config import DriverConfig
 from kouxing.shared.files.output_file import remove_unfinished
 from kouxing.shared.settings.keys import MAX_KEY_SHARE
 from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.session import ErrorCode
 
 MAX_QUEUED = 100_000  # unread commands
 IDLE_S = 10.0  # after this time without a video, the process ends and frees its memory
@@ -64,9 +65,9 @@ class _RecorderProcess:
 class RecorderClient:
     """Passes each session's frames and audio to its video.
 
-    ``on_written`` receives the start of the session and its video's path. ``on_short`` receives
-    the start and the reason why its video ends early; ``on_written`` follows. ``on_failed``
-    receives the start and the reason why no complete video exists.
+    ``on_written`` receives the start of the session and its video's path. ``on_error`` receives
+    ``SHORT_VIDEO`` or ``NO_VIDEO``, the start, and the reason why the video ends early, before it
+    is written, or is not complete.
     """
 
     def __init__(
@@ -74,14 +75,12 @@ class RecorderClient:
         config: DriverConfig,
         *,
         on_written: Callable[[StartSession, Path], None],
-        on_short: Callable[[StartSession, str], None],
-        on_failed: Callable[[StartSession, str], None],
+        on_error: Callable[[ErrorCode, StartSession, str], None],
         on_image: Callable[[], None],
     ) -> None:
         self._config = config
         self._on_written = on_written
-        self._on_short = on_short
-        self._on_failed = on_failed
+        self._on_error = on_error
         self._on_image = on_image
         self._numbers = count()
         self._open: dict[str, int] = {}  # numbers of the videos that accept frames, by session
@@ -119,7 +118,9 @@ class RecorderClient:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            self._on_failed(start, f"cannot create {path.parent}: {error.strerror}")
+            self._on_error(
+                ErrorCode.NO_VIDEO, start, f"cannot create {path.parent}: {error.strerror}"
+            )
             return
         number = self._open[session] = next(self._numbers)
         self._unfinished[number] = start
@@ -199,10 +200,9 @@ class RecorderClient:
             del self._open[start.session]
         if kind == "written":
             self._on_written(start, detail)
-        elif kind == "short":
-            self._on_short(start, detail)
         else:
-            self._on_failed(start, detail)
+            is_short = kind == "short"
+            self._on_error(ErrorCode.SHORT_VIDEO if is_short else ErrorCode.NO_VIDEO, start, detail)
 
     def _fail_all(self, reason: str) -> None:
         self._kill()
@@ -210,7 +210,7 @@ class RecorderClient:
         self._open.clear()
         self._unfinished.clear()
         for start in starts:
-            self._on_failed(start, reason)
+            self._on_error(ErrorCode.NO_VIDEO, start, reason)
 
     def _kill(self) -> None:
         if self._recorder is not None:

@@ -3,8 +3,6 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +32,9 @@ MAX_DRAIN_S = 3.0  # time to draw the remaining images when the driver stops
 RETRY_AFTER_S = 5.0  # sent to a client whose session cannot be recorded now
 
 
-@dataclass(slots=True)
-class _FollowedSession:
+class _FollowedSession(SessionFollower):
     """A session that the driver follows."""
 
-    follower: SessionFollower
     leave_by_s: float | None = None  # set once the session has closed
 
 
@@ -58,8 +54,7 @@ class DriverService(SessionService):
         self.recorder = RecorderClient(
             config,
             on_written=self._report_written,
-            on_short=partial(self._report_error, ErrorCode.SHORT_VIDEO),
-            on_failed=partial(self._report_error, ErrorCode.NO_VIDEO),
+            on_error=self._report_error,
             on_image=lambda: self.metrics.count("video_ms", round(1000 / config.frame_rate_hz)),
         )
 
@@ -78,7 +73,7 @@ class DriverService(SessionService):
         The session has started once the subscriptions are in effect.
         """
         session = self._sessions.get(start.session)
-        if session is not None and session.follower.session_start.token != start.token:
+        if session is not None and session.session_start.token != start.token:
             self._unfollow(session)  # a different session with the same name
             session = None
         if session is None and not start.opening.record and not self.view.is_live:
@@ -93,13 +88,13 @@ class DriverService(SessionService):
             }
             if start.opening.record:
                 handlers[Sound] = self._on_sound
-            session = _FollowedSession(SessionFollower(self, start, handlers))
+            session = _FollowedSession(self, start, handlers)
             self._sessions[start.session] = session
             self.poses.add(start.session, time.monotonic())
             if start.opening.record:
                 self.recorder.begin(start)
-        session.follower.session_start = start
-        session.follower.follow()
+        session.session_start = start
+        session.follow()
         return False
 
     def stop_session(self, session: str) -> None:
@@ -173,11 +168,10 @@ class DriverService(SessionService):
 
     def _unfollow(self, session: _FollowedSession) -> None:
         """Close a session's subscriptions and finish its video with the frames received so far."""
-        name = session.follower.session
-        del self._sessions[name]
-        session.follower.close()
-        self.poses.remove(name)
-        self.recorder.end(name)
+        del self._sessions[session.session]
+        session.close()
+        self.poses.remove(session.session)
+        self.recorder.end(session.session)
 
     def _warn_if_stalled(self, now_s: float) -> None:
         is_stalled = self.poses.is_stalled(now_s)

@@ -8,7 +8,6 @@ import ipaddress
 import math
 import time
 from collections.abc import Coroutine
-from dataclasses import dataclass
 
 from aiohttp import web
 from kouxing_client.messages import EndOfFaps, FapFrame, Message, Phone, Sound, Speech
@@ -47,11 +46,9 @@ MISSING_S = 3.0  # delay before a missing service is shown, because control may 
 CONTROL_MISSING_S = 8.0  # delay before a missing control is shown; a restart is faster
 
 
-@dataclass(slots=True)
-class _FollowedSession:
+class _FollowedSession(SessionFollower):
     """A session to which the gateway subscribes, from its first use until it ends."""
 
-    follower: SessionFollower
     syllables: SyllableCaptions
 
 
@@ -188,17 +185,17 @@ class GatewayService(SessionService):
     def start_session(self, start: StartSession) -> bool:
         """Subscribe to a session for a viewer or sender; confirm when this is in effect."""
         session = self._sessions.get(start.session)
-        if session is not None and session.follower.session_start.token != start.token:
+        if session is not None and session.session_start.token != start.token:
             self.stop_session(start.session)  # a different session with the same name
             session = None
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)
-        session.follower.session_start = start
+        session.session_start = start
         self._announce(session, start.epoch)
         is_needed = start.session in self._needed_sessions() or self._audio_client.num_opening
-        if session.follower.is_following or is_needed:
-            session.follower.follow()
-        return not session.follower.is_following
+        if session.is_following or is_needed:
+            session.follow()
+        return not session.is_following
 
     def _needed_sessions(self) -> set[str]:
         """Return the sessions that are shown or sent to other programs."""
@@ -211,7 +208,7 @@ class GatewayService(SessionService):
         """Unsubscribe from a session and notify its viewers and its microphone."""
         stopped = self._sessions.pop(session, None)
         if stopped is not None:
-            stopped.follower.close()
+            stopped.close()
         self._viewers.remove_session(session)
         self._audio_client.on_closed(session)
         self._create_task(self._microphones.close_session(session))
@@ -228,9 +225,9 @@ class GatewayService(SessionService):
             self._senders.pool.express(strengths, message.face.hold_s)
         session = self._sessions.get(message.session)
         if session is not None:
-            start = session.follower.session_start
+            start = session.session_start
             face = start.opening.face.merged_with(message.face)
-            session.follower.session_start = start.with_face(face)
+            session.session_start = start.with_face(face)
             self._viewers.change_face(message.session, message.face)
 
     def session_progress(self) -> dict[str, SessionProgress]:
@@ -239,12 +236,12 @@ class GatewayService(SessionService):
 
     def on_tick(self, now_s: float) -> float:
         """Follow sessions, move the face at rest, and announce a missing control."""
-        followers = [session.follower for session in self._sessions.values()]
-        if not all(follower.is_following for follower in followers):
+        sessions = [*self._sessions.values()]
+        if not all(session.is_following for session in sessions):
             needed = self._needed_sessions()
-            for follower in followers:
-                if follower.session in needed and not follower.is_following:
-                    follower.follow()
+            for session in sessions:
+                if session.session in needed and not session.is_following:
+                    session.follow()
         resting_frame_due_s = max(self._resting_frame_due_s, self._viewers.resting_frame_due_s)
         if now_s >= resting_frame_due_s:
             self._resting_frame_due_s = resting_frame_due_s = max(
@@ -273,7 +270,7 @@ class GatewayService(SessionService):
     # --- from the publishers ---------------------------------------------------------------------
 
     def _make_session(self, start: StartSession) -> _FollowedSession:
-        follower = SessionFollower(
+        session = _FollowedSession(
             self,
             start,
             {
@@ -287,8 +284,7 @@ class GatewayService(SessionService):
             on_new_epoch=lambda: self._restart(session),
         )
         characters = self._sample.characters if self._sample.session == start.session else ()
-        track = SyllableCaptions(self._inventory(start), characters)
-        session = _FollowedSession(follower, track)
+        session.syllables = SyllableCaptions(self._inventory(start), characters)
         return session
 
     def _inventory(self, start: StartSession) -> PhoneInventory:
@@ -301,11 +297,11 @@ class GatewayService(SessionService):
     def _restart(self, session: _FollowedSession) -> None:
         """Restart a session for its viewers. It continues in a new epoch."""
         session.syllables.reset()
-        self._announce(session, session.follower.epoch)
+        self._announce(session, session.epoch)
 
     def _announce(self, session: _FollowedSession, epoch: int) -> None:
         """Announce a session to its viewers, or its new epoch."""
-        start = session.follower.session_start
+        start = session.session_start
         facts, language = start.facts, session.syllables.inventory.code
         default = FaceSettings(expressiveness=facts.expressiveness, feeling=facts.feeling)
         face = default.merged_with(start.opening.face)

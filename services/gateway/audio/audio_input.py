@@ -30,8 +30,8 @@ class AudioInput:
     def __init__(
         self, session: AudioSession, pcm_format: PcmFormat, *, is_synthesized: bool
     ) -> None:
-        self._session = session
-        self._format = pcm_format
+        self.session = session
+        self.pcm_format = pcm_format
         self._is_synthesized = is_synthesized
         self._is_first = True
         is_pcm16 = pcm_format.encoding == "s16le"
@@ -56,7 +56,7 @@ class AudioInput:
 
         Raises ``UserError`` if the data does not have the announced format.
         """
-        self._format.check_message(pcm)
+        self.pcm_format.check_message(pcm)
         received = self._incomplete + pcm
         if self._is_first and len(received) < HEADER_BYTES:
             self._incomplete = received
@@ -64,18 +64,18 @@ class AudioInput:
         await self._forward(received, message=received if self._is_first else pcm)
 
     async def _forward(self, pcm: bytes, message: bytes = b"") -> None:
-        num_samples = len(pcm) // self._format.frame_bytes
-        end = num_samples * self._format.frame_bytes
+        num_samples = len(pcm) // self.pcm_format.frame_bytes
+        end = num_samples * self.pcm_format.frame_bytes
         pcm, self._incomplete = pcm[:end], pcm[end:]
-        self._format.check_samples(pcm, is_first=self._is_first)
+        self.pcm_format.check_samples(pcm, is_first=self._is_first)
         if self._encoding is not None:
             self._encoding.check(message)
         self._is_first = False
-        duration_s = num_samples / self._format.sample_rate_hz
+        duration_s = num_samples / self.pcm_format.sample_rate_hz
         if self._is_synthesized or duration_s > MAX_LIVE_S or not self._queue.is_empty:
             await self._queue.put(pcm)
         else:
-            self._session.send(pcm, num_samples)
+            self.session.send(pcm, num_samples)
             await self._rate_limit.wait(duration_s)
 
     def skip(self, num_samples: int) -> None:
@@ -86,7 +86,7 @@ class AudioInput:
         """Interrupt: drop queued audio, and audio whose face is not shown yet."""
         self._incomplete = b""
         self._queue.clear()
-        await self._session.flush()
+        await self.session.flush()
 
     async def end(self) -> None:
         """Mark the end of the audio: ``messages`` ends when the queue is empty."""

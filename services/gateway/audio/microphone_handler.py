@@ -6,9 +6,9 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from kouxing_client import KouxingError
 
 from kouxing.services.gateway.audio.audio_input import AudioInput
-from kouxing.services.gateway.audio.audio_sessions import AudioClient, AudioSession, error_text
+from kouxing.services.gateway.audio.audio_sessions import AudioClient, error_text
 from kouxing.services.gateway.messages import browser_messages
-from kouxing.services.gateway.messages.pcm_format import PcmFormat, WrongFormat
+from kouxing.services.gateway.messages.pcm_format import WrongFormat
 from kouxing.services.gateway.web.limits import ConnectionQuota
 from kouxing.services.gateway.web.web_application import OpenWebSockets
 from kouxing.shared.errors import UserError
@@ -83,51 +83,40 @@ class MicrophoneHandler:
             audio_input = AudioInput(session, options, is_synthesized=bool(options.ahead))
             try:
                 async with audio_input.running():
-                    await self._forward_audio(browser, session, audio_input, options)
+                    await _forward_audio(browser, audio_input)
             finally:
                 self._session_names[browser] = ""
 
-    async def _forward_audio(
-        self,
-        browser: web.WebSocketResponse,
-        session: AudioSession,
-        audio_input: AudioInput,
-        pcm_format: PcmFormat,
-    ) -> None:
-        async for message in audio_input.messages(browser):
-            if message.type is WSMsgType.BINARY:
-                await audio_input.push(message.data)
-            elif message.type is WSMsgType.TEXT:
-                await self._execute(message.data, browser, session, audio_input, pcm_format)
-            for error in session.take_errors():
-                await browser.send_str(error_text(error))
 
-    async def _execute(
-        self,
-        text: str,
-        browser: web.WebSocketResponse,
-        session: AudioSession,
-        audio_input: AudioInput,
-        pcm_format: PcmFormat,
-    ) -> None:
-        """Execute a command. An invalid or rejected one is answered; the session continues."""
-        try:
-            command = browser_messages.parse_command(text, pcm_format)
-        except WrongFormat:
-            raise
-        except UserError as error:
+async def _forward_audio(browser: web.WebSocketResponse, audio_input: AudioInput) -> None:
+    async for message in audio_input.messages(browser):
+        if message.type is WSMsgType.BINARY:
+            await audio_input.push(message.data)
+        elif message.type is WSMsgType.TEXT:
+            await _execute(message.data, browser, audio_input)
+        for error in audio_input.session.take_errors():
             await browser.send_str(error_text(error))
-            return
-        if command.problem:
-            await browser.send_str(browser_messages.encode_error(command.problem))
-        if command.skip:
-            audio_input.skip(command.skip)
-        try:
-            if command.flush:
-                await audio_input.flush()
-            if command.face:
-                await session.set_face(**command.face)
-        except KouxingError as error:
-            await browser.send_str(error_text(error))
-        if command.last:
-            await audio_input.end()
+
+
+async def _execute(text: str, browser: web.WebSocketResponse, audio_input: AudioInput) -> None:
+    """Execute a command. An invalid or rejected one is answered; the session continues."""
+    try:
+        command = browser_messages.parse_command(text, audio_input.pcm_format)
+    except WrongFormat:
+        raise
+    except UserError as error:
+        await browser.send_str(error_text(error))
+        return
+    if command.problem:
+        await browser.send_str(browser_messages.encode_error(command.problem))
+    if command.skip:
+        audio_input.skip(command.skip)
+    try:
+        if command.flush:
+            await audio_input.flush()
+        if command.face:
+            await audio_input.session.set_face(**command.face)
+    except KouxingError as error:
+        await browser.send_str(error_text(error))
+    if command.last:
+        await audio_input.end()

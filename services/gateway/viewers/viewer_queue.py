@@ -13,38 +13,24 @@ NUM_TEXTS_KEPT = 50
 
 
 class MessageKind(Enum):
-    """Kind of a queued message; determines how many old messages are kept."""
+    """Kind of a queued message, and how many old messages of this kind are kept."""
 
-    STATUS = "status"  # this kind and the next six describe a state: the newest always arrives
-    SHAPE_NAMES = "shape names"  # what the weights of the following shapes mean
-    SESSION = "session"
-    FACE = "face"
-    ACOUSTIC = "acoustic"
-    SPEECH = "speech"
-    END = "end"
-    TEXT = "text"  # phones, syllables and errors
-    FRAME = "frame"
-    SHAPES = "shapes"  # blendshapes of a frame
-    REST = "rest"  # the face while no session moves it
-    REST_SHAPES = "rest shapes"
-    SOUND = "sound"
+    STATUS = "status", 1  # this kind and the next six describe a state: the newest always arrives
+    SHAPE_NAMES = "shape names", 1  # what the weights of the following shapes mean
+    SESSION = "session", 1
+    FACE = "face", 1
+    ACOUSTIC = "acoustic", 1
+    SPEECH = "speech", 1
+    END = "end", 1
+    TEXT = "text", NUM_TEXTS_KEPT  # phones, syllables and errors
+    FRAME = "frame", NUM_FRAMES_KEPT
+    SHAPES = "shapes", NUM_FRAMES_KEPT  # blendshapes of a frame
+    REST = "rest", 1  # the face while no session moves it
+    REST_SHAPES = "rest shapes", 1
+    SOUND = "sound", 0
 
-
-_NUM_KEPT = {
-    MessageKind.STATUS: 1,
-    MessageKind.SHAPE_NAMES: 1,
-    MessageKind.SESSION: 1,
-    MessageKind.FACE: 1,
-    MessageKind.ACOUSTIC: 1,
-    MessageKind.SPEECH: 1,
-    MessageKind.END: 1,
-    MessageKind.SOUND: 0,
-    MessageKind.FRAME: NUM_FRAMES_KEPT,
-    MessageKind.SHAPES: NUM_FRAMES_KEPT,
-    MessageKind.REST: 1,
-    MessageKind.REST_SHAPES: 1,
-    MessageKind.TEXT: NUM_TEXTS_KEPT,
-}
+    def __init__(self, _name: str, num_kept: int) -> None:
+        self.num_kept = num_kept
 
 
 class ViewerQueue:
@@ -74,7 +60,7 @@ class ViewerQueue:
         # Sound that is seconds late is useless, and so are the frames of that sound. The remaining
         # messages keep their order.
         num_before = len(self._messages)
-        num_left = dict(_NUM_KEPT)
+        num_left = {kind: kind.num_kept for kind in MessageKind}
         remaining: deque[tuple[MessageKind, str | bytes]] = deque()
         for kind, message in reversed(self._messages):
             if num_left[kind] > 0:
