@@ -38,9 +38,7 @@ export function checkOptions(unknown, known) {
 }
 
 /** Follows one session, or always the newest. Reconnects by itself until it is closed. */
-export class Viewer {
-  #socket;
-
+export class Viewer extends ViewerSocket {
   /**
    * @param gateway address of the gateway
    * @param handlers functions by name, see index.d.ts
@@ -55,11 +53,9 @@ export class Viewer {
     }
     let names = [];
     let resolveReady = null;
-    /** Resolved when a session is shown. The viewer misses nothing from then on. */
-    this.ready = new Promise((resolve) => (resolveReady = resolve));
     const call = (name, ...values) => handlers[name]?.(...values);
     const url = (chosen) => socketUrl(gateway, "/viewer", { session: chosen, shapes, token });
-    this.#socket = new ViewerSocket(url, session, {
+    super(url, session, {
       state: (isConnected) => call("connected", isConnected),
       fap: (mediaTime, values) => call("frame", mediaTime, values),
       sound: (mediaTime, samples) => call("sound", mediaTime, samples),
@@ -72,19 +68,7 @@ export class Viewer {
         if (message.type === "session" && message.session !== null) resolveReady();
       },
     });
-  }
-
-  /** Show another session; "" for the newest. */
-  follow(session) {
-    this.#socket.follow(session);
-  }
-
-  /** Send a command, such as { expressions: { joy: 0.5 } }. */
-  send(command) {
-    this.#socket.send(command);
-  }
-
-  close() {
-    this.#socket.close();
+    /** Resolved when a session is shown. The viewer misses nothing from then on. */
+    this.ready = new Promise((resolve) => (resolveReady = resolve));
   }
 }
