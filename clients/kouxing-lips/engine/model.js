@@ -2,6 +2,7 @@
 
 import { floats, halfToFloat } from "./math.js";
 import { Network } from "./network.js";
+import { readGraph } from "./onnx-file.js";
 import { PhoneLm } from "./phone-lm.js";
 
 const FORMAT = "kouxing-lips 7";
@@ -41,8 +42,8 @@ export async function loadModel(base, { phones = false } = {}) {
     arrays: unpack(blob, model.arrays),
     phoneArrays,
     phoneLm: phones ? new PhoneLm(phoneArrays, model.constants) : null,
-    encoder: new Network(encoder),
-    blocks: blocks ? new Network(blocks) : null,
+    encoder: new Network(readGraph(encoder)),
+    blocks: blocks ? new Network(readGraph(blocks)) : null,
   };
 }
 

@@ -1,13 +1,12 @@
-// Runs a network: the nodes of an ONNX file, for one session.
+// Runs a network: the nodes of a graph, for one session.
 //
-// The file is the one that the server runs with onnxruntime. Only its operators are supported. As on the
+// Files are those that the server runs with onnxruntime. Only their operators are supported. As on the
 // server, values are rounded to 32 bits after each operator. All tensors are allocated once, so a run
 // leaves no garbage.
 //
 // onnxruntime-web is not used. It would add 3.7 MB to a download of 2.9 MB; the code here is 10 kB. A step of the
 // audio encoder needs 0.3 ms here and 0.6 ms in onnxruntime-web 1.30 (Node 20, one thread, shortest of 15 series).
 
-import { readGraph } from "./onnx-file.js";
 import { OPERATORS, tensorOf } from "./operators.js";
 import { ProductMemory, alignedBytes } from "./products.js";
 
@@ -15,9 +14,8 @@ export class Network {
   #tensors; // { shape, values } by name
   #steps;
 
-  /** Open the bytes of an ONNX file; throws an error if it needs other operators. */
-  constructor(bytes) {
-    const { nodes, tensors, inputs } = readGraph(bytes);
+  /** Open a graph (readGraph); throws an error if it needs other operators. */
+  constructor({ nodes, tensors, inputs }) {
     const unknown = nodes.find(({ type }) => !(type in OPERATORS));
     if (unknown) throw new Error(`the network needs the operator ${unknown.type}; update the package`);
     this.#tensors = { ...tensors };
