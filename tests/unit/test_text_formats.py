@@ -268,19 +268,29 @@ def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
         ("korean", "안녕하세요", "cp949"),
         ("universal", "La fenêtre est grande", "cp1252"),
         ("universal", "niños y año", "cp1252"),
+        ("universal", "«Bonjour» dit-elle à l’enfant.", "cp1252"),
         ("universal", "A和B都有iPhone", "gb18030"),
         ("mandarin", "x和y都大。", "gb18030"),
         ("mandarin", "歡迎看 Unity、Godot 的人", "big5"),
         ("cantonese", "歡迎收聽", "big5"),
+        ("cantonese", "喺度食嘢", "big5hkscs"),
     ],
 )
 def test_an_encoding_depends_on_the_language(language: str, text: str, encoding: str) -> None:
     assert decode_text(text.encode(encoding), language) == (text, encoding.upper())
 
 
-def test_rejects_an_encoding_that_the_language_does_not_have() -> None:
+@pytest.mark.parametrize(
+    ("language", "content"),
+    [
+        ("hindi", "été".encode("cp1252")),  # an encoding that the language does not have
+        ("mandarin", 9 * ONE.encode("gb18030") + b"\x80 "),  # also valid Windows-1252
+        ("mandarin", ONE.encode()[:-1]),
+    ],
+)
+def test_rejects_an_unknown_encoding(language: str, content: bytes) -> None:
     with pytest.raises(UserError, match=r"encoding is unknown; save .* in UTF-8"):
-        decode_text("été".encode("cp1252"), "hindi")
+        decode_text(content, language)
 
 
 def test_reads_a_file_in_the_encoding_of_its_language(
