@@ -159,6 +159,7 @@ export class KouxingFace extends HTMLElement {
   /** The local lip sync: a promise of a LipSync of kouxing-lips. Its sources move the model. */
   get lips() {
     if (!this.hasAttribute("local")) throw new Error("<kouxing-face> needs the attribute local; add it");
+    if (!this.isConnected) throw new Error("<kouxing-face> is not in the page; add it to the page first");
     if (this.#lips === null) {
       const loading = this.#loadLips();
       this.#lips = loading;

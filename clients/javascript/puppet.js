@@ -48,7 +48,7 @@ export async function loadPuppet(url) {
 async function readAvatar(url) {
   const loader = new GLTFLoader().register((parser) => new VRMLoaderPlugin(parser));
   loader.setMeshoptDecoder(MeshoptDecoder).setDRACOLoader(globalThis.Worker ? new DRACOLoader() : null);
-  loader.register(({ json }) => ({ name: "kouxing", beforeRoot: () => checkTextures(json) }));
+  loader.register(({ json }) => ({ name: "kouxing", beforeRoot: () => prepareFile(json) }));
   const data = await fetchFile(url);
   const { scene, parser, userData } = await loader.parseAsync(data, THREE.LoaderUtils.extractUrlBase(url));
   const kouxing = scene.getObjectByName("kouxing")?.userData.kouxing;
@@ -75,11 +75,18 @@ export async function fetchFile(url) {
   return answer.arrayBuffer();
 }
 
-/** Throw an error if a texture has only an image that needs an extension that cannot be read. */
-function checkTextures({ textures = [] }) {
+/**
+ * Add a scene with all nodes to a file without scenes. Throw an error if a texture has only an image that needs an
+ * extension that cannot be read.
+ */
+function prepareFile(json) {
+  const { scenes = [], nodes = [], textures = [] } = json;
   if (textures.some(({ source, extensions = {} }) => source === undefined && "KHR_texture_basisu" in extensions)) {
     throw new Error(Object.keys(UNREADABLE)[1]);
   }
+  if (scenes.length > 0) return;
+  const children = new Set(nodes.flatMap((node) => node.children ?? []));
+  json.scenes = [{ nodes: [...nodes.keys()].filter((node) => !children.has(node)) }];
 }
 
 /** Return the names of a mesh's morph targets, "" for targets without effect. Programs write them in different places. */

@@ -1,7 +1,7 @@
 // Reads the .csv and .jsonl files of `kouxing listen -o` and `kouxing render`, with FAPs or shapes,
 // and takes (.csv) of the app Live Link Face. Frames of a take without a face, with a count of 0, are left out.
 // Tables of spreadsheet programs may be in UTF-16, and have semicolons or tabs with decimal commas.
-// The values of these tables are numbers, times and names without quotes, so no CSV package is needed.
+// The values of these tables are numbers, times and names, so no CSV package is needed. Quotes are removed.
 
 const RATE_HZ = 16000;
 // A time code counts frames, but the file does not name their rate. It is the lowest of these above
@@ -20,7 +20,7 @@ export function readRecording(content) {
   const text = typeof content === "string" ? content.replace(/^\uFEFF/, "") : decodeText(new Uint8Array(content));
   const lines = text.split(/\r?\n/).filter((line) => /[^ ,;\t]/.test(line) && !line.startsWith("sep=")); // "sep=" is from Excel
   if (lines.length === 0) throw new Error("the recording is empty; record it again");
-  const recording = lines[0].startsWith("{") ? readJsonLines(lines) : readCsv(lines);
+  const recording = lines[0].startsWith("{") ? readJsonLines(lines) : readCsv(lines.map(removeQuotes));
   if (recording.frames.length === 0) throw new Error("the recording has no frames with a face; record it again");
   const wrong = recording.frames.findIndex(
     ([time, values]) => !Number.isFinite(time) || !values.every(Number.isFinite),
@@ -68,6 +68,11 @@ function readJsonLines(lines) {
     }
   });
   return { names, frames };
+}
+
+/** Return a line without quotes. A comma between quotes is a decimal comma. */
+function removeQuotes(line) {
+  return line.replaceAll(/"([^"]*)"/g, (_, cell) => cell.replaceAll(",", "."));
 }
 
 /** Return the cells of each line, separated by commas, semicolons or tabs. */

@@ -206,6 +206,8 @@ export class LipSync extends EventTarget {
     this.#isPlayed = node.isPlayed;
     const delay = node.isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
     node.connect(input);
+    const isElement = isInstance(source, "HTMLMediaElement");
+    if (isElement) node.disconnect(context.destination);
     if (delay) node.connect(delay).connect(context.destination);
     this.#source = {
       node,
@@ -216,6 +218,7 @@ export class LipSync extends EventTarget {
           node.disconnect(delay);
           delay.disconnect();
         }
+        if (isElement) node.connect(context.destination);
         if (isInstance(source, "AudioBuffer")) {
           node.onended = null;
           node.stop();
@@ -346,7 +349,9 @@ function isInstance(object, className) {
   return object.constructor?.name === className || isInstance(Object.getPrototypeOf(object), className);
 }
 
-const elementNodes = new WeakMap(); // an element allows only one node
+// An element allows only one node, and is heard only through it. The node of an element that is not followed is
+// connected to the destination.
+const elementNodes = new WeakMap();
 
 /** Return the audio node of a source. Its property isPlayed is true if the page plays the sound. */
 function sourceNode(context, source) {
@@ -364,8 +369,11 @@ function sourceNode(context, source) {
     return Object.assign(new AudioBufferSourceNode(context, { buffer: source }), { isPlayed: true });
   }
   if (isInstance(source, "HTMLMediaElement")) {
-    if (!elementNodes.has(source)) elementNodes.set(source, new MediaElementAudioSourceNode(context, { mediaElement: source }));
-    return Object.assign(elementNodes.get(source), { isPlayed: true });
+    if (current) return current;
+    const node = Object.assign(new MediaElementAudioSourceNode(context, { mediaElement: source }), { isPlayed: true });
+    node.connect(context.destination);
+    elementNodes.set(source, node);
+    return node;
   }
   throw new TypeError("expected a MediaStream, a track, an AudioBuffer, an <audio> or <video> element, or an audio node");
 }

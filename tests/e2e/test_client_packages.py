@@ -86,6 +86,8 @@ def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path
     assert max(float(line.split()[-1]) for line in jaw) > 200
     assert [line.split()[-1] for line in phones[:4]] == ["n", "i", "h", "ao"]
     assert (site_packages(python) / "kouxing_client" / "py.typed").is_file()
+    (packed,) = site_packages(python).glob("kouxing_client-*/licenses/LICENSE")
+    assert packed.read_bytes() == (ROOT / "LICENSE").read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -273,6 +275,14 @@ def test_the_web_component_plays_no_recording_after_it_was_removed(
     )
     assert result == "AbortError"
     faces.wait_for("arkit.set === 'arkit'")
+
+
+def test_a_web_component_outside_the_page_starts_no_lip_sync(faces: Browser) -> None:
+    make = "const face = document.createElement('kouxing-face'); face.setAttribute('local', '')"
+    error = faces.evaluate(
+        f"(() => {{ {make}; try {{ face.lips; }} catch (e) {{ return `${{e}}`; }} }})()"
+    )
+    assert "add it to the page first" in error
 
 
 def test_the_web_component_reports_that_it_is_no_longer_drawn(faces: Browser) -> None:

@@ -123,6 +123,7 @@ def change(path: Path, kind: str) -> None:
     nodes = document["scenes"][0]["nodes"]
     if kind in TRANSFORMS:
         wrap_scene(document, **TRANSFORMS[kind])
+        del document["scene"], document["scenes"]  # a file without scenes has one with all nodes
     elif kind == "no effect":
         binary[:] = bytes(len(binary))
     elif kind in ("empty expressions", "expressions"):

@@ -25,6 +25,8 @@ RECORDINGS: dict[str, str | bytes] = {
     "case of the titles": "Time_S,jawOpen,Phone\n0,0,a\n0.02,0.5,a\n",
     "empty lines": "time_s,jawOpen\r\n\r\n0,0\r\n0.02,0.5\r\n,\r\n",
     "semicolons, from Excel": "sep=;\ntime_s;jawOpen\n0;0\n0,02;0,5\n;\n",
+    "quotes": '"time_s","jawOpen"\n"0","0"\n"0.02","0.5"\n',
+    "quotes and decimal commas": '"time_s","jawOpen"\n"0","0"\n"0,02","0,5"\n',
     "tabs": TABS,
     "UTF-16": TABS.encode("utf-16"),
     "UTF-16, big-endian": ("\ufeff" + TABS).encode("utf-16-be"),

@@ -48,6 +48,24 @@ class FakeNode {
 
 class AudioBuffer {}
 
+class HTMLMediaElement {}
+
+/** A node that knows the nodes to which it is connected. */
+class ElementNode extends FakeNode {
+  outputs = new Set();
+  constructor(nodeContext) {
+    super();
+    this.context = nodeContext;
+  }
+  connect(node) {
+    this.outputs.add(node);
+    return node;
+  }
+  disconnect(node) {
+    assert.ok(this.outputs.delete(node));
+  }
+}
+
 class AudioNode {}
 
 class FakeContext extends EventTarget {
@@ -55,6 +73,7 @@ class FakeContext extends EventTarget {
   sampleRate = 48000;
   currentTime = 0;
   audioWorklet = { addModule: async () => {} };
+  destination = new FakeNode();
   async resume() {}
 }
 
@@ -89,6 +108,7 @@ test.beforeEach(() => {
     AudioWorkletNode: FakeNode,
     MediaStreamAudioSourceNode: FakeNode,
     AudioBufferSourceNode: FakeNode,
+    MediaElementAudioSourceNode: ElementNode,
     DelayNode: FakeNode,
     MessageChannel: class {},
   });
@@ -267,6 +287,28 @@ test("a wrong source is rejected, and the current one is still followed", async 
   await assert.rejects(lips.listenTo(5), TypeError);
   assert.equal(lips.node, node);
   assert.ok(stream.track.isLive);
+});
+
+test("a media element is always heard: directly, or delayed while it is followed", async () => {
+  const lips = await LipSync.create({ context });
+  const element = new HTMLMediaElement();
+  let node = null;
+  for (let time = 0; time < 2; time++) {
+    const listening = lips.listenTo(element);
+    await open();
+    await listening;
+    ({ node } = lips);
+    assert.equal(node.outputs.size, 2); // the worklet and the delay
+    assert.ok(!node.outputs.has(context.destination));
+    lips.stop();
+    assert.deepEqual([...node.outputs], [context.destination]);
+  }
+  const listening = lips.listenTo(element);
+  await opening();
+  lips.stop();
+  FakeWorker.newest.answer("opened");
+  await assert.rejects(listening, aborted);
+  assert.deepEqual([...node.outputs], [context.destination]);
 });
 
 test("a buffer that is replaced does not report its end", async () => {

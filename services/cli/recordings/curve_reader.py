@@ -118,7 +118,7 @@ def _csv_rows(path: Path, lines: Iterator[str]) -> Iterator[list[str]]:
     delimiter = max(",;\t", key=header.count)
     try:
         for row in csv.reader(itertools.chain([header], lines), delimiter=delimiter):
-            yield row if delimiter == "," else [cell.replace(",", ".") for cell in row]
+            yield [cell.replace(",", ".") for cell in row]
     except csv.Error as error:
         raise UserError(f"{path}: this is not a table: {error}; export it again") from None
 
