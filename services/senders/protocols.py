@@ -4,9 +4,11 @@ Other distributions add protocols by entry points of the group ``kouxing.senders
 has the name of the protocol. Its value is the ``package:Class`` of a ``TargetConnection``.
 """
 
+import re
+from collections.abc import Mapping
 from functools import lru_cache
 from pkgutil import resolve_name
-from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
+from urllib.parse import SplitResult, parse_qsl, quote, urlsplit, urlunsplit
 
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
@@ -60,6 +62,8 @@ def parse_target(url: str) -> Target:
         host, port = parts.hostname or LOOPBACK, parts.port
     except ValueError:
         raise _address_error(url) from None
+    if host == "localhost":
+        host = LOOPBACK
     protocol = protocols().get(parts.scheme)
     is_bare = parts.path in ("", "/") and not parts.fragment and parts.username is None
     is_readable = url.isprintable() and " " not in url
@@ -68,7 +72,7 @@ def parse_target(url: str) -> Target:
     options = _parse_options(url, parts.query, protocol)
     try:
         target = Target(
-            url=_normalize(parts, host, protocol.default_port),
+            url=_normalize(parts, host, options, protocol),
             protocol=parts.scheme,
             frame_contents=protocol.contents,
             host=host,
@@ -82,12 +86,19 @@ def parse_target(url: str) -> Target:
     return target
 
 
-def _normalize(parts: SplitResult, host: str, default_port: int) -> str:
-    """Return the canonical form of an address: with the host, and without the default port."""
+def _normalize(
+    parts: SplitResult, host: str, options: Mapping[str, str], protocol: type[TargetConnection]
+) -> str:
+    """Return the canonical form of an address: with the host, and without default values."""
     address = f"[{host}]" if ":" in host else host
-    if parts.port not in (None, default_port):
+    if parts.port not in (None, protocol.default_port):
         address += f":{parts.port}"
-    return urlunsplit((parts.scheme, address, "", parts.query, ""))
+    query = "&".join(
+        f"{name}={re.sub('[%&+# ]', lambda found: quote(found[0]), value)}"  # others stay readable
+        for name, value in options.items()
+        if value != protocol.options[name].default
+    )
+    return urlunsplit((parts.scheme, address, "", query, ""))
 
 
 def _address_error(url: str) -> UserError:

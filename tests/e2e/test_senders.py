@@ -145,9 +145,10 @@ def test_starts_and_stops_senders(senders: SenderPool, receiver: socket.socket) 
     assert receiver.recv(2000)
     wait_until(lambda: senders.states()[0].rate_hz > 0)
     (state,) = senders.states()
-    assert (state.target, state.contents) == (url, "ARKit shapes and head")
-    senders.stop(url)
-    senders.stop(url)
+    target = parse_target(url).url
+    assert (state.target, state.contents) == (target, "ARKit shapes and head")
+    senders.stop(target)
+    senders.stop(target)
     assert senders.states() == []
     for number in range(MAX_SENDERS):
         senders.start(parse_target(f"osc://127.0.0.1:{9 + number}"))

@@ -153,7 +153,7 @@ def test_vtube_studio_errors_are_explained_or_ignored() -> None:
     [
         ("vmc://", "127.0.0.1", 39540),
         ("livelink://192.168.1.20", "192.168.1.20", 11111),
-        ("osc://localhost", "localhost", 9000),
+        ("osc://localhost", "127.0.0.1", 9000),
         ("vts://[::1]:8002/", "::1", 8002),
     ],
 )
@@ -167,8 +167,11 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
     ("url", "others"),
     [
         ("vmc://127.0.0.1", ["vmc://", "VMC://127.0.0.1/", "vmc://127.0.0.1:39540?"]),
+        ("vmc://127.0.0.1", ["vmc://localhost", "vmc://?delay=0&head=off&camera="]),
+        ("osc://127.0.0.1?delay=2&shapes=vrm", ["osc://?shapes=vrm&prefix=&delay=2"]),
+        ("livelink://127.0.0.1?name=口%26型", ["livelink://?delay=0&name=%E5%8F%A3%26型"]),
         ("vmc://127.0.0.1:39541", ["vmc://:39541", "vmc://127.0.0.1:39541/"]),
-        ("osc://pc.local?prefix=/A/&delay=2", ["OSC://PC.local:9000/?prefix=/A/&delay=2"]),
+        ("osc://pc.local?delay=2&prefix=/A/", ["OSC://PC.local:9000/?prefix=/A/&delay=2"]),
         ("vts://[::1]", ["vts://[::1]:8001", "VTS://[::1]/"]),
     ],
 )
