@@ -12,8 +12,8 @@ enum { FRAMES = SEGMENTER_FRAMES_PER_ENCODER_FRAME, MAX_RECENT = SEGMENTER_MAX_R
 
 /* Resampling to 16 kHz; front_end/resample.py has the formula. */
 typedef struct {
-  int up, down, half;
-  float *table; /* rows (up, 2 * half) of the filter, one for each phase */
+  int up, down, half, num_phases;
+  float *table; /* rows (num_phases + 1, 2 * half) of the filter */
   float *known; /* (2 * half + LIPS_MAX_CHUNK + down / up + 2,) samples */
   int num_known;
   int64_t first, num_out; /* number of the first known sample, and of the next output */
@@ -61,15 +61,16 @@ static bool resampler_init(Resampler *r, int rate_hz) {
   r->up = RESAMPLE_SAMPLE_RATE_HZ / common;
   r->down = rate_hz / common;
   r->half = (int)ceil(RESAMPLE_HALF_WIDTH / lower);
-  r->table = malloc(sizeof(float) * r->up * 2 * r->half);
+  r->num_phases = r->up < RESAMPLE_MAX_PHASES ? r->up : RESAMPLE_MAX_PHASES;
+  r->table = malloc(sizeof(float) * (r->num_phases + 1) * 2 * r->half);
   r->known = calloc(2 * r->half + LIPS_MAX_CHUNK + r->down / r->up + 2, sizeof(float));
   if (!r->table || !r->known) return false;
-  for (int phase = 0; phase < r->up; phase++) {
+  for (int phase = 0; phase <= r->num_phases; phase++) {
     float *row = r->table + phase * 2 * r->half;
     double sum = 0.0;
     for (int pass = 0; pass < 2; pass++) {
       for (int tap = 0; tap < 2 * r->half; tap++) {
-        const double time = (double)phase / r->up - (tap + 1 - r->half), ratio = time / r->half;
+        const double time = (double)phase / r->num_phases - (tap + 1 - r->half), ratio = time / r->half;
         const double weight = sinc(lower * RESAMPLE_CUTOFF * time) * bessel(RESAMPLE_KAISER_BETA * sqrt(fmax(0.0, 1.0 - ratio * ratio)));
         if (pass == 0) sum += weight;
         else row[tap] = (float)(weight / sum);
@@ -97,11 +98,12 @@ static void resample(Lips *lips, const float *samples, int num_samples) {
   memcpy(r->known + r->num_known, samples, num_samples * sizeof(float));
   r->num_known += num_samples;
   for (; (r->num_out * r->down) / r->up + r->half < r->first + r->num_known; r->num_out++) {
-    const int64_t position = r->num_out * r->down;
-    const float *filter = r->table + (position % r->up) * 2 * r->half;
+    const int64_t position = r->num_out * r->down, phase = position % r->up * r->num_phases;
+    const float *filter = r->table + phase / r->up * 2 * r->half, *following = filter + 2 * r->half;
+    const double rest = (double)(phase % r->up) / r->up; /* 0 unless the table has fewer phases than the rate */
     const float *known = r->known + (position / r->up - r->half + 1 - r->first);
     double total = 0.0;
-    for (int tap = 0; tap < 2 * r->half; tap++) total += (double)filter[tap] * known[tap];
+    for (int tap = 0; tap < 2 * r->half; tap++) total += (filter[tap] + rest * (following[tap] - filter[tap])) * known[tap];
     process_sample(lips, (float)total);
   }
   int64_t drop = (r->num_out * r->down) / r->up - r->half + 1 - r->first;

@@ -218,6 +218,19 @@ def test_buffers_at_48_khz_from_python(library: Any) -> None:
     assert np.abs(from_integers - mono).mean() < 0.003
 
 
+def test_a_rate_with_many_phases_has_the_visemes_of_a_similar_rate(library: Any) -> None:
+    """The filter has 16,000 phases at 47,999 Hz; the library interpolates between 640."""
+    samples = samples_of_file(DEMO / "hello-female.wav")[:32_000]
+    sound = soxr.resample(samples, 16_000, RATE_HZ).astype(np.float32)
+    other = ctypes.c_uint()
+    create_ex = library.ovrLipSync_CreateContextEx
+    assert create_ex(ctypes.byref(other), ENHANCED, RATE_HZ - 1, False) == SUCCESS
+    (_, expected), (_, weights) = (
+        process(library, context, sound) for context in (create(library), other)
+    )
+    assert_close(weights, expected)
+
+
 def laughter_of(samples: Frames) -> list[float]:
     """Return the server's evidence of laughter, after each position of the encoder."""
     bands = WhisperMel().accept_waveform(samples)

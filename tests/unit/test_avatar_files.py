@@ -211,6 +211,16 @@ def test_limits_the_size_of_a_draco_mesh_before_it_is_decoded(
         read_glb(path)
 
 
+def test_limits_the_points_of_a_draco_mesh_because_its_attributes_are_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = edit(write_glb(tmp_path / "my.glb", meshes({"jawOpen": SHAPES["jawOpen"]})), draco)
+    monkeypatch.setattr(glb_file, "read_mesh_size", lambda _: (700_000, 2_100_000))
+    monkeypatch.setattr(DracoPy, "decode", lambda _: pytest.fail("the mesh was decoded"))
+    with pytest.raises(UserError, match="a mesh has 700000 triangles; reduce it to 666666"):
+        read_glb(path)
+
+
 def test_applies_default_weights_of_other_shapes_only(tmp_path: Path) -> None:
     """The shapes of speech start at rest; the others, such as the shape of the nose, stay."""
 
