@@ -35,6 +35,7 @@ class BenchGroup(TyperGroup):
 
 app = typer.Typer(
     cls=BenchGroup,
+    no_args_is_help=True,
     add_completion=False,
     help="Measure speed and load. 'kouxing bench my.wav' means 'kouxing bench latency my.wav'.",
 )

@@ -87,7 +87,12 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
             "the file is damaged or cut off",
             "文件损坏或不完整",
         ),
-        ("silent.wav", None, "silent.wav: no speech was found; the file is silent", "文件是静音的"),
+        (
+            "silent.wav",
+            None,
+            "silent.wav: no speech was found; the file is silent. Choose another file",
+            "请选择其他文件",
+        ),
     ],
 )
 def test_a_file_without_sound_is_explained_in_both_languages(

@@ -59,6 +59,15 @@ def test_the_choices_of_an_option_are_not_broken_in_a_narrow_terminal(command: s
 
 
 @pytest.mark.parametrize(
+    "group", ["bench", "evaluate", "export", "head", "keys", "mos", "plot", "train"]
+)
+def test_a_group_without_a_command_lists_its_commands(group: str) -> None:
+    printed = CliRunner().invoke(command_line.app, [group]).output
+    assert "Usage:" in printed
+    assert "Commands" in printed or "evaluations" in printed
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ("train gmm --any-license", "train --any-license gmm"),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from kouxing_client import NotConnected
+from kouxing_client.connection_check import NO_LISTENER
 
 from kouxing.services.cli.system.running_system import (
     announce_system,
@@ -94,6 +95,14 @@ def test_says_that_no_system_runs_unless_the_user_gave_its_address(
 ) -> None:
     with pytest.raises(UserError, match=message), open_control_address(address):
         raise UserError("no answer") from NotConnected("no answer")
+
+
+def test_says_only_once_how_to_start_a_system() -> None:
+    with (
+        pytest.raises(UserError, match=r"Tried: tcp://127\.0\.0\.1:5550$"),
+        open_control_address(""),
+    ):
+        raise UserError(f"no answer: {NO_LISTENER}") from NotConnected("no answer")
 
 
 def test_a_given_address_overrides_the_running_system(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,6 +116,7 @@ def open_control_address(address: str) -> Iterator[str]:
     Raises ``UserError`` if there is no such system, and control's default address cannot be used.
     """
     from kouxing_client import NotConnected
+    from kouxing_client.connection_check import NO_LISTENER
 
     system = choose_system(address)
     config = system.config
@@ -126,7 +127,8 @@ def open_control_address(address: str) -> Iterator[str]:
         yield system.running_endpoint or control_endpoint(config.control, insecure=config.insecure)
     except UserError as error:
         if system.uses_default_address and isinstance(error.__cause__, NotConnected):
-            raise UserError(f"{_not_running_text(others)}. Tried: {error}") from error
+            tried = config.control if NO_LISTENER in str(error) else error  # one remedy is enough
+            raise UserError(f"{_not_running_text(others)}. Tried: {tried}") from error
         raise
 
 

@@ -110,7 +110,10 @@ export const TEXTS = {
     en: "{file}: no speech was found. Choose a recording with a clear voice.",
     zh: "{file}：没有找到语音。请选择人声清晰的录音。",
   },
-  noSpeechSilent: { en: "{file}: no speech was found; the file is silent", zh: "{file}：没有找到语音，文件是静音的" },
+  noSpeechSilent: {
+    en: "{file}: no speech was found; the file is silent. Choose another file, or record it again with the microphone on.",
+    zh: "{file}：没有找到语音，文件是静音的。请选择其他文件，或打开麦克风重新录音。",
+  },
   oldMouthProfile: {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
     zh: "保存的口型不适用于当前版本。请按“学我的口型”重新录制。",
