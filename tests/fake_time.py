@@ -1,8 +1,9 @@
 """An event loop in which waiting takes no time."""
 
 import asyncio
+import functools
 import selectors
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 
 
 class InstantSelector(selectors.DefaultSelector):
@@ -26,7 +27,12 @@ class FakeTimeLoop(asyncio.SelectorEventLoop):
         return self._clock.now_s
 
 
-def run(coroutine: Coroutine[None, None, None]) -> None:
-    """Run a coroutine in such a loop."""
-    with asyncio.Runner(loop_factory=FakeTimeLoop) as runner:
-        runner.run(coroutine)
+def with_fake_time(test: Callable[..., Coroutine[None, None, None]]) -> Callable[..., None]:
+    """Run a test that is a coroutine in such a loop."""
+
+    @functools.wraps(test)
+    def run(**arguments: object) -> None:
+        with asyncio.Runner(loop_factory=FakeTimeLoop) as runner:
+            runner.run(test(**arguments))
+
+    return run

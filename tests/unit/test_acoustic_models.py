@@ -1,6 +1,5 @@
 """Acoustic models: each frame is scored once, in any chunks and segments; broken files."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from kouxing.services.recognizer.config import MODEL_NAMES
 from kouxing.services.recognizer.front_end.features import NUM_FEATURES, NUM_STATIC
 from kouxing.shared.errors import UserError
 from kouxing.training.model_files import save_blocks, save_gmm
-from tests.languages import MANDARIN, NUM_PHONES, SIL, Table, random_topology
+from tests.languages import MANDARIN, NUM_PHONES, random_topology
 from tests.system import HELLO
 
 
@@ -30,7 +29,7 @@ def frames(model: AcousticModel) -> np.ndarray:
     return model.create_front_end().accept_waveform(HELLO)
 
 
-@pytest.mark.parametrize("num_frames", [0, 1, 29, 30])
+@pytest.mark.parametrize("num_frames", [0, 1, 30])
 def test_scores_every_frame_once(model: AcousticModel, frames: np.ndarray, num_frames: int) -> None:
     stream = model.create_stream()
     for _ in range(2):
@@ -68,7 +67,8 @@ def test_saved_and_loaded_scores_are_the_same(
     save(tmp_path / "model.npz", model)  # type: ignore[arg-type]
     again = load_model(tmp_path / "model.npz")
     np.testing.assert_array_equal(score_segment(again, frames), score_segment(model, frames))
-    assert again.topology.lm_scale == model.topology.lm_scale
+    for weight in ("lm_scale", "phone_penalty", "rate_weight"):
+        assert getattr(again.topology, weight) == getattr(model.topology, weight)
 
 
 NUM_STATES = 2 * NUM_PHONES
@@ -84,11 +84,10 @@ def random_mixtures(rng: np.random.Generator, num_mixtures: int = 3) -> Gaussian
     )
 
 
-def random_gmm(seed: int = 0) -> GmmModel:
-    rng = np.random.default_rng(seed)
-    hmms = random_topology(2, rng, Table.draw(rng, [0, 21, 30, SIL], order=3).tree())
+def random_gmm() -> GmmModel:
+    rng = np.random.default_rng(0)
     return GmmModel(
-        topology=replace(hmms, lm_scale=1.5, phone_penalty=-0.25, rate_weight=7.0),
+        topology=random_topology(2, rng),
         mixtures=random_mixtures(rng),
         rotation=np.eye(NUM_FEATURES, dtype=np.float32),
         prior_mean=np.zeros(NUM_STATIC, np.float32),
@@ -105,12 +104,6 @@ def test_densities_match_scipy() -> None:
     expected = logsumexp(log_parts + np.log(mixtures.weights), axis=-1)
     scores = mixture_scores(x, mixtures.score_matrix(), 3)
     np.testing.assert_allclose(scores, expected, rtol=1e-4)
-
-
-def test_search_weights_are_saved(tmp_path: Path) -> None:
-    save_gmm(tmp_path / "model.npz", random_gmm())
-    topology = load_model(tmp_path / "model.npz").topology
-    assert (topology.lm_scale, topology.phone_penalty, topology.rate_weight) == (1.5, -0.25, 7.0)
 
 
 def test_rejects_broken_files(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from kouxing.services.recognizer.offline.alignment import (
     drop_pauses,
     find_syllable_times,
 )
-from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.phone_files import format_phones
@@ -126,8 +125,3 @@ def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:
     assert read["syllables"][1] == {
         "text": "好", "spelling": "hao3", "onset_s": 0.4, "duration_s": 0.2,
     }  # fmt: skip
-
-
-def test_rejects_an_unknown_suffix(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"ends in \.txt, \.csv, \.json, \.textgrid"):
-        align(VOWELS_FILE, "啊", output=tmp_path / "said.xml")

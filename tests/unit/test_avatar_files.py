@@ -321,25 +321,11 @@ def test_eye_bones_of_a_vrm_turn_the_eyes(tmp_path: Path, version: int, fap: str
     assert np.linalg.norm(turned / scale - wanted) < 0.2 * np.linalg.norm(wanted)
 
 
-@pytest.mark.parametrize(
-    ("kept", "shift", "error_text"),
-    [
-        (["eyeBlinkLeft", "mouthPucker"], 0, "cannot speak: it has no shape jawOpen of ARKit"),
-        ([], 0, "cannot speak: it has no shape jawOpen, mouthPucker of ARKit"),
-        (list(SHAPES), 1, "several faces; export only one"),
-    ],
-    ids=["no mouth", "no shapes", "two avatars"],
-)
-def test_the_error_says_why_an_avatar_cannot_speak(
-    tmp_path: Path, kept: list[str], shift: float, error_text: str
-) -> None:
-    parts = meshes({name: SHAPES[name] for name in kept})
-    path = write_glb(tmp_path / "my.glb", parts)
-
+def test_rejects_a_file_with_two_avatars(tmp_path: Path) -> None:
     def double(document: dict[str, Any], _binary: bytearray) -> None:
         count = len(document["nodes"])
-        document["nodes"] += [node | {"translation": [shift, 0, 0]} for node in document["nodes"]]
+        document["nodes"] += [node | {"translation": [1, 0, 0]} for node in document["nodes"]]
         document["scenes"][0]["nodes"] += [count + i for i in range(count)]
 
-    with pytest.raises(UserError, match=error_text):
-        read_glb(edit(path, double) if shift else path)
+    with pytest.raises(UserError, match="several faces; export only one"):
+        read_glb(edit(write_glb(tmp_path / "my.glb", meshes(SHAPES)), double))

@@ -44,10 +44,6 @@ def send(data: bytes, num_channels: int = 1, num_bytes: int = 640) -> EncodingCh
     return check
 
 
-def square(frequency_hz: float) -> Samples:
-    return np.sign(tone(frequency_hz))
-
-
 def tone(frequency_hz: float) -> Samples:
     wave: Samples = np.sin(2 * np.pi * frequency_hz * TIME_S + 0.1)
     return wave
@@ -66,9 +62,7 @@ def tone(frequency_hz: float) -> Samples:
         ("DOUBLE", "LITTLE", "64-bit float samples"),
     ],
 )
-@pytest.mark.parametrize(
-    ("gain", "num_bytes"), [(0.1, 640), (0.89, 640), (0.89, 999), (0.89, 100_000)]
-)
+@pytest.mark.parametrize(("gain", "num_bytes"), [(0.1, 640), (0.89, 999)])
 def test_the_error_names_the_encoding_of_speech(
     subtype: str, endian: str, kind: str, gain: float, num_bytes: int
 ) -> None:
@@ -135,7 +129,7 @@ def test_refuses_packets_of_a_codec() -> None:
         *(RANDOM.normal(0, rms, len(TIME_S)).clip(-1, 1) for rms in (0.25, 0.36, 0.6, 1.0)),
         *(RANDOM.uniform(-peak, peak, len(TIME_S)) for peak in (0.62, 0.9, 1.0)),
         np.sign(RANDOM.normal(0, 1, len(TIME_S))),
-        *(square(frequency_hz) for frequency_hz in (50, 440, 3000, 7999)),
+        *(np.sign(tone(frequency_hz)) for frequency_hz in (50, 440, 3000, 7999)),
         *(0.9 * tone(frequency_hz) for frequency_hz in (440, 4000, 7990)),
         *(np.where(np.arange(len(TIME_S)) % period, 0.0, 0.9) for period in (3, 50, 800)),
         np.floor(RANDOM.uniform(-128, 128, len(TIME_S))) / 128,  # 8-bit noise

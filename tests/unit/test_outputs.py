@@ -13,7 +13,6 @@ import pytest
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from kouxing.evaluation.commands import plot_heads
 from kouxing.services.cli import web_model
 from kouxing.services.cli.main import app
 from kouxing.services.cli.options import ExportOptions
@@ -124,32 +123,9 @@ def test_run_keeps_the_video_of_another_running_system(old_video: Path) -> None:
     assert old_video.read_bytes() == b"mine"
 
 
-def test_pictures_of_heads_are_not_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "faces.webp").write_bytes(b"mine")
-    with pytest.raises(UserError, match=r"faces.webp exists; add --force"):
-        plot_heads(tmp_path)
-    assert [*tmp_path.iterdir()] == [tmp_path / "faces.webp"]
-
-
 def test_standard_output_is_not_a_file() -> None:
     with pytest.raises(UserError, match="cannot write to standard output; name a file"):
         check_output(Path("-"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["me.avi"], r"me\.avi: unknown format; use a name that ends in \.mp4"),
-        (["me.csv", "--lips", "lerned"], "unknown lip model 'lerned'; use one of"),
-    ],
-)
-def test_render_names_a_wrong_format_or_lip_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("me.wav").touch()
-    with pytest.raises(UserError, match=message):
-        app(["render", "me.wav", *arguments], standalone_mode=False)
 
 
 def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) -> None:
@@ -192,10 +168,11 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("speak mic --fast", "--fast does not apply to mic"),
         ("speak monitor --raw", "--raw does not apply to monitor"),
         ("lips a.wav mouth.png --timing align", "--timing needs a text"),
-        (
-            "listen --as phones -o a.csv",
-            "--output does not apply to phones",
-        ),
+        ("listen --as phones -o a.csv", "--output does not apply to phones"),
+        ("render a.wav me.avi", "me.avi: unknown format; use a name that ends in .mp4"),
+        ("render a.wav me.csv --lips lerned", "unknown lip model 'lerned'; use one of"),
+        ("align a.wav 啊 -o said.xml", "ends in .txt, .csv, .json, .textgrid"),
+        ("plot heads .", "faces.webp exists; add --force"),
         ("express demo --hold 2", "--hold needs an expression"),
         ("express joy:0.4", "for example joy=0.4"),
         ("run --stop-after", "--stop-after needs --play FILE"),
@@ -208,12 +185,12 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("evaluate lips --clips . --from-csv . --delay-ms 9", "--delay-ms applies to lip models"),
     ],
 )
-def test_refuses_an_option_without_effect(
+def test_refuses_arguments_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("a.wav").touch()
-    Path("tablet.key").touch()
+    for name in ("a.wav", "tablet.key", "faces.webp"):
+        Path(name).touch()
     error = CliRunner().invoke(app, arguments.split()).exception
     assert isinstance(error, UserError), error
     assert message in str(error)
@@ -277,18 +254,16 @@ def interrupt_export(output: Path) -> None:
         )
 
 
-def test_an_interrupted_table_is_deleted(tmp_path: Path) -> None:
-    interrupt_export(tmp_path / "face.csv")
-    assert not [*tmp_path.iterdir()]
-
-
 @pytest.mark.parametrize("name", ["face.fap", "face.csv"])
-def test_an_interrupted_command_keeps_an_old_output(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("is_new", [False, True])
+def test_an_interrupted_command_keeps_the_old_output_or_none(
+    tmp_path: Path, name: str, is_new: bool
+) -> None:
     output = tmp_path / name
-    output.write_text("old")
+    if not is_new:
+        output.write_text("old")
     interrupt_export(output)
-    assert output.read_text() == "old"
-    assert [*tmp_path.iterdir()] == [output]
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"] * (not is_new)
 
 
 def test_a_new_file_has_the_permissions_of_the_old_one(tmp_path: Path) -> None:

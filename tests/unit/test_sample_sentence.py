@@ -7,7 +7,7 @@ from typing import cast
 
 from kouxing.services.gateway.audio.audio_sessions import AudioClient
 from kouxing.services.gateway.audio.sample_sentence import SAMPLE_FILE, SampleSentence
-from tests.fake_time import run
+from tests.fake_time import with_fake_time
 
 
 class FakeSession:
@@ -35,13 +35,10 @@ class FakeClient:
         yield self.session
 
 
-def test_the_samples_of_the_file_are_sent_unchanged() -> None:
+@with_fake_time
+async def test_the_samples_of_the_file_are_sent_unchanged() -> None:
     client = FakeClient()
-
-    async def play() -> None:
-        await SampleSentence(cast("AudioClient", client))._speak()
-
-    run(play())
+    await SampleSentence(cast("AudioClient", client))._speak()
     with wave.open(str(SAMPLE_FILE)) as file:
         assert file.getsampwidth() == 2
         assert client.session.pcm == file.readframes(file.getnframes())

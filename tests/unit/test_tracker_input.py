@@ -12,7 +12,7 @@ from kouxing.services.senders.osc import bundle_messages, encode_message
 from kouxing.services.senders.protocols import make_connection, parse_target
 from kouxing.services.senders.tracker_input import TrackerInput
 from kouxing.shared.errors import UserError
-from tests.fake_time import run
+from tests.fake_time import with_fake_time
 from tests.receivers import LIVE_LINK_ORDER, frame_of, read_live_link, read_osc
 
 
@@ -114,7 +114,8 @@ def test_packets_that_cost_too_much_are_dropped() -> None:
         VMC.with_mouth(nested, MOUTH_FRAME)
 
 
-def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
+@with_fake_time
+async def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
     forwarded: list[bytes] = []
 
     def forward(packet: bytes) -> bool:
@@ -123,15 +124,12 @@ def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
             raise ValueError("malformed")
         return True
 
-    async def receive() -> None:
-        tracker = TrackerInput(forward)
-        tracker.datagram_received(b"bad", None)
-        assert not tracker.is_live
-        for _ in range(2000):
-            tracker.datagram_received(b"good", None)
-        assert tracker.is_live
-
-    run(receive())
+    tracker = TrackerInput(forward)
+    tracker.datagram_received(b"bad", None)
+    assert not tracker.is_live
+    for _ in range(2000):
+        tracker.datagram_received(b"good", None)
+    assert tracker.is_live
     assert len(forwarded) == 600
 
 

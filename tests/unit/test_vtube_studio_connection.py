@@ -15,7 +15,7 @@ from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.face.faps import NUM_FAPS
-from tests import fake_time
+from tests.fake_time import with_fake_time
 
 FRAME = FaceFrame(np.zeros(NUM_FAPS, np.float32), 0.0)
 
@@ -73,18 +73,15 @@ class FakeClientSession:
         return next(self._websockets)
 
 
-def test_connects_again_if_no_frame_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+@with_fake_time
+async def test_connects_again_if_no_frame_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    busy, awake = FakeWebSocket(is_busy=True), FakeWebSocket(is_busy=False)
     monkeypatch.setattr(vtube_studio, "_read_tokens", lambda: {"127.0.0.1:8001": "token"})
-
-    async def run() -> None:
-        busy, awake = FakeWebSocket(is_busy=True), FakeWebSocket(is_busy=False)
-        monkeypatch.setattr(aiohttp, "ClientSession", lambda: FakeClientSession(busy, awake))
-        connection = VTubeStudioConnection(parse_target("vts://"))
-        task = asyncio.create_task(connection.run())
-        async with asyncio.timeout(60.0):
-            while not awake.num_frames:
-                connection.send(FRAME)
-                await asyncio.sleep(0.1)
-        task.cancel()
-
-    fake_time.run(run())
+    monkeypatch.setattr(aiohttp, "ClientSession", lambda: FakeClientSession(busy, awake))
+    connection = VTubeStudioConnection(parse_target("vts://"))
+    task = asyncio.create_task(connection.run())
+    async with asyncio.timeout(60.0):
+        while not awake.num_frames:
+            connection.send(FRAME)
+            await asyncio.sleep(0.1)
+    task.cancel()

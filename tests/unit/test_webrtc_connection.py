@@ -1,6 +1,5 @@
 """The received audio of a WebRTC connection, from the timestamps of its packets."""
 
-from collections.abc import Iterator
 from typing import Any, cast
 
 import numpy as np
@@ -9,7 +8,7 @@ from aiortc.mediastreams import MediaStreamError
 from av import AudioFrame
 
 from kouxing.services.gateway.webrtc.connection import MAX_CONCEALED_SAMPLES, WebRtcPeer
-from tests.fake_time import run
+from tests.fake_time import with_fake_time
 
 PACKET = 960  # samples
 START = 10**9
@@ -19,21 +18,15 @@ class FakeTrack:
     """A track whose packets have these timestamps; then the connection ends."""
 
     def __init__(self, timestamps: list[int]) -> None:
-        self._frames = self._make_frames(timestamps)
+        self._timestamps = iter(timestamps)
 
-    @staticmethod
-    def _make_frames(timestamps: list[int]) -> Iterator[AudioFrame]:
-        for timestamp in timestamps:
+    async def recv(self) -> AudioFrame:
+        for timestamp in self._timestamps:
             samples = np.full((1, 2 * PACKET), 1000, np.int16)
             frame = AudioFrame.from_ndarray(samples, format="s16", layout="stereo")
             frame.pts = timestamp
-            yield frame
-
-    async def recv(self) -> AudioFrame:
-        try:
-            return next(self._frames)
-        except StopIteration:
-            raise MediaStreamError from None
+            return frame
+        raise MediaStreamError
 
 
 @pytest.mark.parametrize(
@@ -47,14 +40,12 @@ class FakeTrack:
         (0, [(0, PACKET)]),
     ],
 )
-def test_timestamps_show_lost_and_late_packets_and_new_streams(
+@with_fake_time
+async def test_timestamps_show_lost_and_late_packets_and_new_streams(
     third: int, expected: list[tuple[int, int]]
 ) -> None:
-    async def receive() -> None:
-        peer = WebRtcPeer(lambda _: None)
-        peer._track = cast("Any", FakeTrack([START, START + PACKET, third]))
-        received = [(lost, samples) async for lost, _, samples in peer.receive_audio()]
-        assert received == [(0, PACKET), (0, PACKET), *expected]
-        await peer.close()
-
-    run(receive())
+    peer = WebRtcPeer(lambda _: None)
+    peer._track = cast("Any", FakeTrack([START, START + PACKET, third]))
+    received = [(lost, samples) async for lost, _, samples in peer.receive_audio()]
+    assert received == [(0, PACKET), (0, PACKET), *expected]
+    await peer.close()

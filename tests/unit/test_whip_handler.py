@@ -16,7 +16,7 @@ from kouxing.services.gateway.web.web_application import OpenWebSockets
 from kouxing.services.gateway.webrtc.whip_handler import MAX_COMMANDS, WhipHandler, _Client
 from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.wire.face import FaceSettings
-from tests.fake_time import run
+from tests.fake_time import with_fake_time
 
 UNUSED = cast("Any", None)
 
@@ -80,46 +80,37 @@ def handler(viewers: ViewerHandler) -> WhipHandler:
     return WhipHandler(1.0, cast("AudioClient", None), viewers, [])
 
 
-def test_the_session_can_end_before_the_connection(
+@with_fake_time
+async def test_the_session_can_end_before_the_connection(
     handler: WhipHandler, viewers: ViewerHandler
 ) -> None:
-    async def stream() -> None:
-        viewers.add_session("s", 1, FaceSettings(), "zh")
-        session = cast("Any", FakeSession(Refused("unknown-session", "it has ended")))
-        client = _Client(None, session=session)
-        with viewers.connect_viewer("s", None) as viewer:
-            await handler._stream(
-                client, cast("Any", FakePeer()), session, contextlib.AsyncExitStack()
-            )
-            messages = [str(await viewer.queue.get()) for _ in range(len(viewer.queue))]
-        assert json.loads(messages[-1])["text"] == "it has ended"
-        assert client.is_ending
-
-    run(stream())
+    viewers.add_session("s", 1, FaceSettings(), "zh")
+    session = cast("Any", FakeSession(Refused("unknown-session", "it has ended")))
+    client = _Client(None, session=session)
+    with viewers.connect_viewer("s", None) as viewer:
+        await handler._stream(client, cast("Any", FakePeer()), session, contextlib.AsyncExitStack())
+        messages = [str(await viewer.queue.get()) for _ in range(len(viewer.queue))]
+    assert json.loads(messages[-1])["text"] == "it has ended"
+    assert client.is_ending
 
 
-def test_a_data_channel_rejects_what_it_does_not_execute(handler: WhipHandler) -> None:
-    async def command() -> None:
-        session, channel = FakeSession(), FakeChannel()
-        client = _Client(None, session=cast("Any", session))
-        handler._on_channel(client, cast("Any", channel))
-        channel.on_message('{"skip": 960, "flush": true}')
-        channel.on_message('{"last": true}')
-        await asyncio.sleep(1.0)
-        assert session.num_flushes == 1
-        assert [error.partition(";")[0] for error in channel.errors] == [
-            "unknown field skip",
-            "unknown field last",
-        ]
-        channel.errors.clear()
-        for _ in range(MAX_COMMANDS + 2):
-            channel.on_message('{"flush": true}')
-        await asyncio.sleep(100.0)
-        assert session.num_flushes == 1 + MAX_COMMANDS
-        assert [error.partition(":")[0] for error in channel.errors] == [
-            "the command is dropped"
-        ] * 2
-        for task in client.tasks:
-            task.cancel()
-
-    run(command())
+@with_fake_time
+async def test_a_data_channel_rejects_what_it_does_not_execute(handler: WhipHandler) -> None:
+    session, channel = FakeSession(), FakeChannel()
+    client = _Client(None, session=cast("Any", session))
+    handler._on_channel(client, cast("Any", channel))
+    channel.on_message('{"skip": 960, "flush": true}')
+    channel.on_message('{"last": true}')
+    await asyncio.sleep(1.0)
+    assert session.num_flushes == 1
+    errors = [error.partition(";")[0] for error in channel.errors]
+    assert errors == ["unknown field skip", "unknown field last"]
+    channel.errors.clear()
+    for _ in range(MAX_COMMANDS + 2):
+        channel.on_message('{"flush": true}')
+    await asyncio.sleep(100.0)
+    assert session.num_flushes == 1 + MAX_COMMANDS
+    errors = [error.partition(":")[0] for error in channel.errors]
+    assert errors == ["the command is dropped"] * 2
+    for task in client.tasks:
+        task.cancel()
