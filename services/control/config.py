@@ -19,6 +19,8 @@ class ControlConfig(ServiceConfig):
     """The settings of control."""
 
     control: BoundEndpoint = "tcp://127.0.0.1:5550"
+    """Address at which control accepts commands. Control binds it; if it contains a host name,
+    control binds all addresses of its host."""
     events: BoundEndpoint = "tcp://127.0.0.1:5551"
     """Address that control binds to publish events."""
     max_sessions: Annotated[int, Field(ge=1, le=1_000_000)] = 64

@@ -11,19 +11,14 @@ unknown variables, and does not report where a value came from. With these three
 would save fewer lines than its adapters need.
 """
 
-import ast
 import difflib
-import inspect
 import os
 import re
-import textwrap
 import tomllib
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
-from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -165,7 +160,7 @@ HostNames = Annotated[TextList, AfterValidator(_check_hosts_of), ValueHint("a li
 class ServiceConfig(BaseModel):
     """The keys that every service has."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     safe_alternative: ClassVar[str] = "bind a loopback address"
     """Alternative to an unencrypted address that other machines can reach, for errors."""
@@ -288,7 +283,7 @@ class Settings:
     ) -> list[Setting]:
         """Return all keys of a service with their current values; raises as ``load``."""
         config, values = self._resolve(config_type, overrides or {})
-        defaults, meanings = config_type(), _key_docstrings(config_type)
+        defaults = config_type()
         return [
             Setting(
                 key=key,
@@ -296,7 +291,7 @@ class Settings:
                 origin=values[key].origin if key in values else _DEFAULT,
                 default=getattr(defaults, key),
                 allowed=describe_allowed_values(field),
-                meaning=meanings.get(key, ""),
+                meaning=" ".join((field.description or "").split()),
             )
             for key, field in _fields(self._table(config_type), config_type).items()
         ]
@@ -464,19 +459,6 @@ def _as_text(value: object) -> str:
     if isinstance(value, list):
         return " ".join(map(str, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-@cache
-def _key_docstrings(config_type: type[ServiceConfig]) -> dict[str, str]:
-    """Return the text below each key in the source. pydantic would parse it at every startup."""
-    texts = {}
-    for base in config_type.__mro__[-3::-1]:  # from ServiceConfig, after BaseModel and object
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        for statement, text in pairwise(getattr(definition, "body", [])):
-            match statement, text:
-                case ast.AnnAssign(ast.Name(key)), ast.Expr(ast.Constant(str(meaning))):
-                    texts[key] = " ".join(meaning.split())
-    return texts
 
 
 def _hint(name: str, known: Iterable[str]) -> str:
