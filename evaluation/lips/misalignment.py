@@ -12,6 +12,7 @@ Long clips are cut into segments of 8 s, because the paper's sequences are sente
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
 
 from kouxing.evaluation.lips.mouths import Mouth
 
@@ -60,10 +61,8 @@ def match_extrema(predicted: Array, real: Array) -> list[int]:
 def _find_extrema(curve: Array) -> NDArray[np.int_]:
     """Return 1 for maxima, -1 for minima, 0 otherwise. A plateau counts once, at its middle."""
     kind = np.zeros(len(curve), dtype=int)
-    steps = np.flatnonzero(np.diff(curve))
-    signs = np.sign(np.diff(curve)[steps]).astype(int)
-    for k in np.flatnonzero(np.diff(signs)):
-        kind[(steps[k] + 1 + steps[k + 1]) // 2] = signs[k]
+    kind[find_peaks(curve)[0]] = 1
+    kind[find_peaks(-curve)[0]] = -1
     return kind
 
 

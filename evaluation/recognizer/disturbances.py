@@ -113,7 +113,10 @@ def limit_to_telephone_band(samples: Samples) -> Samples:
 
 
 def change_speed(samples: Samples, factor: float) -> Samples:
-    """Change the speed of speech at constant pitch."""
+    """Change the speed of speech at constant pitch.
+
+    FFmpeg's filter atempo is not used: it is 20 ms early, and returns nothing for short recordings.
+    """
     hop, search = 160, 120  # 10 and 7.5 ms; segments are two hops long
     window = np.hanning(2 * hop + 1)[: 2 * hop]
     # the middle of segment n is at n hops in the result, and near n hops * factor in the samples

@@ -1,4 +1,7 @@
-"""Reads WAV files and pipes with several parts: several ``data`` chunks, or joined files."""
+"""Reads WAV files and pipes with several parts: several ``data`` chunks, or joined files.
+
+FFmpeg and ``wave`` read only one part of either.
+"""
 
 import math
 from typing import BinaryIO, Protocol

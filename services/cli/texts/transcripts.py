@@ -1,4 +1,8 @@
-"""Extracts the spoken text from transcripts with times, speakers or labels."""
+"""Extracts the spoken text from transcripts with times, speakers or labels.
+
+praatio 6.2 is not used: it rejects a TextGrid in which any field is missing. The other formats are
+habits of programs and people, which no package reads.
+"""
 
 import re
 from itertools import pairwise
