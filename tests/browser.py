@@ -31,6 +31,7 @@ class Browser(Chromium):
         camera: Path | None = None,
         size_px: tuple[int, int] = SIZE_PX,
     ) -> None:
+        """Start the browser. In a window that is too low, it draws one image a second."""
         super().__init__(folder, size_px, microphone, camera)
 
     def open(self, address: str) -> None:

@@ -1,6 +1,5 @@
 """The client libraries, installed from what is built of them, against a running system."""
 
-import contextlib
 import json
 import os
 import re
@@ -8,22 +7,22 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-import threading
 import venv
 from collections.abc import Collection, Iterator
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import soundfile
-from kouxing_client import Client
+from kouxing_client import Session
 
 from kouxing.evaluation.system.chromium import serve_folder
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.documents import code_blocks
+from tests.e2e.page_actions import A_FACE
+from tests.e2e.page_control import PageControl
 from tests.glb_writer import BONES, Mesh, add_vrm, read_chunks, write_chunks, write_glb
 from tests.system import CHAIN, DEMO, NODE, ROOT, Gateway, System, samples_of_file
 
@@ -34,7 +33,7 @@ PYTHON_CLIENT = ROOT / "clients" / "python"
 
 @pytest.fixture(scope="module")
 def services() -> Collection[str]:
-    return CHAIN
+    return (*CHAIN, "gateway")
 
 
 def run_program(*command: object, cwd: Path | None = None, **environment: str) -> list[str]:
@@ -75,13 +74,23 @@ def site_packages(python: Path) -> Path:
     return folder
 
 
-def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def speech(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second of speech: the gateway drops what a busy viewer does not read in time."""
+    path = tmp_path_factory.mktemp("speech") / "speech.wav"
+    soundfile.write(path, samples_of_file(SPEECH)[:16000], 16000)
+    return path
+
+
+def test_the_python_package_speaks_a_file(
+    system: System, python: Path, speech: Path, tmp_path: Path
+) -> None:
     control = system.control.partition(" ")[0]
     outputs = []
     for number, example in enumerate(code_blocks(PYTHON_CLIENT / "README.md", "python")):
         program = tmp_path / f"example{number}.py"
         program.write_text(example, encoding="utf-8")
-        outputs.append(run_program(python, "-I", program, SPEECH, KOUXING_CONTROL=control))
+        outputs.append(run_program(python, "-I", program, speech, KOUXING_CONTROL=control))
     jaw, phones = outputs
     assert max(float(line.split()[-1]) for line in jaw) > 200
     assert [line.split()[-1] for line in phones[:4]] == ["n", "i", "h", "ao"]
@@ -131,8 +140,9 @@ def site(project: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def gateway(system: System, site: str) -> Iterator[Gateway]:
-    gateway = Gateway(system.control, trusted_origins=site)
+def gateway(control: PageControl, site: str) -> Iterator[Gateway]:
+    """The gateway of the web components."""
+    gateway = Gateway(control.address, trusted_origins=site)
     yield gateway
     gateway.stop()
 
@@ -143,16 +153,13 @@ def test_the_javascript_package_contains_its_license(project: Path) -> None:
         assert packed.read_bytes() == (ROOT / name).read_bytes()
 
 
-def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -> None:
+def test_the_javascript_package_works_in_node(system: System, project: Path, speech: Path) -> None:
     shutil.copy(JAVASCRIPT_CLIENT / "tests" / "client.test.js", project / "client.test.mjs")
-    run_program(
-        NODE, "--test", project / "client.test.mjs", GATEWAY=gateway.page, SPEECH=str(SPEECH)
-    )
     (example,) = code_blocks(JAVASCRIPT_CLIENT / "README.md", "js")
     (project / "example.mjs").write_text(example, encoding="utf-8")
-    wav = project / "one-second.wav"  # the gateway drops what a busy viewer does not read in time
-    soundfile.write(wav, samples_of_file(SPEECH)[:16000], 16000)
-    lines = run_program(NODE, project / "example.mjs", wav, GATEWAY=gateway.page)
+    test = (NODE, "--test", project / "client.test.mjs")
+    run_program(*test, GATEWAY=system.page, SPEECH=str(speech))
+    lines = run_program(NODE, project / "example.mjs", speech, GATEWAY=system.page)
     assert max(float(line.split()[-1]) for line in lines if "jaw" in line) > 200
     assert [line.split()[-1] for line in lines if "phone" in line][:4] == ["n", "i", "h", "ao"]
 
@@ -233,7 +240,7 @@ def faces(
         f"<body style='margin: 0; display: flex'>{page}",
         encoding="utf-8",
     )
-    browser = Browser(tmp_path_factory.mktemp("browser"), SPEECH, size_px=(320, 120))
+    browser = Browser(tmp_path_factory.mktemp("browser"), SPEECH, size_px=(320, 240))
     browser.command("Page.navigate", url=f"{site}/index.html")
     names = [name for name in attributes if name != "none"]
     browser.wait_for(f"{names}.every((name) => window[name]?.set)")
@@ -367,31 +374,10 @@ def test_the_web_component_frees_the_memory_of_a_model_that_it_no_longer_shows(
     assert faces.evaluate("window.numFreed = 0; vrm.remove(); numFreed") > 0
 
 
-@contextlib.contextmanager
-def speaking_session(system: System) -> Iterator[None]:
-    """Speak in the session that the faces show."""
-    samples = samples_of_file(SPEECH)[:24000]
-    ended = threading.Event()
-    with Client(system.control) as client:
-        session = client.open_session(name="seen", encoding="f32le")
-
-        def speak() -> None:
-            for begin in cycle(range(0, len(samples), 1600)):
-                session.push(samples[begin : begin + 1600])
-                if ended.wait(0.1):
-                    return
-
-        thread = threading.Thread(target=speak)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
-            session.close()
-
-
-def test_the_web_component_shows_and_plays_a_session(faces: Browser, system: System) -> None:
+def test_the_web_component_shows_and_plays_a_session(
+    faces: Browser, control: PageControl, session: Session
+) -> None:
+    control.talk(session.name, A_FACE, "a")
     faces.evaluate(
         "import('/node_modules/kouxing-client/page/playout.js').then(({ Playout }) => {"
         " const { adjust } = Playout.prototype;"
@@ -405,7 +391,7 @@ def test_the_web_component_shows_and_plays_a_session(faces: Browser, system: Sys
     )
     faces.click("own")  # sound starts with a gesture
     module = "/node_modules/kouxing-client/page/draw-rate.js"
-    with speaking_session(system), faces.drawing_seldom(module):
+    with faces.drawing_seldom(module):
         faces.wait_for("own.shown?.[2] > 100 && window.isHeard")
         faces.evaluate("sessions.length = 0; own.setAttribute('token', 'another')")
         faces.wait_for("sessions.includes('seen')")  # it has reconnected

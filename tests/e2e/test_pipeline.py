@@ -42,7 +42,7 @@ from tests.system import (
 
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
 OPEN_JAW = 2  # index of FAP 3
-SENTENCE = samples_of_file(DEMO / "hello-female.wav")
+SENTENCE = samples_of_file(DEMO / "hello-female.wav")[:48000]
 MOUTH = np.array(MOUTH_FAPS) - 1
 LIPS_AND_JAW = [*range(2, 11), *range(50, 58)]  # without the corners' height, which shows feelings
 
@@ -64,7 +64,7 @@ def streamed(system: System) -> StreamedSession:
 
 
 def test_phones_become_final_and_speech_starts_and_ends(streamed: StreamedSession) -> None:
-    assert len(streamed.symbols) > 20
+    assert len(streamed.symbols) > 10
     assert {*streamed.symbols} <= {*load_inventory().phones}
     assert all({phone.index: phone.final for phone in streamed.phones}.values())
     states = [speech.active for speech in streamed.speech]
@@ -110,7 +110,7 @@ def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
 def test_services_send_the_frames_of_the_chain(
     system: System, name: str, rate_hz: int, chunk: int
 ) -> None:
-    samples = at_rate(samples_of_file(DEMO / f"{name}.wav")[:48000], rate_hz)
+    samples = at_rate(samples_of_file(DEMO / f"{name}.wav")[:32000], rate_hz)
     samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
     streamed = stream_audio(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
     pipeline = LivePipeline(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
@@ -169,13 +169,13 @@ def test_evaluation_scores_the_mouth_of_the_chain() -> None:
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Some samples, and a loud stereo recording at 44.1 kHz that ends within a word."""
+    """Vowels, and a loud stereo recording at 44.1 kHz that ends within a word."""
     folder = tmp_path_factory.mktemp("recordings")
     samples = read_audio(DEMO / "lake-male.wav")[0][:, 0]
-    times = np.arange(0, 40_000, 16_000 / 44_100)  # of 2.5 s
+    times = np.arange(-8_000, 40_000, 16_000 / 44_100)  # 3 s, with a pause before the speech
     stereo = np.interp(times, np.arange(len(samples)), samples)[:, None] * [1.5, 0.4]
     soundfile.write(folder / "stereo.wav", stereo, 44100, subtype="FLOAT")
-    return [DEMO / "lake-male.wav", VOWELS_FILE, folder / "stereo.wav"]
+    return [VOWELS_FILE, folder / "stereo.wav"]
 
 
 @pytest.fixture(scope="module")

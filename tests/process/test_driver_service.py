@@ -4,6 +4,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import count
 from pathlib import Path
 from queue import SimpleQueue
 from unittest.mock import Mock
@@ -15,6 +16,7 @@ from kouxing_client.messages import EndOfFaps, Event
 
 from kouxing.services.driver import pose_store, recorder_client
 from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.recorder_client import _RecorderProcess
 from kouxing.services.driver.service import DriverService
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.fast_record import replace
@@ -23,6 +25,8 @@ from kouxing.shared.wire.session import Error
 from tests.fake_control import FakeControl
 from tests.samples import START, fap_frame
 from tests.system import wait_until
+
+VIDEO_NUMBERS = count()  # a recorder receives no number again
 
 
 class DriverHarness:
@@ -92,16 +96,34 @@ class DriverHarness:
         return float(self.driver.poses.faps(time.monotonic())[0])
 
 
+@pytest.fixture(scope="module")
+def idle_recorders() -> Iterator[list[_RecorderProcess]]:
+    """The recorder of an earlier driver, if it is idle: starting one takes long."""
+    recorders: list[_RecorderProcess] = []
+    yield recorders
+    for recorder in recorders:
+        recorder.kill()
+
+
 @pytest.fixture
-def harness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DriverHarness]:
+def harness(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle_recorders: list[_RecorderProcess]
+) -> Iterator[DriverHarness]:
+    def start_recorder(config: DriverConfig) -> _RecorderProcess:
+        return idle_recorders.pop() if idle_recorders else _RecorderProcess(config)
+
     monkeypatch.setattr(follower, "CATCH_UP_S", 0.0)  # no frame is too old on a busy machine
+    monkeypatch.setattr(recorder_client, "_RecorderProcess", start_recorder)
+    monkeypatch.setattr(recorder_client, "count", lambda: VIDEO_NUMBERS)
     with FakeControl() as control:
         harness = DriverHarness(tmp_path, control)
         yield harness
+        videos, recorder = harness.driver.recorder, harness.driver.recorder._recorder
+        if recorder is not None and recorder.process.is_alive() and not videos.unfinished:
+            videos._recorder = None
+            idle_recorders.append(recorder)
         harness.driver.on_shutdown()
         harness.driver.bus.close()
-    for recorder in multiprocessing.active_children():  # it may still be ending
-        recorder.join()
 
 
 @pytest.fixture
@@ -249,6 +271,7 @@ def test_a_stopping_driver_saves_the_finished_part_of_a_video(
         harness.publish("film", number, 100.0)
     harness.step_until(lambda: harness.driver.metrics.counts["video_ms"])
     harness.driver.on_shutdown()
+    wait_until(lambda: not multiprocessing.active_children())
     assert [path.name for path in harness.folder.iterdir()] == ["film.mp4"]
 
 

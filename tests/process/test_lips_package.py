@@ -33,10 +33,7 @@ from tests.system import DEMO, HELLO, NODE, ROOT, VOWELS_FILE, samples_of_file
 SCRIPTS = ROOT / "clients" / "kouxing-lips" / "tests"
 HEAD_TURN = slice(47, 50)  # FAPs 48 to 50
 FILES = [
-    *(
-        DEMO / f"{name}.wav"
-        for name in ("hello-male", "bilabials-female", "lake-male", "fast-female")
-    ),
+    *(DEMO / f"{name}.wav" for name in ("bilabials-female", "lake-male", "fast-female")),
     VOWELS_FILE,
 ]
 
@@ -71,12 +68,9 @@ def test_frames_and_first_phones_equal_the_servers(models: Path, file: Path) -> 
     check_frames_and_phones(output_of(models, file), server_events(samples_of_file(file)))
 
 
-# The package's block network is slow; it uses the last 2.5 s.
-@pytest.mark.parametrize(("name", "duration_s"), [("hello-male", 3), ("bilabials-female", 1.5)])
-def test_frames_and_final_phones_equal_the_servers(
-    models: Path, name: str, duration_s: float
-) -> None:
-    samples = samples_of_file(DEMO / f"{name}.wav")[: round(duration_s * RATE_HZ)]
+def test_frames_and_final_phones_equal_the_servers(models: Path) -> None:
+    # The package's block network is slow; it uses the last 2.5 s.
+    samples = samples_of_file(DEMO / "hello-male.wav")[: 3 * RATE_HZ]
     output = package_output(models, samples, phones="final")
     check_frames_and_phones(output, server_events(samples, "blocks"))
 
@@ -99,7 +93,7 @@ def edit_distance(ours: list[str], theirs: list[str]) -> int:
 
 def test_pauses_and_loud_and_quiet_speech(models: Path) -> None:
     speech, other = (
-        samples_of_file(DEMO / f"{name}.wav")[: 2 * RATE_HZ]
+        samples_of_file(DEMO / f"{name}.wav")[: round(1.5 * RATE_HZ)]
         for name in ("lake-male", "fast-female")
     )
     samples = np.concatenate([np.zeros(7001, np.float32), 0.1 * speech, np.zeros(20_000), other])
@@ -114,7 +108,7 @@ def test_without_phones_only_the_sound_closes_the_lips(models: Path) -> None:
 
 @pytest.mark.parametrize("rate_hz", [8_000, 47_999, 48_000])
 def test_resampling_equals_the_servers(models: Path, rate_hz: int) -> None:
-    samples = samples_of_file(DEMO / "hello-female.wav")[: 3 * RATE_HZ]
+    samples = samples_of_file(DEMO / "hello-female.wav")[: 2 * RATE_HZ]
     resampled = soxr.resample(samples, RATE_HZ, rate_hz)
     ours = faps_of(models, resampled, sampleRateHz=rate_hz)
     assert_equal(ours, server_faps(server_events(to_16_khz(resampled, rate_hz))))
@@ -194,33 +188,3 @@ def test_voice_state_follows_the_speech(models: Path) -> None:
     assert any(speaking[60:])
     for file in FILES:
         assert not any(frame["isLaughing"] for frame in output_of(models, file)["frames"])
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"sampleRateHz": 4000}, "the sample rate 4000 Hz is out of range; use 8000 to 192000 Hz"),
-        ({"shapes": ["arkit52"]}, "unknown shapes arkit52; use arkit, oculus, vrm"),
-        ({"expressiveness": 3}, "expressiveness is 3; it must be from 0.5 to 2"),
-        ({"delayMs": -1}, "delayMs is -1; it must be from 0 to 300"),
-        ({"shapes": "oculus"}, 'shapes must be an array of names, such as ["arkit"]'),
-        (
-            {"sampleRate": 48000},
-            "unknown option sampleRate; use sampleRateHz, shapes, expressiveness, feeling, delayMs,"
-            " phones, models",
-        ),
-    ],
-)
-def test_bad_options_give_a_sentence(models: Path, options: dict[str, Any], text: str) -> None:
-    assert package_output(models, np.zeros(320, np.float32), **options) == {"error": text}
-
-
-def test_samples_that_are_not_finite_give_a_sentence(models: Path) -> None:
-    output = package_output(models, np.full(320, np.nan, np.float32))
-    assert output == {"error": "some samples are not finite; they must be in [-1, 1]"}
-
-
-def test_missing_models_give_a_sentence(tmp_path: Path) -> None:
-    error = package_output(tmp_path, np.zeros(320, np.float32))["error"]
-    assert error.startswith("cannot load file://")
-    assert error.endswith("or create the file with: kouxing export web")

@@ -1,0 +1,28 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { LipEngine } from "../engine/engine.js";
+
+for (const [options, message] of [
+  [{ sampleRateHz: 4000 }, "the sample rate 4000 Hz is out of range; use 8000 to 192000 Hz"],
+  [{ shapes: ["arkit52"] }, "unknown shapes arkit52; use arkit, oculus, vrm"],
+  [{ shapes: "oculus" }, 'shapes must be an array of names, such as ["arkit"]'],
+  [{ expressiveness: 3 }, "expressiveness is 3; it must be from 0.5 to 2"],
+  [{ delayMs: -1 }, "delayMs is -1; it must be from 0 to 300"],
+  [
+    { sampleRate: 48000 },
+    "unknown option sampleRate; use sampleRateHz, shapes, expressiveness, feeling, delayMs, phones, models",
+  ],
+]) {
+  test(`rejects ${JSON.stringify(options)}`, () => assert.rejects(LipEngine.load({ phones: false, ...options }), { message }));
+}
+
+test("rejects samples that are not finite", async () => {
+  const engine = await LipEngine.load();
+  const message = "some samples are not finite; they must be in [-1, 1]";
+  assert.throws(() => engine.push(new Float32Array(320).fill(NaN)), { message });
+});
+
+test("reports missing models", async () => {
+  const message = /^cannot load file:.* or create the file with: kouxing export web$/;
+  await assert.rejects(LipEngine.load({ models: new URL("none/", import.meta.url) }), { message });
+});
