@@ -4,14 +4,15 @@ Such data sounds like loud noise. Real noise may be equally loud. Data is theref
 if the same bytes are plausible sound in another encoding, or contain the frames of a codec.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, audio_file_kind, find_media_start
-from kouxing.shared.audio.pcm import FULL_SCALE
+from kouxing.shared.audio.pcm import FULL_SCALE, as_floats
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]
@@ -41,35 +42,14 @@ class Measure(NamedTuple):
     rms: float  # of full scale
 
 
-def _decode_mulaw(data: NDArray[np.uint8]) -> Array:
-    code = (~data).astype(np.int64)
-    size = (((code & 15) << 3) + 132 << ((code >> 4) & 7)) - 132
-    return np.where(code & 128, -size, size) / FULL_SCALE
-
-
-def _decode_alaw(data: NDArray[np.uint8]) -> Array:
-    code = (data ^ 0x55).astype(np.int64)
-    exponent, mantissa = (code >> 4) & 7, ((code & 15) << 4) + 8
-    size = np.where(exponent == 0, mantissa, mantissa + 256 << np.maximum(exponent - 1, 0))
-    return np.where(code & 128, size, -size) / FULL_SCALE
-
-
-def _decode_24_bit(data: NDArray[np.uint8]) -> Array:
-    return np.pad(data.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").ravel() / 2**31
-
-
-_WIDE: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.floating]]] = {
-    "16-bit big-endian samples": lambda data: data.view(">i2") / FULL_SCALE,
-    "24-bit samples": _decode_24_bit,
-    "32-bit samples": lambda data: data.view("<i4") / 2**31,
-    "32-bit float samples": lambda data: data.view("<f4"),
-    "64-bit float samples": lambda data: data.view("<f8"),
+_WIDE = {  # FFmpeg's codec of each encoding
+    "16-bit big-endian samples": "pcm_s16be",
+    "24-bit samples": "pcm_s24le",
+    "32-bit samples": "pcm_s32le",
+    "32-bit float samples": "pcm_f32le",
+    "64-bit float samples": "pcm_f64le",
 }
-_NARROW: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.floating]]] = {
-    "mu-law": _decode_mulaw,
-    "A-law": _decode_alaw,
-    "unsigned 8-bit samples": lambda data: data / 128.0 - 1.0,
-}
+_NARROW = {"mu-law": "pcm_mulaw", "A-law": "pcm_alaw", "unsigned 8-bit samples": "pcm_u8"}
 _READINGS = _WIDE | _NARROW
 
 
@@ -133,7 +113,9 @@ class EncodingCheck:
             and correlation < _MAX_NARROW_CORRELATION
             and len(np.unique(data.view("<i2"))) > _MIN_DISTINCT
         )
-        readings = {name: self._measure_loudest(decode(data)) for name, decode in _READINGS.items()}
+        readings = {
+            name: self._measure_loudest(_decode(data, codec)) for name, codec in _READINGS.items()
+        }
         likely = [
             (reading.flatness, name)
             for name, reading in readings.items()
@@ -179,6 +161,15 @@ class EncodingCheck:
             return Measure(np.inf, 0.0, 0.0)
         channels = samples.astype(np.float64).reshape(-1, self._num_channels)
         return _measure(channels[:, channels.std(axis=0).argmax()])
+
+
+def _decode(data: NDArray[np.uint8], codec: str) -> NDArray[np.float32]:
+    """Decode bytes as samples of one channel."""
+    decoder: Any = av.CodecContext.create(codec, "r")
+    decoder.sample_rate, decoder.layout = MEDIA_RATE_HZ, "mono"  # any rate
+    (frame,) = decoder.decode(av.Packet(data.tobytes()))
+    with np.errstate(over="ignore", invalid="ignore"):  # of 64-bit floats
+        return as_floats(frame.to_ndarray().ravel())
 
 
 def _measure(samples: Array) -> Measure:
