@@ -4,7 +4,7 @@ import { existsSync } from "node:fs";
 import { cp, mkdir } from "node:fs/promises";
 
 const SHARED = [
-  ...["draw-rate", "joints", "lateness", "messages", "morph", "player", "playout", "sliding-window"],
+  ...["draw-rate", "joints", "lateness", "morph", "player", "playout", "sliding-window"],
   ...["sound", "sound-worklet", "stream-activity", "viewer-socket"],
 ];
 const PAGE = new URL("../../services/gateway/page/", import.meta.url);

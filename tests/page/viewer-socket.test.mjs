@@ -2,7 +2,6 @@ import assert from "node:assert/strict";
 import test from "node:test";
 import { socketUrl } from "../../services/gateway/page/address.js";
 import { ViewerSocket } from "../../services/gateway/page/viewer-socket.js";
-import { NUM_FAPS, readMessage } from "../../services/gateway/page/messages.js";
 
 class FakeWebSocket {
   static CONNECTING = 0;
@@ -49,17 +48,25 @@ function record() {
 }
 
 test("binary messages are read by their type; unknown types are ignored", () => {
-  const faps = Float32Array.from({ length: NUM_FAPS }, (_, i) => i);
-  const frame = readMessage(binary(1, 2 ** 40 + 1, faps));
-  assert.equal(frame.mediaTime, 2 ** 40 + 1);
-  assert.deepEqual(frame.faps, faps);
-  const sound = readMessage(binary(2, 320, Int16Array.of(1, -32768)));
-  assert.deepEqual(sound, { mediaTime: 320, samples: Int16Array.of(1, -32768) });
-  assert.deepEqual(readMessage(binary(3, 0, faps)), { rest: faps });
-  const weights = Float32Array.of(0.5, 1);
-  assert.deepEqual(readMessage(binary(4, 320, weights)), { mediaTime: 320, weights });
-  assert.deepEqual(readMessage(binary(5, 0, weights)), { restWeights: weights });
-  assert.equal(readMessage(binary(6, 0, new Uint8Array(4))), null);
+  const { calls, handlers } = record();
+  const viewer = new ViewerSocket(toViewer, "", handlers);
+  const [socket] = FakeWebSocket.instances;
+  const faps = Float32Array.from({ length: 68 }, (_, i) => i);
+  const [samples, weights] = [Int16Array.of(1, -32768), Float32Array.of(0.5, 1)];
+  socket.onmessage({ data: binary(1, 2 ** 40 + 1, faps) });
+  socket.onmessage({ data: binary(2, 320, samples) });
+  socket.onmessage({ data: binary(3, 0, faps) });
+  socket.onmessage({ data: binary(4, 320, weights) });
+  socket.onmessage({ data: binary(5, 0, weights) });
+  socket.onmessage({ data: binary(6, 0, new Uint8Array(3)) });
+  assert.deepEqual(calls, [
+    ["fap", 2 ** 40 + 1, faps],
+    ["sound", 320, samples],
+    ["rest", faps],
+    ["weights", 320, weights],
+    ["restWeights", weights],
+  ]);
+  viewer.close();
 });
 
 test("it reconnects with increasing delays, to the session chosen last", (t) => {

@@ -1,11 +1,11 @@
 // Plays the session that is shown: it keeps sound and image in sync and computes the face that is due.
 
 import { Lateness } from "./lateness.js";
-import { NUM_FAPS } from "./messages.js";
 import { FapTrack, Playout } from "./playout.js";
 import { SlidingWindow } from "./sliding-window.js";
 import { StreamActivity } from "./stream-activity.js";
 
+const NUM_FAPS = 68;
 const DELAY_WINDOW_MS = 2000;
 
 export class Player {

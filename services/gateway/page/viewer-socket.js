@@ -1,8 +1,8 @@
 // The WebSocket that brings a session's frames, sound and events; see proto/GATEWAY.md.
 
-import { readMessage } from "./messages.js";
-
 const RETRY_MS = { min: 300, max: 5000 };
+const [FAPS, SOUND, REST, SHAPES, REST_SHAPES] = [1, 2, 3, 4, 5]; // types of binary messages
+const HEADER_BYTES = 16;
 
 /** Connects, and reconnects by itself until it is closed. */
 export class ViewerSocket {
@@ -77,11 +77,13 @@ export class ViewerSocket {
       this.#handlers.text(JSON.parse(data));
       return;
     }
-    const message = readMessage(data);
-    if (message?.faps) this.#handlers.fap(message.mediaTime, message.faps);
-    else if (message?.samples) this.#handlers.sound(message.mediaTime, message.samples);
-    else if (message?.rest) this.#handlers.rest(message.rest);
-    else if (message?.weights) this.#handlers.weights(message.mediaTime, message.weights);
-    else if (message?.restWeights) this.#handlers.restWeights(message.restWeights);
+    const header = new DataView(data);
+    const [type, mediaTime] = [header.getUint8(0), header.getFloat64(8, true)];
+    const valuesOf = (Type) => new Type(data, HEADER_BYTES);
+    if (type === FAPS) this.#handlers.fap(mediaTime, valuesOf(Float32Array));
+    else if (type === SOUND) this.#handlers.sound(mediaTime, valuesOf(Int16Array));
+    else if (type === REST) this.#handlers.rest(valuesOf(Float32Array));
+    else if (type === SHAPES) this.#handlers.weights(mediaTime, valuesOf(Float32Array));
+    else if (type === REST_SHAPES) this.#handlers.restWeights(valuesOf(Float32Array));
   }
 }
