@@ -18,8 +18,7 @@ from kouxing.services.gateway.audio.sample_sentence import SampleSentence
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.messages import browser_messages
 from kouxing.services.gateway.senders_api import SendersApi
-from kouxing.services.gateway.uploads.audio_upload import AudioUploadHandler
-from kouxing.services.gateway.uploads.learn_mouth_handler import LearnMouthHandler
+from kouxing.services.gateway.uploads.upload_handlers import AudioUploadHandler, LearnMouthHandler
 from kouxing.services.gateway.viewers.viewer_handler import ViewerHandler
 from kouxing.services.gateway.viewers.viewer_queue import MessageKind
 from kouxing.services.gateway.web import web_application

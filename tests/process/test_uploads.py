@@ -16,10 +16,14 @@ import pytest
 import soundfile
 from aiohttp import web
 
-from kouxing.services.gateway.uploads import audio_upload
-from kouxing.services.gateway.uploads.audio_upload import REMARKS_HEADER, AudioUploadHandler
-from kouxing.services.gateway.uploads.learn_mouth_handler import MAX_BYTES, LearnMouthHandler
-from kouxing.services.gateway.uploads.upload_handler import UploadHandler
+from kouxing.services.gateway.uploads import upload_handlers
+from kouxing.services.gateway.uploads.upload_handlers import (
+    MAX_RECORDING_BYTES,
+    REMARKS_HEADER,
+    AudioUploadHandler,
+    LearnMouthHandler,
+    UploadHandler,
+)
 from kouxing.services.gateway.web.access import AccessPolicy
 from kouxing.services.gateway.web.web_application import make_application
 from tests.process.web_clients import async_test
@@ -112,8 +116,10 @@ async def test_answers_with_the_error_of_the_learner(program: str, text: str) ->
 @async_test
 async def test_a_recording_that_is_too_large_is_rejected() -> None:
     async with serve(fake_learner(REVERSE)) as post:
-        assert await post(bytes(MAX_BYTES + 1)) == error(413, "the recording is larger than 8 MiB")
-        assert (await post(bytes(MAX_BYTES)))[0] == 200
+        assert await post(bytes(MAX_RECORDING_BYTES + 1)) == error(
+            413, "the recording is larger than 8 MiB"
+        )
+        assert (await post(bytes(MAX_RECORDING_BYTES)))[0] == 200
 
 
 @async_test
@@ -205,7 +211,7 @@ async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch
         status, data, _ = await post(b'{"error": "no key"}', "a.mp3")
         assert status == 422
         assert b"a.mp3: cannot read audio: this is text, not audio" in data
-        monkeypatch.setattr(audio_upload, "MAX_BYTES", 1000)
+        monkeypatch.setattr(upload_handlers, "MAX_AUDIO_BYTES", 1000)
         status, data, _ = await post(media_bytes("WAV", SINE), "a.wav")
         assert status == 413
         assert b"larger than" in data
