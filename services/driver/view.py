@@ -37,7 +37,11 @@ class View:
         self._is_window_open = self._window is not None
         self._virtual_camera: VirtualCamera | None = None
         if config.virtual_camera:
-            self._virtual_camera = _open_virtual_camera(config, self._window)
+            from kouxing.services.driver.render.scene import open_renderer
+            from kouxing.services.driver.video.virtual_camera import VirtualCamera
+
+            renderer = open_renderer(config, self._window.context if self._window else None)
+            self._virtual_camera = VirtualCamera(renderer, config.frame_rate_hz)
             LOG.info("the virtual camera is %s", self._virtual_camera.device)
         elif self._window is None and config.head not in HEAD_NAMES:
             from kouxing.services.driver.render.scene import load_head
@@ -87,11 +91,3 @@ def _open_window(config: DriverConfig, on_switch: Callable[[int], None]) -> Wind
             raise
         LOG.warning("cannot open a window: %s", error)
         return None
-
-
-def _open_virtual_camera(config: DriverConfig, window: Window | None) -> VirtualCamera:
-    from kouxing.services.driver.render.scene import open_renderer
-    from kouxing.services.driver.video.virtual_camera import VirtualCamera
-
-    renderer = open_renderer(config, None if window is None else window.context)
-    return VirtualCamera(renderer, config.frame_rate_hz)

@@ -275,7 +275,12 @@ class VTubeStudioConnection(TargetConnection):
             await vtube_studio.close()
 
     def _save_token(self, token: str) -> None:
-        _write_tokens({**_read_tokens(), self._address: token})
+        path = key_folder() / _TOKENS
+        try:
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            write_private(path, json.dumps({**_read_tokens(), self._address: token}).encode())
+        except OSError as error:
+            LOG.warning("cannot write %s, so VTube Studio will ask again: %s", path, error.strerror)
 
 
 def _read_tokens() -> dict[str, str]:
@@ -285,12 +290,3 @@ def _read_tokens() -> dict[str, str]:
     except (UserError, ValueError):
         return {}
     return tokens if isinstance(tokens, dict) else {}
-
-
-def _write_tokens(tokens: dict[str, str]) -> None:
-    path = key_folder() / _TOKENS
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_private(path, json.dumps(tokens).encode())
-    except OSError as error:
-        LOG.warning("cannot write %s, so VTube Studio will ask again: %s", path, error.strerror)

@@ -236,14 +236,12 @@ class Follower:
                 self._receive(message)
 
     def _receive(self, message: Message) -> None:
-        if self._is_paced and isinstance(message, FapFrame) and self._is_catching_up():
+        is_catching_up = self._transport.now_s < self._transport.resumed_at_s + CATCH_UP_S
+        if self._is_paced and isinstance(message, FapFrame) and is_catching_up:
             self._held_frames.append(message)
         else:
             self._deliver_held()
             self._accept(message)
-
-    def _is_catching_up(self) -> bool:
-        return self._transport.now_s < self._transport.resumed_at_s + CATCH_UP_S
 
     def _deliver_held(self) -> None:
         while self._held_frames:

@@ -155,16 +155,20 @@ def _head(name: str, glb: GlbFile, pieces: list[MeshPiece], known: ShapeFaps) ->
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
     pivot = _find_pivot(glb, turn, middle, unit)
     world = np.concatenate([piece.vertices for piece in pieces])
-    weight = _head_weight(pieces, (world[:, 1] - middle[1]) / unit)
+    weights = [piece.head_weight for piece in pieces if piece.head_weight is not None]
+    if len(weights) == len(pieces):  # every piece has a skeleton
+        head_weight = np.concatenate(weights)
+    else:
+        head_weight = head_weight_at((world[:, 1] - middle[1]) / unit)
     for piece in pieces:
         piece.vertices = (piece.vertices - pivot) * scale
         piece.shapes = {name: shift * scale for name, shift in piece.shapes.items()}
     has_eyes = any(name.startswith("eye_") for name in names)
-    weights = _weights_by_fap(known, gaze=not has_eyes)
+    fap_weights = _weights_by_fap(known, gaze=not has_eyes)
     arrays = pack_head(
         pieces,
-        fields=[_displacement_fields(piece, weights) for piece in pieces],
-        head_weight=weight,
+        fields=[_displacement_fields(piece, fap_weights) for piece in pieces],
+        head_weight=head_weight,
         fapu=standard_fapu(),
         feature_points={},
         eye_centers=(eyes - pivot) * scale,
@@ -280,15 +284,6 @@ def _find_pivot(glb: GlbFile, turn: Float64, middle: Float64, unit: float) -> Fl
         if is_joint and np.linalg.norm(position - middle) < 4 * unit:
             return position
     return middle + PIVOT_OFFSET * unit
-
-
-def _head_weight(pieces: list[MeshPiece], height: Float64) -> Float64:
-    """Return the fraction (V,) of the head rotation, from the skeleton if every piece has one.
-
-    Otherwise it is computed from ``height``.
-    """
-    weights = [piece.head_weight for piece in pieces if piece.head_weight is not None]
-    return np.concatenate(weights) if len(weights) == len(pieces) else head_weight_at(height)
 
 
 def _weights_by_fap(known: ShapeFaps, *, gaze: bool) -> dict[str, Float64]:

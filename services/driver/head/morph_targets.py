@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
 from kouxing.shared.face.shapes import ARKIT, VRM
 
@@ -31,16 +31,11 @@ def units_per_weight(fapu: str) -> float:
     return _ANGLE_UNITS_PER_WEIGHT if fapu == "AU" else FAP_UNITS_PER_FAPU
 
 
-def _build_fap_morphs() -> tuple[MorphTarget, ...]:
-    units = np.array([units_per_weight(fap.fapu) for fap in FAPS], np.float32)
-    rows = np.eye(NUM_FAPS, dtype=np.float32) * units
-    return tuple(
-        MorphTarget(fap.name, row, _MIN_FAP_SHIFT_M, turns_eyes=False)
-        for fap, row in zip(FAPS, rows, strict=True)
-    )
-
-
-FAP_MORPHS = _build_fap_morphs()
+_FAP_UNITS = np.diag([units_per_weight(fap.fapu) for fap in FAPS]).astype(np.float32)
+FAP_MORPHS = tuple(
+    MorphTarget(fap.name, row, _MIN_FAP_SHIFT_M, turns_eyes=False)
+    for fap, row in zip(FAPS, _FAP_UNITS, strict=True)
+)
 ARKIT_MORPHS = tuple(
     MorphTarget(name, faps) for name, faps in zip(ARKIT.names, ARKIT.basis, strict=True)
 )

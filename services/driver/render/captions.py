@@ -95,15 +95,13 @@ class CaptionDrawer:
     def _break(self, captions: Sequence[Caption]) -> list[list[Caption]]:
         """Start a new line after a pause, and when a line is full."""
         lines: list[list[Caption]] = []
+        max_px = self._width_px - 2 * _MARGIN * self._text_px
         for caption in captions:
             is_pause = lines and caption.start_s - lines[-1][-1].end_s > PAUSE_S
-            if not lines or is_pause or not self._fits([*lines[-1], caption]):
+            if not lines or is_pause or self._length_px([*lines[-1], caption]) > max_px:
                 lines.append([])
             lines[-1].append(caption)
         return lines
-
-    def _fits(self, line: Sequence[Caption]) -> bool:
-        return self._length_px(line) <= self._width_px - 2 * _MARGIN * self._text_px
 
     def _length_px(self, line: Sequence[Caption]) -> float:
         spaces = sum(self._space_px(caption) for caption in line[1:])

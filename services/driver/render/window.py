@@ -1,5 +1,6 @@
 """Shows a head in a desktop window."""
 
+import re
 from collections.abc import Callable
 
 import glfw
@@ -39,7 +40,7 @@ class Window:
         if not glfw.init():
             raise UserError("no display for a window; set DISPLAY, or write a video instead")
         self._open(width_px, height_px, num_samples=0)
-        if not _draws_in_software(self._context):
+        if not re.search("llvmpipe|softpipe", str(self._context.info["GL_RENDERER"])):
             glfw.destroy_window(self._window)
             self._open(width_px, height_px, num_samples=4)
         size = glfw.get_framebuffer_size(self._window)
@@ -109,8 +110,3 @@ class Window:
     def _on_mouse_button(self, _window: object, _button: int, action: int, _modifiers: int) -> None:
         if action == glfw.PRESS:
             self._on_switch(1)
-
-
-def _draws_in_software(context: moderngl.Context) -> bool:
-    renderer = str(context.info["GL_RENDERER"])
-    return "llvmpipe" in renderer or "softpipe" in renderer
