@@ -31,7 +31,7 @@ from kouxing.evaluation.lips.lip_measures import opening_range
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.face_animator import configured_face
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import CONSOLE
@@ -145,12 +145,7 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
 
 
 def _face_at_rest(config: SynthesizerConfig) -> Floats:
-    face = FaceAnimator(
-        load_lip_model(name=config.lips),
-        frame_rate_hz=config.frame_rate_hz,
-        delay_s=config.delay_ms / 1e3,
-        idle_motion=config.idle_motion,
-    )
+    face = configured_face(load_lip_model(name=config.lips), config)
     return np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
 
 

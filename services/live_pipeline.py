@@ -16,7 +16,7 @@ from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.live.stream import SpeechStream
 from kouxing.services.recognizer.offline.offline_recognition import WithProgress
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
+from kouxing.services.synthesizer.face_animator import Frame, configured_face
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import SoundEvent, Waveform
@@ -72,14 +72,7 @@ class LivePipeline:
             lip_predictor=lip_predictor or load_lip_predictor(),
             face_delay_s=synthesizer.delay_ms / 1e3,
         )
-        self._face = FaceAnimator(
-            lip_model,
-            frame_rate_hz=synthesizer.frame_rate_hz,
-            delay_s=synthesizer.delay_ms / 1e3,
-            idle_motion=synthesizer.idle_motion,
-            expressiveness=synthesizer.expressiveness,
-            feeling=synthesizer.feeling,
-        )
+        self._face = configured_face(lip_model, synthesizer)
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:
         """Process finite samples, shape (n,), and return the frames that are due."""

@@ -30,7 +30,7 @@ from kouxing.services.recognizer.live.speech_segmenter import (
 )
 from kouxing.services.recognizer.offline.offline_recognition import WithProgress
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, FaceAnimator, Frame
+from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, Frame, configured_face
 from kouxing.services.synthesizer.lips.learned.closure_rule import ClosureRule
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
@@ -126,14 +126,7 @@ def animate_recording(
         lip_model = dataclasses.replace(
             lip_model, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED
         )
-    face = FaceAnimator(
-        lip_model,
-        frame_rate_hz=config.frame_rate_hz,
-        delay_s=MAX_DELAY_S,
-        idle_motion=config.idle_motion,
-        expressiveness=config.expressiveness,
-        feeling=config.feeling,
-    )
+    face = configured_face(lip_model, config, delay_s=MAX_DELAY_S)
     end = EndOfSound(time_s=recording.duration_s + MAX_DELAY_S)
     frames = [
         frame

@@ -29,9 +29,9 @@ def faps_of(models: Path, samples: Frames, **options: Any) -> Frames:
     return package_faps(package_output(models, samples, **options))
 
 
-def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> Frames:
+def server_faps(events: Sequence[SoundEvent], **settings: float) -> Frames:
     """Return the server's frames without idle motion and tongue."""
-    faps = lips_package.server_faps(events, feeling)
+    faps = lips_package.server_faps(events, **settings)
     faps[:, TONGUE] = 0.0
     return faps
 

@@ -36,7 +36,7 @@ from kouxing.services.recording_pipeline import (
     animate_recording,
 )
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
+from kouxing.services.synthesizer.face_animator import Frame, configured_face
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
@@ -151,15 +151,7 @@ def make_frames(
     output = recognized.outputs[condition.recognizer]
     if condition.scheme == RECOGNIZED:
         return animate_recording(output.offline, lips, config)
-    face = FaceAnimator(
-        lips,
-        frame_rate_hz=config.frame_rate_hz,
-        delay_s=config.delay_ms / 1e3,
-        idle_motion=config.idle_motion,
-        expressiveness=config.expressiveness,
-        feeling=config.feeling,
-    )
-    return animate_live(face, face_input(condition, output))
+    return animate_live(configured_face(lips, config), face_input(condition, output))
 
 
 def face_input(condition: Condition, output: RecognizerOutput) -> Sequence[SoundEvent]:

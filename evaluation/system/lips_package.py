@@ -19,7 +19,7 @@ from rich.progress import track
 
 from kouxing.corpora.scoring import ErrorCounts, count_errors
 from kouxing.evaluation.lips.agreement import Agreement, agreement_of
-from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ, animate_live
+from kouxing.evaluation.lips.live_faces import animate_live
 from kouxing.evaluation.lips.mouths import clip_mouth, predicted_mouth
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording, align_corpus
@@ -31,7 +31,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.face_animator import configured_face
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
@@ -102,19 +102,9 @@ def server_events(samples: Samples, acoustic: str = "light") -> list[SoundEvent]
     return recognize_events(load_model(acoustic), samples, load_lip_predictor(), delay_s, config)
 
 
-def server_faps(events: Sequence[SoundEvent], feeling: float | None = None) -> Faps:
-    """Return the server's frames (F, 68), without idle motion.
-
-    ``feeling`` replaces the default setting.
-    """
-    settings = SynthesizerConfig()
-    face = FaceAnimator(
-        load_lip_model(),
-        frame_rate_hz=FRAME_RATE_HZ,
-        delay_s=settings.delay_ms / 1e3,
-        expressiveness=settings.expressiveness,
-        feeling=settings.feeling if feeling is None else feeling,
-    )
+def server_faps(events: Sequence[SoundEvent], **settings: Any) -> Faps:
+    """Return the server's frames (F, 68), without idle motion; ``settings`` replace defaults."""
+    face = configured_face(load_lip_model(), SynthesizerConfig(idle_motion=False, **settings))
     return np.array([faps for _, faps in animate_live(face, events)])
 
 

@@ -19,14 +19,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.lip_model import LipModel, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
 from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
-from kouxing.services.synthesizer.modifiers.expression import ExpressionModifier
 from kouxing.services.synthesizer.modifiers.expressiveness import ExpressivenessModifier
 from kouxing.services.synthesizer.modifiers.feeling import FeelingModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
-from kouxing.services.synthesizer.modifiers.nonverbal import NonverbalModifier
+from kouxing.services.synthesizer.modifiers.nonverbal import ExpressionModifier, NonverbalModifier
 from kouxing.services.synthesizer.modifiers.speech_motion import (
     IdleMotionSettings,
     SpeechMotionModifier,
@@ -383,3 +383,17 @@ class FaceAnimator:
         for modifier in self._modifiers:
             modifier.apply(faps, context)
         return faps
+
+
+def configured_face(
+    lip_model: LipModel, config: SynthesizerConfig, *, delay_s: float | None = None
+) -> FaceAnimator:
+    """Return a face with the settings of a configuration; ``delay_s`` replaces its delay."""
+    return FaceAnimator(
+        lip_model,
+        frame_rate_hz=config.frame_rate_hz,
+        delay_s=config.delay_ms / 1e3 if delay_s is None else delay_s,
+        idle_motion=config.idle_motion,
+        expressiveness=config.expressiveness,
+        feeling=config.feeling,
+    )

@@ -17,12 +17,20 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.modifiers.expression import ExpressionModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, pop_until
-from kouxing.shared.face.expression_motion import EXPRESSION_FAPS
+from kouxing.shared.face.expression_motion import EXPRESSION_FAPS, ExpressionMotion
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
 from kouxing.shared.face.high_level_faps import VISEME_NAMES, VISEMES
+
+
+class ExpressionModifier(ExpressionMotion):
+    """Expressions that leave the lips to speech."""
+
+    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+        """Add the expressions to a frame, FAPs (68,), in place."""
+        self.add(faps, context.step_s, is_speaking=context.is_speaking)
+
 
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
 _BREATH_OPENING = 0.3  # fraction of an open vowel's opening
