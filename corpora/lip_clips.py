@@ -303,7 +303,12 @@ def write_clip_archive(folder: Path, archive: Path) -> int:
     ``held.txt`` names all held-out clips. ``clips.tsv`` lists split, language, speaker and license
     of each clip. Raises ``UserError`` if no clip may be shared, or the file cannot be written.
     """
-    clips = [clip for clip in read_clips(folder, language=None) if _may_share(clip.license)]
+    clips = [
+        clip
+        for clip in read_clips(folder, language=None)
+        # a model may use footage by third parties, but nobody may share it
+        if may_distribute(clip.license) and "third part" not in clip.license
+    ]
     if not clips:
         raise UserError(f"{folder}: no clip has a license that allows sharing, such as CC BY")
     rows = [(c.name, c.split, c.language, c.speaker, c.license.replace("\t", " ")) for c in clips]
@@ -321,8 +326,3 @@ def write_clip_archive(folder: Path, archive: Path) -> int:
         unfinished.unlink(missing_ok=True)
         raise write_error(archive, error) from None
     return len(clips)
-
-
-def _may_share(license_name: str) -> bool:
-    """Return whether the clips may be shared: a model may use footage by third parties."""
-    return may_distribute(license_name) and "third part" not in license_name

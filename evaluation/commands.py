@@ -390,8 +390,8 @@ def schemes(
     recognizers = load_recognizers(acoustic or ["blocks", "gmm"], uses_paper_rule=paper_rule)
     names = lips or list(lip_models())
     recognized = recognize_all(recognizers, chosen)
-    results = asdict(score_schemes(recognized, recognizers, names))
-    scores = results["scores"]
+    scores = [asdict(score) for score in score_schemes(recognized, recognizers, names)]
+    results = {"sentences": [item.sentence.clip.name for item in recognized], "scores": scores}
     agreements = (schemes_table(scores, reference) for reference in ("scheme 1", "real lips"))
     show_results(json_file, results, *(table for table in agreements if table.rows))
     if videos:

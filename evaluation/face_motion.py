@@ -130,7 +130,9 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
         np.concatenate([np.arange(*span, 0.02) for span in session.spans]) for session in sessions
     ]
     still = [_is_still(session.faps) for session in sessions]
-    still_at_rest = _is_still(_face_at_rest(config))
+    face = configured_face(load_lip_model(name=config.lips), config)
+    at_rest = face.relax(round(_REST_S * config.frame_rate_hz))
+    still_at_rest = _is_still(np.array([faps for _, faps in at_rest]))
     return FaceFigures(
         correlations=_correlations(sessions, labels, rate_hz),
         nods=_movement_stats(nods_s, sessions, minutes),
@@ -142,11 +144,6 @@ def measure_face(model: AcousticModel, recordings: Sequence[EmotionRecording]) -
         still_at_rest=float(still_at_rest.mean()),
         longest_still_s=max(map(_longest_run, [*still, still_at_rest])) / rate_hz,
     )
-
-
-def _face_at_rest(config: SynthesizerConfig) -> Floats:
-    face = configured_face(load_lip_model(name=config.lips), config)
-    return np.array([faps for _, faps in face.relax(round(_REST_S * config.frame_rate_hz))])
 
 
 def _animate(

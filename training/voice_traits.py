@@ -31,7 +31,12 @@ from scipy.stats import spearmanr
 from kouxing.corpora.emotions import FEELINGS, read_emotions, speakers_of
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.sounds import read_sounds
-from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, VoiceKind, load_encoder
+from kouxing.services.recognizer.acoustic.encoder import (
+    EncoderOutput,
+    EncoderStream,
+    VoiceKind,
+    load_encoder,
+)
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.live.voice_traits import MIN_VOICE, VoiceReadout
@@ -112,7 +117,7 @@ def _encoder_outputs(samples: Floats, rng: np.random.Generator) -> Iterator[list
     """Yield the encoder's outputs for samples, unchanged and augmented."""
     for sound in (samples, scale_level(disturb(samples, rng), rng)):
         frames = WhisperMel().accept_waveform(sound)
-        encoder = load_encoder().create_stream()
+        encoder = EncoderStream(load_encoder())
         yield [
             encoder.process_encoder_frame(frames[start : start + FRAMES_PER_ENCODER_FRAME])
             for start in range(

@@ -59,19 +59,11 @@ class ConditionScore:
     like_real_lips: Agreement | None
 
 
-@dataclass(slots=True, kw_only=True)
-class SchemeComparison:
-    """Results of the experiment."""
-
-    sentences: list[str]
-    scores: list[ConditionScore]
-
-
 def score_schemes(
     sentences: Sequence[RecognizedSentence],
     recognizers: Sequence[RecognizerSetup],
     lips: Sequence[str],
-) -> SchemeComparison:
+) -> list[ConditionScore]:
     """Score all conditions; raises ``UserError`` if there are neither texts nor tracked lips."""
     if all(s.aligned is None and not len(s.sentence.clip.time_s) for s in sentences):
         raise UserError("no sentence has a text or tracked lips")
@@ -87,7 +79,7 @@ def score_schemes(
         aligned = frames[Condition(ALIGNED, condition.lips, "")]
         delays_s = [d for s in sentences for d in phone_delays_s(condition, s, inventory)]
         scores.append(_score_condition(condition, frames[condition], aligned, clips, delays_s))
-    return SchemeComparison(sentences=[clip.name for clip in clips], scores=scores)
+    return scores
 
 
 def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array | None:

@@ -50,22 +50,18 @@ class Opinion:
 
 def make_report(study: Study, answers: Iterable[Answer]) -> list[Opinion]:
     """Compute the results; raises ``UserError`` if there are no answers."""
-    groups = group_scores(study, answers)
-    if not groups:
-        raise UserError(f"no answers yet; collect them with: kouxing mos serve {study.folder}")
-    return [opinion_of(*key, scores) for key, scores in groups.items()]
-
-
-def group_scores(study: Study, answers: Iterable[Answer]) -> dict[tuple[str, str], Scores]:
-    """Return the scores by scale and condition, in the study's order, without practice."""
     groups: dict[tuple[str, str], Scores] = {
         (scale, condition): {} for scale in SCALES for condition in study.conditions
     }
     for answer in answers:
-        if answer.place >= 0 and (answer.sentence, answer.condition) in study.files:
+        is_practice = answer.place < 0
+        if not is_practice and (answer.sentence, answer.condition) in study.files:
             scores = groups[answer.scale, answer.condition]
             scores[answer.judge, answer.sentence] = answer.score
-    return {key: scores for key, scores in groups.items() if scores}
+    opinions = [opinion_of(*key, scores) for key, scores in groups.items() if scores]
+    if not opinions:
+        raise UserError(f"no answers yet; collect them with: kouxing mos serve {study.folder}")
+    return opinions
 
 
 def is_within_fences(scores: ArrayLike) -> NDArray[np.bool_]:

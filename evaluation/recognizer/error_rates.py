@@ -205,7 +205,10 @@ def evaluate_recognizer(
             recognition = recognize_live(model, scored, rule)
             speech[name].add(reference, recognition)
             if name == CLEAN:
-                counts = _count_final_errors(reference, recognition)
+                counts = count_errors(
+                    [phone.symbol for phone in reference.phones],
+                    [phone.symbol for phone in recognition.final],
+                )
                 by_recording[reference.utterance.utterance_id] = {
                     "phones": counts.reference,
                     "errors": counts.total,
@@ -224,11 +227,6 @@ def evaluate_recognizer(
         "rules": {name: score.summary(rng) for name, score in by_rule.items()},
         "errors_by_recording": by_recording,
     }
-
-
-def _count_final_errors(reference: AlignedRecording, recognition: Recognition) -> ErrorCounts:
-    final = [phone.symbol for phone in recognition.final]
-    return count_errors([phone.symbol for phone in reference.phones], final)
 
 
 def _rule_name(rule: OutputRuleConfig) -> str:

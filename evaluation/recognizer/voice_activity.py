@@ -11,7 +11,6 @@ The share therefore includes the delays of the detector, such as the half second
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,20 +31,14 @@ from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.phones.events import Phone, Progress, SpeechChange
 
 Mask = NDArray[np.bool_]  # (slices,)
+# a kind of audio, and its recordings, each with a mask of the slices with a voice
+LabeledAudio = tuple[str, Sequence[tuple[Samples, Mask]]]
 
 _SLICE_S = SLICE_SAMPLES / SAMPLE_RATE_HZ
 _PAUSE = 2 * SAMPLE_RATE_HZ  # samples of silence before and after a recording of speech
 _SYNTHETIC_S = 60.0
 _SUNG_OVER_MUSIC_DB = 5.0
 _SOUND_KINDS = {"singing": True, "laughter": False, "breath": False, "music": False, "noise": False}
-
-
-@dataclass(frozen=True, slots=True)
-class LabeledAudio:
-    """Recordings of one kind of audio, each with a mask of the slices with a voice."""
-
-    kind: str
-    recordings: Sequence[tuple[Samples, Mask]]
 
 
 def labeled_audio(
@@ -64,7 +57,7 @@ def labeled_audio(
         for reference, samples in zip(references, speech, strict=True)
     ]
     for name, disturb in disturbances.items():
-        yield LabeledAudio(f"speech, {name}", [*zip(map(disturb, speech), voiced, strict=True)])
+        yield f"speech, {name}", [*zip(map(disturb, speech), voiced, strict=True)]
     for kind, is_voice in _SOUND_KINDS.items():
         recordings = [as_floats(sound.samples) for sound in held_out(sounds, kind)]
         if recordings:
@@ -79,10 +72,9 @@ def labeled_audio(
 
 
 def _label_all(kind: str, recordings: Iterable[Samples], *, is_voice: bool) -> LabeledAudio:
-    return LabeledAudio(
-        kind,
-        [(samples, np.full(-(-len(samples) // SLICE_SAMPLES), is_voice)) for samples in recordings],
-    )
+    return kind, [
+        (sound, np.full(-(-len(sound) // SLICE_SAMPLES), is_voice)) for sound in recordings
+    ]
 
 
 def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
@@ -106,12 +98,12 @@ def evaluate_voice(
     breath refer to the whole time.
     """
     results = {}
-    for material in track(materials, "voice activity", console=CONSOLE, transient=True):
-        voiced = np.concatenate([mask for _, mask in material.recordings])
-        states = [voice_states(model, samples) for samples, _ in material.recordings]
+    for kind, recordings in track(materials, "voice activity", console=CONSOLE, transient=True):
+        voiced = np.concatenate([mask for _, mask in recordings])
+        states = [voice_states(model, samples) for samples, _ in recordings]
         is_on, laughter, breath = np.concatenate(states).T
         parts = {"voice": voiced, "no_voice": ~voiced}
-        results[material.kind] = {
+        results[kind] = {
             "seconds": {part: float(mask.sum()) * _SLICE_S for part, mask in parts.items()},
             "on": {
                 part: float(is_on[mask].mean()) if mask.any() else None

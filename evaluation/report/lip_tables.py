@@ -33,7 +33,7 @@ _REALISM_MEASURES = {  # measures that are best when they equal the value of rea
     "phone_spread": "spread",
     "turns_per_s": "number of turns per second",
 }
-_CLOSURE_COLUMNS = {  # measures by title
+CLOSURE_COLUMNS = {  # measures by title
     "F1": "closure_f1",
     "recall": "closure_recall",
     "precision": "closure_precision",
@@ -44,7 +44,7 @@ _CLOSURE_COLUMNS = {  # measures by title
     "closed at b p m": "labials_shut",
     "closed in speech": "share_shut",
 }
-_MOTION_COLUMNS = {  # measures by title
+MOTION_COLUMNS = {  # measures by title
     "lag, ms": "lag_ms",
     "MTM, ms": "mtm_ms",
     "SLCC": "slcc",
@@ -72,7 +72,7 @@ close in pauses. spread: within phone classes, FAP units/turns per s/MTM, ms."""
 _MARKS = {CLEAN: "", BABBLE: "+b", MUSIC: "+m"}
 _WHOLE_MEASURES = ("lag_ms", "mtm_ms", "rest_opening", "closing_time_ms", "phone_spread")
 _FORMATS = {  # of measures; not of correlations
-    **dict.fromkeys(_CLOSURE_COLUMNS.values(), "%"),
+    **dict.fromkeys(CLOSURE_COLUMNS.values(), "%"),
     **dict.fromkeys(_WHOLE_MEASURES, ".0f"),
     "turns_per_s": ".1f",
 }
@@ -152,18 +152,8 @@ def agreement_table(faces: Figures) -> Table:
     return Table(("face, delay", *titles), rows)
 
 
-def closures_table(faces: Figures) -> Table:
-    """Return recall and precision of closures in percent, also by class of phones."""
-    return _measures_table(faces, _CLOSURE_COLUMNS)
-
-
-def motion_table(faces: Figures) -> Table:
-    """Return timing, effort and rest of the faces, and of real lips."""
-    return _measures_table(faces, _MOTION_COLUMNS)
-
-
-def _measures_table(faces: Figures, measures: Mapping[str, str]) -> Table:
-    """Return measures of all clips: real lips, own lip models, then other programs."""
+def measures_table(faces: Figures, measures: Mapping[str, str]) -> Table:
+    """Return measures, by title, of all clips: real lips, own lip models, then other programs."""
     scores = {title_of(face): groups[ALL] for face, groups in _clean_scores(faces).items()}
     if REAL in faces:
         scores = {"real lips": faces[REAL][CLEAN][ALL], **scores}

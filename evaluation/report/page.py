@@ -6,42 +6,38 @@
 import json
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from kouxing.corpora.figures import new_figure, save_figure
 from kouxing.evaluation.report import lip_tables, paper_tables, recognition_table, system_tables
+from kouxing.evaluation.report.lip_tables import CLOSURE_COLUMNS, MOTION_COLUMNS, measures_table
 from kouxing.evaluation.report.steps import STEPS
 from kouxing.evaluation.tables import Figures, Table
 
 PICTURE = "delay.png"
 _TEMPLATE = Path(__file__).with_name("template.md")
 
-
-@dataclass(frozen=True, slots=True)
-class ReportTable:
-    """A table, with the steps whose results it shows."""
-
-    steps: tuple[str, ...]
-    table: Callable[..., Table]  # takes the result of each step, empty if it is not measured
-
-
-TABLES = {
-    "recognition": ReportTable(
-        ("read", "conversation", "disturbed", "languages"), recognition_table.recognition
+# Each table has the steps whose results it shows, and a function of the result of each step. The
+# result of a step that is not measured is empty.
+TABLES: dict[str, tuple[tuple[str, ...], Callable[..., Table]]] = {
+    "recognition": (
+        ("read", "conversation", "disturbed", "languages"),
+        recognition_table.recognition,
     ),
-    "agreement": ReportTable(("rivals",), lip_tables.agreement_table),
-    "closures": ReportTable(("rivals",), lip_tables.closures_table),
-    "delay": ReportTable(("delay",), lip_tables.delay_table),
-    "motion": ReportTable(("rivals",), lip_tables.motion_table),
-    "schemes": ReportTable(("schemes", "schemes-paper-rule"), paper_tables.report_schemes),
-    "visemes": ReportTable(("visemes",), paper_tables.viseme_fit_table),
-    "ferguson": ReportTable(("ferguson",), paper_tables.ferguson_table),
-    "system": ReportTable(
-        ("latency", "load", "busy", "browser", "package", "sizes"), system_tables.system_table
+    "agreement": (("rivals",), lip_tables.agreement_table),
+    "closures": (("rivals",), partial(measures_table, measures=CLOSURE_COLUMNS)),
+    "delay": (("delay",), lip_tables.delay_table),
+    "motion": (("rivals",), partial(measures_table, measures=MOTION_COLUMNS)),
+    "schemes": (("schemes", "schemes-paper-rule"), paper_tables.report_schemes),
+    "visemes": (("visemes",), paper_tables.viseme_fit_table),
+    "ferguson": (("ferguson",), paper_tables.ferguson_table),
+    "system": (
+        ("latency", "load", "busy", "browser", "package", "sizes"),
+        system_tables.system_table,
     ),
-    "faults": ReportTable(("faults",), system_tables.faults_table),
+    "faults": (("faults",), system_tables.faults_table),
 }
 
 
@@ -83,16 +79,16 @@ def bullets(sentences: Iterable[str]) -> str:
 
 
 def _render_table(name: str, steps: Figures, results: Figures) -> str:
-    part = TABLES[name]
-    missing = [step for step in part.steps if step not in steps]
+    shown, make_table = TABLES[name]
+    missing = [step for step in shown if step not in steps]
     command = f'Not measured yet: `make report STEPS="{" ".join(missing)}"`'
-    if missing == [*part.steps]:
+    if missing == [*shown]:
         return f"{command}.\n"
-    notes = [_describe_measurement(steps[step]) for step in part.steps if step in steps]
+    notes = [_describe_measurement(steps[step]) for step in shown if step in steps]
     notes += [command] if missing else []
     if name == "agreement" and "lips" in steps:
         notes += [*lip_tables.disturbed_lips(results["lips"]), _describe_measurement(steps["lips"])]
-    table = part.table(*(results.get(step, {}) for step in part.steps))
+    table = make_table(*(results.get(step, {}) for step in shown))
     return f"{markdown(table)}\n{bullets(notes)}"
 
 

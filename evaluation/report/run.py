@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -57,7 +58,7 @@ def run_steps(
         if reason := _reason_to_skip(commands, folders):
             print_message(f"{name}: skipped ({reason})")
             continue
-        command_lines = [f"kouxing {_without_braces(command)}" for command in commands]
+        command_lines = [re.sub("[{}]", "", f"kouxing {command}") for command in commands]
         code = code_hash(step.code)
         if not is_fresh and _is_up_to_date(path, command_lines, code):
             print_message(f"{name}: up to date")
@@ -144,10 +145,6 @@ def _cpu_s() -> float:
     """Return the processor time of all finished child processes, seconds."""
     times = os.times()
     return times.children_user + times.children_system
-
-
-def _without_braces(command: str) -> str:
-    return command.replace("{", "").replace("}", "")
 
 
 def _to_json(value: Any, indent: str = "") -> str:

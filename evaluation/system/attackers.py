@@ -154,10 +154,6 @@ def _random_message(number: int) -> list[bytes]:
     return [random.randbytes(random.choice((0, 1, 30, 3000))) for _ in range(random.randint(1, 4))]
 
 
-def _random_subscription(number: int) -> list[bytes]:
-    return [b"\x01" + b"%0120d" % number]
-
-
 def keyed_connections(endpoint: str, source: str, seconds: float) -> None:
     """Hold many ZeroMQ connections of one key."""
     end_s = time.monotonic() + seconds
@@ -220,7 +216,7 @@ ATTACKS: dict[str, Attack] = {
             ("flood of large messages", _flood(lambda _: [bytes(65_000)]), _INPUTS),
             ("flood of small messages", _flood(lambda _: [bytes(10)]), _INPUTS),
             ("malformed messages", _flood(_random_message), _INPUTS),
-            ("many subscriptions", _flood(_random_subscription, zmq.XSUB), ("faps",)),
+            ("many subscriptions", _flood(lambda n: [b"\x01%0120d" % n], zmq.XSUB), ("faps",)),
             ("many connections", keyed_connections, _INPUTS),
             ("silent subscribers", silent_subscribers, ("commands",)),
             ("many sessions", many_sessions, ("commands",)),

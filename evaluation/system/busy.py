@@ -84,12 +84,8 @@ class BusyRun:
     @property
     def summary(self) -> dict[str, float | None]:
         """The figures of the run."""
-        return {
-            "worst_s": self.worst_s,
-            "longest_s": self.longest_s,
-            "recovery_s": self.recovery_s,
-            "missing": self.missing,
-        }
+        names = ("worst_s", "longest_s", "recovery_s", "missing")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

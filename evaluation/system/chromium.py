@@ -21,15 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.wait import wait_until
-from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 
 _TIMEOUT_S = 120.0
 
 
-def is_installed() -> bool:
-    """Whether Chromium is installed."""
-    return _find_chromium() is not None
+def find_chromium() -> str | None:
+    """Return the path of Chromium, or None if it is not installed."""
+    return shutil.which("chromium") or shutil.which("google-chrome")
 
 
 class Chromium:
@@ -44,7 +43,7 @@ class Chromium:
     def __init__(
         self, folder: Path, size_px: tuple[int, int], microphone: Path, camera: Path | None = None
     ) -> None:
-        program = _find_chromium()
+        program = find_chromium()
         if program is None:
             raise UserError("Chromium is not installed; install the package chromium")
         self._process = subprocess.Popen(  # noqa: S603 - found on the path
@@ -207,20 +206,8 @@ def serve_folder(folder: Path) -> Iterator[str]:
             thread.join()
 
 
-def write_microphone(audio: Path, wav: Path) -> None:
-    """Write a recording as the WAV file that the fake microphone repeats.
-
-    Raises ``UserError`` if the file is not audio.
-    """
-    write_wav(wav, *read_audio(audio))
-
-
 def write_wav(path: Path, samples: NDArray[np.float32], rate_hz: int) -> None:
     """Write samples (num_samples, num_channels) to a WAV file of 16 bits."""
     with wave.open(str(path), "wb") as file:
         file.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
         file.writeframes((samples * 32767).astype("<i2").tobytes())
-
-
-def _find_chromium() -> str | None:
-    return shutil.which("chromium") or shutil.which("google-chrome")

@@ -59,7 +59,7 @@ def measure_latency(
     results = asdict(latency.measure(audio, CONSOLE, language))
     results["sessions"] = costs.measure_sessions(audio)
     results["rendering"] = asdict(costs.measure_images())
-    drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
+    drawings = page.measure(audio, CONSOLE) if chromium.find_chromium() else {}
     results["page"] = {"drawings": {name: asdict(drawing) for name, drawing in drawings.items()}}
     show_results(
         json_file, results, system_table(latency=results), figures_table({"value": results})

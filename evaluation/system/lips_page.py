@@ -34,7 +34,7 @@ from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
 from kouxing.evaluation.lips.references import read_parts
 from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.source_tree import ROOT
-from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_microphone, write_wav
+from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_wav
 from kouxing.evaluation.tables import percentiles
 from kouxing.services.cli.web_model import web_model
 from kouxing.shared.audio.audio_file import read_audio
@@ -149,7 +149,7 @@ def _serve_site(audio: Path, profile: bytes | None) -> Iterator[_Site]:
             (folder / "models" / file).write_bytes(content)
         if profile is not None:
             (folder / "wlipsync-profile.json").write_bytes(profile)
-        write_microphone(audio, folder / "voice.wav")
+        write_wav(folder / "voice.wav", *read_audio(audio))
         with serve_folder(folder) as origin:
             yield _Site(folder, origin, folder / "voice.wav")
 

@@ -56,11 +56,6 @@ class Step:
     memory_mb: dict[str, float]  # by service, at the end
     client_late_ms: float  # 95th percentile of how late chunks were sent
 
-    @property
-    def is_served(self) -> bool:
-        """Whether every admitted session was within the limit."""
-        return self.num_sessions > 0 and self.worst_p95_ms <= LIMIT_MS
-
 
 @dataclass(frozen=True, slots=True)
 class Load:
@@ -74,7 +69,9 @@ class Load:
     @property
     def summary(self) -> dict[str, float]:
         """The most sessions served, in total, per core and per used core, and their memory."""
-        served = [step for step in self.steps if step.is_served]
+        served = [
+            step for step in self.steps if step.num_sessions and step.worst_p95_ms <= LIMIT_MS
+        ]
         if not served:
             return {"sessions": 0.0}
         first, best = self.steps[0], max(served, key=lambda step: step.num_sessions)

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from kouxing.evaluation.system.chromium import Chromium, write_microphone
+from kouxing.evaluation.system.chromium import Chromium, write_wav
 from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 
 SIZE_PX = (1100, 800)
@@ -44,7 +45,7 @@ def measure(path: Path, console: Console) -> dict[str, Drawing]:
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_microphone(path, folder / "voice.wav")
+        write_wav(folder / "voice.wav", *read_audio(path))
         with LocalSystem(folder, console) as system:
             browser = Chromium(folder / "profile", SIZE_PX, folder / "voice.wav")
             try:

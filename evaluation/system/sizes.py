@@ -52,21 +52,17 @@ def measure() -> Sizes:
         _BLOCKS: len(blocks.network) * sizes.length * _ENCODER_FRAMES_PER_S / sizes.block,
         _ENCODER: encoder_bytes * _ENCODER_FRAMES_PER_S,
     }
+    fields = {"values": bytes(4 * NUM_FAPS), "mask": bytes(9), "media_time": 16_000_000, "epoch": 1}
     return Sizes(
         model_bytes={
             path.stem: path.stat().st_size for path in sorted(MODELS_FOLDER.glob("*.npz"))
         },
-        frame_bytes=sum(map(len, _frame_message())),
+        frame_bytes=sum(map(len, encode("fap-frame", "session-1", fields))),
         gemm_gflops=_gemm_gflops(),
         network_gflop_per_s={
             name: _OPERATIONS * number / 1e9 for name, number in weighted_positions.items()
         },
     )
-
-
-def _frame_message() -> list[bytes]:
-    fields = {"values": bytes(4 * NUM_FAPS), "mask": bytes(9), "media_time": 16_000_000, "epoch": 1}
-    return encode("fap-frame", "session-1", fields)
 
 
 def _gemm_gflops() -> float:

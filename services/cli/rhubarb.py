@@ -34,7 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; exit with status 1 after an error."""
     options = _parser().parse_args(arguments)
     try:
-        _check_frame_rate(options)
+        rate_hz = options.datFrameRate
+        if options.exportFormat == "dat" and not 10.0 <= rate_hz <= 100.0:
+            raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 images per second")
         _report(options, "start", f"reading {options.input}", file=options.input)
         motion = _animate(options)
         _report(options, "progress", "finished", value=1.0)
@@ -80,12 +82,6 @@ def _parser() -> argparse.ArgumentParser:
     for names in (("-r", "--recognizer"), ("--consoleLevel",), ("--logLevel",), ("--threads",)):
         add(*names, help="ignored; accepted for compatibility")
     return parser
-
-
-def _check_frame_rate(options: argparse.Namespace) -> None:
-    rate_hz = options.datFrameRate
-    if options.exportFormat == "dat" and not 10.0 <= rate_hz <= 100.0:
-        raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 images per second")
 
 
 def _animate(options: argparse.Namespace) -> FaceMotion:

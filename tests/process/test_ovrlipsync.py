@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kouxing.evaluation.system.lips_package import server_events
 from kouxing.services.cli.web_model import web_model
-from kouxing.services.recognizer.acoustic.encoder import load_encoder
+from kouxing.services.recognizer.acoustic.encoder import EncoderStream, load_encoder
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.live.voice_traits import load_voice_readout
@@ -234,7 +234,7 @@ def test_a_rate_with_many_phases_has_the_visemes_of_a_similar_rate(library: Any)
 def laughter_of(samples: Frames) -> list[float]:
     """Return the server's evidence of laughter, after each position of the encoder."""
     bands = WhisperMel().accept_waveform(samples)
-    encoder, readout = load_encoder().create_stream(), load_voice_readout()
+    encoder, readout = EncoderStream(load_encoder()), load_voice_readout()
     evidence, values = 0.0, []
     for pair in bands[: len(bands) // 2 * 2].reshape(-1, 2, bands.shape[1]):
         outputs = encoder.process_encoder_frame(pair).state @ readout.weights + readout.bias

@@ -14,7 +14,6 @@ from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import add_sound, held_out_music
 from kouxing.evaluation.recognizer.synthetic_sounds import held_vowels, varying_noise
 from kouxing.evaluation.recognizer.voice_activity import (
-    LabeledAudio,
     evaluate_voice,
     labeled_audio,
     voice_states,
@@ -63,7 +62,7 @@ def test_measures_parts_with_and_without_a_voice(monkeypatch: pytest.MonkeyPatch
     masks = np.array([[True, True, True, False], [True, False, False, False]])
     pieces = [(np.zeros(4, np.float32), mask) for mask in masks]
     voiced = (np.zeros(2, np.float32), np.full(2, True))
-    materials = [LabeledAudio("mixed", pieces), LabeledAudio("voice", [voiced])]
+    materials = [("mixed", pieces), ("voice", [voiced])]
     results = evaluate_voice(load_model("gmm"), materials)
     shares = results["mixed"]
     assert shares["seconds"] == {"voice": pytest.approx(0.08), "no_voice": pytest.approx(0.08)}
@@ -80,7 +79,7 @@ def test_materials_have_a_voice_where_the_text_has_phones(
     vowels = Utterance(utterance_id="vowels", path=VOWELS_FILE)
     reference = AlignedRecording(vowels, [phone(0, "a", 0.2, 0.4)])
     materials = labeled_audio([reference], {"clean": np.copy}, varying_noise(1.0), sounds)
-    by_kind = {material.kind: material.recordings for material in materials}
+    by_kind = dict(materials)
     ((_, mask),) = by_kind["speech, clean"]
     assert np.flatnonzero(mask).tolist() == list(range(110, 130))  # after 2 s
     assert [len(mask) for _, mask in by_kind["laughter"]] == [PER_S / 2]  # the second half

@@ -12,6 +12,7 @@ from kouxing.services.recognizer.live.voice_traits import (
     NUM_TRAITS,
     VoiceReadout,
     VoiceTraits,
+    VoiceTraitsStream,
     load_voice_readout,
 )
 from kouxing.shared.errors import UserError
@@ -65,7 +66,7 @@ READOUT = VoiceReadout(
 
 def traits_of(*parts: tuple[float, VoiceKind, Sequence[float]]) -> list[VoiceTraits]:
     """Return the traits after each encoder frame of parts: duration in s, kind of voice, state."""
-    stream = READOUT.create_stream()
+    stream = VoiceTraitsStream(READOUT)
     none = np.zeros(0, np.float32)
     seen = []
     for duration_s, kind, state in parts:

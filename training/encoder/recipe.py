@@ -156,12 +156,11 @@ def _speech_of(
         files_by_source, source_weights / source_weights.sum(), strict=True
     ):
         total = sum(weight for _, weight in source)
-        recordings += [_recording(path, source_weight * weight / total) for path, weight in source]
+        recordings += [
+            SourceRecording(path.name, partial(_read, path), source_weight * weight / total)
+            for path, weight in source
+        ]
     return recordings
-
-
-def _recording(path: Path, weight: float) -> SourceRecording:
-    return SourceRecording(path.name, partial(_read, path), weight)
 
 
 def _read(path: Path) -> Samples:

@@ -86,7 +86,8 @@ class HeadBuilder:
         self._cavity = mouth_cavity(mesh, subdivide(self._plain, self._face))
         self.reference = self._skin(self._plain)
         self._outer = self._outer_vertices()
-        self._map = self._face_map()
+        outer = self.reference.vertices[self._outer]
+        self._map = paint.face_map(outer, paint.skin_uv(outer), self._skin_source())
         self._scalp = paint.scalp(self._map, textures.load(folder, _PAINTED_HAIR))
         self._teeth = fitted_mesh.read(folder, "teeth/teeth_base/teeth_base")
         blink, squint = (
@@ -303,10 +304,6 @@ class HeadBuilder:
         outward[:, 1] = 0
         outer = ((normals * outward).sum(axis=1) > 0) & (skin.vertices[:, 0] > -1e-6)
         return np.flatnonzero(outer & ~self._cavity)
-
-    def _face_map(self) -> paint.FaceMap:
-        outer = self.reference.vertices[self._outer]
-        return paint.face_map(outer, paint.skin_uv(outer), self._skin_source())
 
     def _skin_source(self) -> Float:
         """Return the coordinates (V, 2) of the outer vertices in MakeHuman's skin, v downward."""

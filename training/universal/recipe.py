@@ -31,9 +31,9 @@ from kouxing.training.phone_lm.recipe import estimate_phone_lm, join_sentences
 from kouxing.training.seed import SEED
 from kouxing.training.universal.alignment import Aligner
 from kouxing.training.universal.encoder import FeatureEncoder
-from kouxing.training.universal.features import LAYERS, Features, FeatureStore
+from kouxing.training.universal.features import LAYERS, WIDTH, Features, FeatureStore
 from kouxing.training.universal.recordings import read_training_set
-from kouxing.training.universal.trainer import CROPS_S, new_readout, train_readout
+from kouxing.training.universal.trainer import CROPS_S, READOUT, train_readout
 
 # chosen on held-out recordings
 _ACOUSTIC_SCALE, _PHONE_PENALTY, _LM_SCALE, _RATE_WEIGHT = 0.6, 6.0, 1.0, 120.0
@@ -76,7 +76,7 @@ def train_universal(
     states = dict(zip(saved["names"].tolist(), pieces, strict=True))
     aligned = [features for features in stored if features.name in states]
     readout = train_readout(
-        new_readout(STATES_PER_PHONE * len(inventory)),
+        BlockReadout(WIDTH, STATES_PER_PHONE * len(inventory), READOUT),
         aligned,
         states,
         [data.weights[features.name] for features in aligned],

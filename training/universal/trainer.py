@@ -84,11 +84,6 @@ def train_readout(
     )
 
 
-def new_readout(num_states: int) -> BlockReadout:
-    """Return an untrained readout of standardized features."""
-    return BlockReadout(WIDTH, num_states, READOUT)
-
-
 def _crop(
     recording: Features, states: NDArray[np.int64], layout: BlockLayout, rng: np.random.Generator
 ) -> tuple[NDArray[np.int8], NDArray[np.int64]]:

@@ -111,7 +111,8 @@ def run(
             },
             extra_workers=extra_worker_environments(settings, workers),
         )
-        _install_signal_handlers()
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+        install_interrupt_handler()  # a shell's background processes ignore SIGINT
         if warning := _port_warning(settings, free_ports, control_address):
             print_message(warning)
         try:
@@ -225,11 +226,6 @@ def _port_warning(settings: Settings, free_ports: Mapping[str, str], control: st
             f" KOUXING_CONTROL={control}"
         )
     return "; ".join(warnings)
-
-
-def _install_signal_handlers() -> None:
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    install_interrupt_handler()  # a shell's background processes ignore SIGINT
 
 
 def _open_browser(page: str) -> None:

@@ -190,17 +190,11 @@ def animate(
 @lru_cache(maxsize=1)
 def _load_models(mouth: Path | None, language: str) -> tuple[AcousticModel, GruLipPredictor]:
     """Load the models once for all files of a command."""
-    model = load_model_for_language(language)
-    return model, _load_lip_predictor(mouth)
-
-
-def _load_lip_predictor(mouth: Path | None) -> GruLipPredictor:
-    """Return the network that predicts learned lips, adapted to a mouth profile, if any."""
-    predictor = load_lip_predictor()
+    model, predictor = load_model_for_language(language), load_lip_predictor()
     if mouth is None:
-        return predictor
+        return model, predictor
     profile = read_mouth_profile(mouth)
     try:
-        return predictor.with_mouth_profile(profile)
+        return model, predictor.with_mouth_profile(profile)
     except UserError as error:
         raise UserError(f"--mouth {mouth}: {error}") from None

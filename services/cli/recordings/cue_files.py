@@ -8,7 +8,6 @@ end of the recording, with the mouth at rest.
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
@@ -24,17 +23,10 @@ Frames: TypeAlias = Iterable[tuple[float, NDArray[np.float32]]]  # times in seco
 _Span: TypeAlias = tuple[str, str, str]  # start, end, and the mouth between them
 
 
-@dataclass(frozen=True, slots=True)
-class CueKind:
-    """A set of mouths, one of which is shown at a time."""
-
-    find_cues: Callable[[Frames], Iterator[Cue]]
-    rest: str
-
-
-CUE_KINDS = {
-    CurveFormat.RHUBARB: CueKind(mouth_cues, REST),
-    CurveFormat.OCULUS: CueKind(oculus_cues, SILENCE),
+# functions that find the cues of a set of mouths, and the mouth at rest
+CUE_KINDS: dict[CurveFormat, tuple[Callable[[Frames], Iterator[Cue]], str]] = {
+    CurveFormat.RHUBARB: (mouth_cues, REST),
+    CurveFormat.OCULUS: (oculus_cues, SILENCE),
 }
 
 

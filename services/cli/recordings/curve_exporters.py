@@ -175,13 +175,11 @@ class CueExporter(CurveExporter):
 
     def write(self, curves: FrameStream) -> int:
         """Write the cues when the last frame has arrived."""
-        kind = CUE_KINDS[self._curve_format]
+        find_cues, rest = CUE_KINDS[self._curve_format]
         frames = [(time_s, faps) for time_s, _, faps in curves.rows]
         end_s = curves.duration_s or (frames[-1][0] if frames else 0.0)
-        cues = kind.find_cues(frames)
         suffix = self._output.suffix.lower()
-        text = format_cues(suffix, cues, kind.rest, end_s, curves.source)
-        write_text(self._output, text)
+        write_text(self._output, format_cues(suffix, find_cues(frames), rest, end_s, curves.source))
         return len(frames)
 
 

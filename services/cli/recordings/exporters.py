@@ -4,14 +4,14 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, TypeAlias
 
 from rich.progress import Progress
 
 from kouxing.services.cli.options import ExportOptions
 from kouxing.services.cli.recordings.animation import FaceMotion, slow_down
 from kouxing.services.cli.recordings.captions import make_captions
-from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS
+from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, CurveExporter
 from kouxing.services.driver.config import check_even, parse_size
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.captions import band_height_px
@@ -27,19 +27,6 @@ from kouxing.services.driver.video.video_writer import (
 from kouxing.shared.errors import UserError
 
 _DRAWING_OPTIONS = frozenset({"lips", "head", "size", "background", "camera", "captions"})
-
-
-class Exporter(Protocol):
-    """Writes the motion of a face in one format."""
-
-    unit: ClassVar[str]  # unit that ``export`` counts
-    options: ClassVar[frozenset[str]]  # fields of ``ExportOptions`` that apply
-
-    def __init__(self, output: Path, options: ExportOptions) -> None:
-        """Check the output and the options before any long computation."""
-
-    def export(self, motion: FaceMotion, progress: Progress) -> int:
-        """Write the motion and return the number of frames or images."""
 
 
 class PictureExporter:
@@ -95,6 +82,7 @@ class VideoExporter(PictureExporter):
         )
 
 
+Exporter: TypeAlias = PictureExporter | CurveExporter
 EXPORTERS: dict[str, type[Exporter]] = {
     **dict.fromkeys(VIDEO_SUFFIXES, VideoExporter),
     ".png": PictureExporter,

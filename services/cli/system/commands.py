@@ -301,7 +301,9 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
         metrics = ", ".join(
             f"{name} {value:.4g}"
             for name, value in sorted(service.metrics.items())
-            if name.endswith(("_p50", "_p95")) or name in SHOWN_METRICS or _is_drop_counter(name)
+            if name.endswith(("_p50", "_p95"))
+            or name in SHOWN_METRICS
+            or (name.startswith("dropped_") and not name.endswith("_per_s"))
         )
         services.append((service.instance, service.state, f"{service.age_s:.1f} s ago", metrics))
     print_table(out, ("service", "state", "last seen", "metrics"), services)
@@ -350,7 +352,3 @@ def _session_name(name: str) -> str:
 
 def _lateness_text(late: Lateness | None) -> str:
     return "" if late is None else f"{late.p50_ms:.0f}, {late.p95_ms:.0f}, {late.worst_ms:.0f} ms"
-
-
-def _is_drop_counter(name: str) -> bool:
-    return name.startswith("dropped_") and not name.endswith("_per_s")

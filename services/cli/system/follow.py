@@ -63,9 +63,10 @@ def follow(
             if as_format is ListenFormat.SYLLABLES:
                 count = _print(_syllable_lines(phones, inventory))
             else:
-                count = _print(_phone_lines(respell(phones, inventory, alphabet)))
+                written = respell(phones, inventory, alphabet)
+                count = _print(_line(p.onset_s, p.duration_s, p.symbol) for p in written)
         else:
-            rows = map(_to_row, arriving)
+            rows = ((f.time_s, f.sequence, np.array(f.values, np.float32)) for f in arriving)
             live = FrameStream(rows, is_live=True)
             count = _print_frames(rows, curve_format) if exporter is None else exporter.write(live)
     unit = as_format.value.removesuffix("s") if as_format and is_speech else "frame"
@@ -113,11 +114,6 @@ def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
         yield from results
 
 
-def _phone_lines(phones: Iterable[events.Phone]) -> Iterator[str]:
-    """Yield a line for each phone."""
-    return (_line(phone.onset_s, phone.duration_s, phone.symbol) for phone in phones)
-
-
 def _syllable_lines(phones: Iterable[events.Phone], inventory: PhoneInventory) -> Iterator[str]:
     """Yield a line for each syllable when it is final. Pauses have no line."""
     track = SyllableCaptions(inventory)
@@ -129,10 +125,6 @@ def _syllable_lines(phones: Iterable[events.Phone], inventory: PhoneInventory) -
 
 def _line(onset_s: float, duration_s: float, text: str) -> str:
     return f"{onset_s:9.3f} s  {duration_s:6.3f} s  {text}"
-
-
-def _to_row(frame: FapFrame) -> FrameRow:
-    return frame.time_s, frame.sequence, np.array(frame.values, np.float32)
 
 
 def _print_frames(rows: Iterable[FrameRow], curve_format: CurveFormat | None) -> int:

@@ -98,10 +98,6 @@ class AudioEncoder:
         outputs: list[Floats] = run_onnx_session(self._session, _OUTPUTS, inputs)
         return outputs
 
-    def create_stream(self) -> EncoderStream:
-        """Create the stream of one session."""
-        return EncoderStream(self)
-
 
 class EncoderStream:
     """Runs the encoder on one session's audio, one encoder frame at a time."""

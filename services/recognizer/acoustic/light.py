@@ -31,7 +31,11 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     ScoreRequest,
     Topology,
 )
-from kouxing.services.recognizer.acoustic.encoder import PHONES_LAG_FRAMES, load_encoder
+from kouxing.services.recognizer.acoustic.encoder import (
+    PHONES_LAG_FRAMES,
+    EncoderStream,
+    load_encoder,
+)
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
@@ -45,7 +49,7 @@ class EncoderPhones:
 
     def __init__(self) -> None:
         self._mel = WhisperMel()
-        self._encoder = load_encoder().create_stream()
+        self._encoder = EncoderStream(load_encoder())
         self._rows = np.empty((0, load_encoder().num_phones), np.float32)
         self._frames = np.empty((0, NUM_MELS), np.float32)
 

@@ -180,32 +180,22 @@ def compute_cepstra_batch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
     return log_mel @ _CEPSTRAL
 
 
-@numba.njit(cache=True)
 def _append_deltas(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
-    num_static = static.shape[1]
-    num_first = max(0, static.shape[0] - 2 * half_width)
-    num_rows = max(0, static.shape[0] - 4 * half_width)
-    norm = np.float32(0.0)
-    for step in range(1, half_width + 1):
-        norm += np.float32(2 * step * step)
-    first = np.zeros((num_first, num_static), dtype=np.float32)
-    for row in range(num_first):
-        for step in range(1, half_width + 1):
-            center = row + half_width
-            for k in range(num_static):
-                difference = static[center + step, k] - static[center - step, k]
-                first[row, k] += np.float32(step) / norm * difference
-    out = np.zeros((num_rows, 3 * num_static), dtype=np.float32)
-    for row in range(num_rows):
-        for k in range(num_static):
-            out[row, k] = static[row + 2 * half_width, k]
-            out[row, num_static + k] = first[row + half_width, k]
-        for step in range(1, half_width + 1):
-            center = row + half_width
-            for k in range(num_static):
-                difference = first[center + step, k] - first[center - step, k]
-                out[row, 2 * num_static + k] += np.float32(step) / norm * difference
-    return out
+    steps = range(1, half_width + 1)
+    norm = np.float32(sum(2 * step * step for step in steps))
+
+    def differences(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        num_rows = max(0, len(values) - 2 * half_width)
+        total = np.zeros((num_rows, values.shape[1]), np.float32)
+        for step in steps:
+            later, earlier = (values[half_width + sign * step :][:num_rows] for sign in (1, -1))
+            total += np.float32(step) / norm * (later - earlier)
+        return total
+
+    first = differences(static)
+    second = differences(first)
+    rows = len(second)
+    return np.hstack([static[2 * half_width :][:rows], first[half_width:][:rows], second])
 
 
 class RunningMean:

@@ -22,7 +22,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Topology,
     empty_scores,
 )
-from kouxing.services.recognizer.front_end.features import HOP_S, frame_time_s
+from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.live.speech_scorer import (
     FrameScores,
     ScoreEvent,
@@ -201,18 +201,13 @@ class LiveDecoder:
             if phone != known.get(number):
                 emitted.append(phone)
             if phone.final:
-                self._finalize(phone)
+                self._num_final += 1
+                self._last_final = segment.phone
+                self._final_end_frame = segment.end
             else:
                 self._open.append(phone)
         self._confidence = self._confidence[self._final_end_frame - first_frame :]
         return emitted
-
-    def _finalize(self, phone: Phone) -> None:
-        """Count a phone as final."""
-        self._num_final += 1
-        self._last_final = self._index_of(phone)
-        end_s = phone.onset_s + phone.duration_s - self._time_s(0)
-        self._final_end_frame = round(end_s / HOP_S)
 
     def _index_of(self, phone: Phone) -> int:
         return self._inventory.index[phone.symbol]

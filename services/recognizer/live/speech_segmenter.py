@@ -14,13 +14,17 @@ from typing import TypeAlias
 import numpy as np
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Floats, FrontEnd
-from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, load_encoder
+from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, EncoderStream, load_encoder
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
 from kouxing.services.recognizer.front_end.vad import VoiceActivityDetector
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from kouxing.services.recognizer.lips.lip_prediction import LipPredictorStream
-from kouxing.services.recognizer.live.voice_traits import VoiceTraits, load_voice_readout
+from kouxing.services.recognizer.live.voice_traits import (
+    VoiceTraits,
+    VoiceTraitsStream,
+    load_voice_readout,
+)
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import LipPositions
 
@@ -83,9 +87,9 @@ class SpeechSegmenter:
         self._mel = None if isinstance(front_end, WhisperMel) else WhisperMel()
         self._lip_stream = lip_stream
         self._start_frame = start_frame
-        self.encoder = load_encoder().create_stream()
+        self.encoder = EncoderStream(load_encoder())
         self._detector = VoiceActivityDetector()
-        self._traits = load_voice_readout().create_stream()
+        self._traits = VoiceTraitsStream(load_voice_readout())
         self._mels = np.empty((0, NUM_MELS), np.float32)  # log-mel frames of the next encoder frame
         self._features: Floats | None = None  # feature frames of the next encoder frame
         # Features and encoder frames before speech

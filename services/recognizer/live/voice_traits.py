@@ -65,10 +65,6 @@ class VoiceReadout:
     bias: Floats  # b
     mean: Floats  # (2,) arousal and valence of the training speakers
 
-    def create_stream(self) -> VoiceTraitsStream:
-        """Create the stream of one session."""
-        return VoiceTraitsStream(self)
-
 
 class VoiceTraitsStream:
     """The traits of one session's voice."""

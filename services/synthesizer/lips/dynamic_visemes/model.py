@@ -157,7 +157,8 @@ class VisemeStream:
         transition = self._transition
         # most frames need no velocity
         self._mouth = lambda: self._clip_to_hull(target + transition.at(time_s))
-        faps = self._clip(target.value + transition.value_at(time_s))
+        faps = np.maximum(target.value + transition.value_at(time_s), self._lowest)
+        faps = np.minimum(faps, self._highest)
         self._time_s = time_s
         self._closures.record_closures(active, time_s, faps)
         return self._frame(faps)
@@ -189,10 +190,6 @@ class VisemeStream:
 
     def _clip_to_hull(self, state: FapState) -> FapState:
         return clip_state(state, self._lowest, self._highest)
-
-    def _clip(self, faps: NDArray[np.float64]) -> NDArray[np.float64]:
-        clipped: NDArray[np.float64] = np.minimum(np.maximum(faps, self._lowest), self._highest)
-        return clipped
 
     def _frame(self, faps: NDArray[np.float64]) -> MouthFrame:
         return MouthFrame(faps, VisemeArticulation(self._current, self._parameters.level_db))
