@@ -65,7 +65,7 @@ class ExpressionMotion:
         self._goal: NDArray[np.float32] = np.zeros(NUM_FAPS, np.float32)
         self._shown = TwoPoleFilter(self._goal)
         self._remaining_s = 0.0  # time until the expressions fade
-        self._lip_weight = 1.0
+        self.lip_weight = 1.0  # the least weight on the lips: 1 without speech, 0 in speech
         self._is_shown = False
 
     def show(self, strengths: Mapping[str, float], hold_s: float) -> None:
@@ -83,23 +83,18 @@ class ExpressionMotion:
         """Replace the current expressions with FAPs, (68,), for a time."""
         self._goal, self._remaining_s = goal, hold_s
 
-    @property
-    def lip_weight(self) -> float:
-        """The least weight of the expression on the lips: 1 without speech, 0 in speech."""
-        return self._lip_weight
-
     def add(self, faps: NDArray[np.float32], step_s: float, *, is_speaking: bool) -> None:
         """Add the expressions to a frame, FAPs (68,), in place."""
         is_held = self._remaining_s > 0.0
         self._remaining_s -= step_s
         if is_speaking:
-            self._lip_weight = max(self._lip_weight - step_s / _BIND_S, 0.0)
+            self.lip_weight = max(self.lip_weight - step_s / _BIND_S, 0.0)
         else:
-            self._lip_weight += (1.0 - self._lip_weight) * smoothing_gain(step_s, _FREE_S)
+            self.lip_weight += (1.0 - self.lip_weight) * smoothing_gain(step_s, _FREE_S)
         if is_held or self._is_shown:
             goal = is_held * self._goal
             shown = self._shown.step(goal, step_s, self._ease_s if is_held else _FADE_S)
-            mix_expression(faps, shown, self._lip_weight)
+            mix_expression(faps, shown, self.lip_weight)
             self._is_shown = bool(np.abs(shown).max() > _VISIBLE)
 
 

@@ -26,20 +26,16 @@ class Fap:
     feature_points: tuple[str, ...]  # points that this FAP moves, such as "2.1"
 
 
-def _read_table() -> tuple[Fap, ...]:
-    return tuple(
-        Fap(
-            number=int(row["fap"]),
-            name=row["name"],
-            fapu=row["fapu"],
-            direction=row["direction"],
-            feature_points=tuple(point for point in row["feature_points"].split(",") if point),
-        )
-        for row in read_table(__package__, "faps.tsv")
+FAPS = tuple(
+    Fap(
+        number=int(row["fap"]),
+        name=row["name"],
+        fapu=row["fapu"],
+        direction=row["direction"],
+        feature_points=tuple(point for point in row["feature_points"].split(",") if point),
     )
-
-
-FAPS = _read_table()
+    for row in read_table(__package__, "faps.tsv")
+)
 MOUTH_FAPS = (*range(3, 15), 16, 17, *range(44, 48), *range(51, 61))  # jaw, lips and tongue
 NUM_MOUTH_FAPS = len(MOUTH_FAPS)
 # heights of six points of each lip, those of the inner lip first; positive closes the mouth

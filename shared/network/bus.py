@@ -61,7 +61,9 @@ class Bus:
     def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:
         self._context = zmq.Context()
         self._key = key
-        self._limiter = ConnectionLimiter(self._is_service, extra_connections)
+        self._limiter = ConnectionLimiter(
+            lambda key: self.zap is not None and self.zap.is_service(key), extra_connections
+        )
         self.zap = None if key is None else Zap(self._limiter.disconnect_keys)
         self._answers_handshakes = False
         self._sockets: list[Socket] = []
@@ -149,9 +151,6 @@ class Bus:
             socket.close()
         self._sockets.clear()
         self._context.term()
-
-    def _is_service(self, key: str) -> bool:
-        return self.zap is not None and self.zap.is_service(key)
 
     def _open(self, kind: int, queue_length: int) -> zmq.Socket[bytes]:
         try:

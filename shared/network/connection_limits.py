@@ -101,10 +101,6 @@ class LimitedSocket:
             if follows and connection.is_stalled(now_s):
                 connection.disconnect("it stopped reading live frames")
 
-    def is_open(self, inode: int) -> bool:
-        """Return whether a connection is still open."""
-        return self.limiter.is_open(inode)
-
     def accepted(self) -> Iterator[int]:
         """Yield the descriptors of new connections."""
         while int(self._monitor.get(zmq.EVENTS)) & _READABLE:

@@ -197,7 +197,7 @@ class Socket:
 
     def is_open(self, connection: int) -> bool:
         """Return whether a connection to this bound socket has not ended, by its number."""
-        return self._limited is not None and self._limited.is_open(connection)
+        return self._limited is not None and self._limited.limiter.is_open(connection)
 
     def ended(self) -> Iterator[int]:
         """Yield the numbers of connections that have ended since the last call."""

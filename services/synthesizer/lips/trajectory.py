@@ -69,13 +69,10 @@ class Transition:
         elapsed_s = time_s - self.start_s
         if elapsed_s >= self.longest_s:
             return np.zeros(len(self.duration_s))
-        u = np.minimum(elapsed_s / self.duration_s, 1.0)
-        start, duration_s = self.difference, self.duration_s
+        u, start = np.minimum(elapsed_s / self.duration_s, 1.0), self.difference
         # cubic Hermite spline from (value, velocity) to (0, 0)
-        value: Array = (1.0 - u) ** 2 * (
-            (1.0 + 2.0 * u) * start.value + u * duration_s * start.velocity
-        )
-        return value
+        rest: Array = (1.0 + 2.0 * u) * start.value + u * self.duration_s * start.velocity
+        return (1.0 - u) ** 2 * rest
 
 
 NO_TRANSITION = Transition(

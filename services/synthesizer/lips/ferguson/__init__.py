@@ -1,17 +1,12 @@
 """Ferguson lips (Zhang et al. 2021): a single opening R, drawn as Ferguson curves."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from typing import Any
 
 from kouxing.services.lip_models import LipModelInfo
-
-if TYPE_CHECKING:  # importing NumPy would slow down every command
-    from kouxing.services.synthesizer.lips.lip_model import LipModel
-    from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.inventory import PhoneInventory
 
 
-def _load(inventory: PhoneInventory) -> LipModel:
+def _load(inventory: PhoneInventory) -> Any:  # importing NumPy would slow down every command
     from kouxing.services.synthesizer.lips.ferguson.model import FergusonLips
     from kouxing.services.synthesizer.lips.ferguson.phone_table import load_table
 
