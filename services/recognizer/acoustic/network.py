@@ -49,7 +49,8 @@ def encode_integer_inputs(num_axes: Mapping[str, int]) -> bytes:
 
     ``num_axes`` has the axes of each constant, by name; each axis has length 1. Concatenated
     messages of Protocol Buffers are merged, so the bytes add inputs to the file's graph. An input
-    with the name of a constant replaces it in a run (ONNX IR, "Graphs").
+    with the name of a constant replaces it in a run (ONNX IR, "Graphs"). The package onnx has
+    31 MB, and only training needs it.
 
     Raises ``ValueError`` if all inputs together need 128 bytes or more: each length is one byte.
     """

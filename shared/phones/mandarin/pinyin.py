@@ -163,7 +163,8 @@ def spell(phones: tuple[str, ...]) -> str:
 def write(spelling: str) -> str:
     """Return a syllable with tone mark and ü, or a phone as it is written in a syllable.
 
-    The mark is on a or e, on the o of ou, and otherwise on the last vowel (ISO 7098).
+    The mark is on a or e, on the o of ou, and otherwise on the last vowel (ISO 7098). pypinyin's
+    ``to_tone`` is not used: it writes ng1 as n1g, and its tables take 0.3 s to load.
 
     Examples
     --------
