@@ -14,11 +14,12 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import CLOSURE_FAPS, VISEME_INDEX
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
+from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
 from tests import lips
-from tests.lips import INVENTORY, LIPS, advance, make_face
+from tests.lips import INVENTORY, LIPS, advance, lip_gaps, make_face
 
 PARAMETERS = LIPS.parameters
 FRAME_S = 0.02
@@ -237,3 +238,30 @@ def test_learned_lips_have_no_jumps_or_corners(seed: int, delay_s: float) -> Non
         # closing within 20 ms is 62 per frame; a jump is five times larger
         assert np.abs(np.diff(faps, axis=0)).max() < 62.0
         assert np.abs(np.diff(faps, n=2, axis=0)).max() < 40.0
+
+
+spoken = st.lists(st.sampled_from(["b", "p", "m", "f", "a", "u", "i", "t"]), min_size=1, max_size=8)
+strengths = st.dictionaries(st.sampled_from([*ExpressionName]), st.floats(0.0, 1.0), max_size=4)
+
+
+@examples
+@given(spoken=spoken, wanted=strengths, from_s=st.floats(0.0, 1.0))
+def test_expressions_do_not_open_closures(
+    spoken: list[str], wanted: dict[str, float], from_s: float
+) -> None:
+    """Closures without expression stay closed with any expression, from the start of the sound."""
+    plain, expressive = make_face(), make_face()
+    for face in (plain, expressive):
+        face.process(SpeechChange(active=True, time_s=0.2))
+        for index, symbol in enumerate(spoken):
+            face.process(lips.phone(index, symbol, 0.4 + 0.12 * index, 0.12))
+    begun = advance(expressive, from_s)
+    expressive.set_expressions(wanted, 60.0)
+    frames = advance(plain, 2.0), begun + advance(expressive, 2.0)
+    from_sound = round(0.3 / FRAME_S)
+    before, after = (
+        lip_gaps(np.array([faps for _, faps in shown])[from_sound:]) for shown in frames
+    )
+    closed = before <= CLOSED
+    assert (after[closed] <= before[closed] + 0.01).all()
+    assert (after[~closed] >= CLOSED - 0.01).all()

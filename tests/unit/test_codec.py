@@ -1,9 +1,10 @@
-"""Messages are encoded and decoded; everything else is rejected with a reason."""
+"""Messages are encoded and decoded; everything else is rejected with a reason for users."""
 
 import math
 from typing import Any
 
 import msgpack
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,8 +14,9 @@ from kouxing_client.messages import decode as decode_fields
 
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
+from kouxing.shared.name_rules import NAME_RULE
 from kouxing.shared.wire.codec import BadMessage, decode, encode
-from kouxing.shared.wire.control import Heartbeat, HeartbeatReply
+from kouxing.shared.wire.field_errors import describe_field_error
 from kouxing.shared.wire.session import Done, Error, OpenSession
 from tests.samples import SAMPLES
 
@@ -27,54 +29,37 @@ def parts_of(kind: str, session: str = "s", **fields: object) -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("parts", "reason"),
+    ("parts", "reason", "request_name"),
     [
-        ([b"done/s/"], "parts"),
-        ([b"done", b"\x80"], "topic"),
-        ([b"dance/s/", b"\x80"], "kind"),
-        ([b"done/s/x", b"\x80"], "kind"),
-        ([b"done/s/", b"\xc1garbage"], "body"),
-        ([b"done/s/", b"\x91" * 5000], "body"),
-        (parts_of("done"), "body"),
-        (parts_of("done", request=5), "body"),
-        (parts_of("done", request="r", media_time=-1), "body"),
-        (parts_of("open-session", request="r", sample_rate_hz=192000), "body"),
-        (parts_of("open-session", request="r", encoding="mp3"), "body"),
-        (parts_of("open-session", session="a b", request="r"), "body"),
-        *((parts_of("phone", **PHONE, confidence=c), "body") for c in (math.nan, 1.5, -0.1)),
-        (parts_of("fap-frame", values=b"short", mask=b"\0" * 9), "body"),
-        (parts_of("fap-frame", **FRAME, shapes={"arkit": b"\0" * 7}), "body"),
-        (parts_of("done", request="r", version=1), "version"),
-        (parts_of("open", request="r", version=1), "version"),
-        (parts_of("open", request="r"), "kind"),
-        (parts_of("done", request="r", version=0), "body"),
-        ([b"done/other/", msgpack.packb({"session": "s", "request": "r"})], "topic"),
+        ([b"done/s/"], "parts", None),
+        ([b"done", b"\x80"], "topic", None),
+        ([b"dance/s/", b"\x80"], "kind", None),
+        (parts_of("dance", request="r"), "kind", "r"),
+        ([b"done/s/x", b"\x80"], "kind", None),
+        ([b"done/s/", b"\xc1garbage"], "body", None),
+        ([b"done/s/", b"\x91" * 5000], "body", None),
+        (parts_of("done"), "body", None),
+        (parts_of("done", request=5), "body", None),
+        (parts_of("done", request="r", media_time=-1), "body", "r"),
+        (parts_of("open-session", request="r", sample_rate_hz=192000), "body", "r"),
+        (parts_of("open-session", request="r", encoding="mp3"), "body", "r"),
+        (parts_of("open-session", session="a b", request="r"), "body", "r"),
+        *((parts_of("phone", **PHONE, confidence=c), "body", None) for c in (math.nan, 1.5, -0.1)),
+        (parts_of("fap-frame", values=b"short", mask=b"\0" * 9), "body", None),
+        (parts_of("fap-frame", **FRAME, shapes={"arkit": b"\0" * 7}), "body", None),
+        (parts_of("done", request="r", version=1), "version", "r"),
+        (parts_of("open", request="r", version=1), "version", "r"),
+        (parts_of("open", request="r"), "kind", "r"),
+        (parts_of("done", request="r", version=0), "body", "r"),
+        ([b"done/other/", msgpack.packb({"session": "s", "request": "r"})], "topic", "r"),
     ],
 )
-def test_rejects_bad_messages_with_a_reason(parts: list[bytes], reason: str) -> None:
-    with pytest.raises(BadMessage) as caught:
-        decode(parts)
-    assert caught.value.reason == reason
-
-
-@pytest.mark.parametrize(
-    ("parts", "request_name"),
-    [
-        (parts_of("done", request="r", media_time=-1), "r"),
-        (parts_of("dance", request="r"), "r"),
-        (parts_of("done", request="r", version=1), "r"),
-        (parts_of("done", request=5), None),
-        (parts_of("phone", **PHONE, confidence=2.0), None),
-        ([b"done/s/", b"\xc1garbage"], None),
-        ([b"done/s/"], None),
-    ],
-)
-def test_a_bad_message_has_the_name_of_its_request(
-    parts: list[bytes], request_name: str | None
+def test_rejects_bad_messages_with_a_reason_and_the_name_of_their_request(
+    parts: list[bytes], reason: str, request_name: str | None
 ) -> None:
     with pytest.raises(BadMessage) as caught:
         decode(parts)
-    assert caught.value.request == request_name
+    assert (caught.value.reason, caught.value.request) == (reason, request_name)
 
 
 def test_a_rejection_with_a_long_text_can_be_read() -> None:
@@ -124,13 +109,10 @@ def test_programs_of_version_2_can_read_an_error_and_its_errors_can_be_read() ->
 
 @pytest.mark.parametrize("clock_ns", [-(2**63), -1, 2**63, 2**64 - 1])
 def test_heartbeats_of_a_wrong_clock_count(clock_ns: int) -> None:
-    heartbeat = SAMPLES["heartbeat"]
-    assert isinstance(heartbeat, Heartbeat)
-    wrong = replace(heartbeat, sent_ns=clock_ns)
+    wrong = replace(SAMPLES["heartbeat"], sent_ns=clock_ns)
     assert decode(encode(wrong)) == wrong
-    reply = HeartbeatReply(
-        sent_ns=clock_ns, received_ns=-1, replied_ns=clock_ns, control_instance="c"
-    )
+    times = {"sent_ns": clock_ns, "received_ns": -1, "replied_ns": clock_ns}
+    reply = replace(SAMPLES["heartbeat-reply"], **times)
     assert decode(encode(reply)) == reply
 
 
@@ -157,3 +139,29 @@ def test_rejects_a_damaged_message_or_reads_it_the_same_twice(
             except BadMessage:
                 continue
             assert encode(decode(read)) == read
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"sample_rate_hz": 200000}, "sample_rate_hz must be an integer of at most 48000"),
+        ({"sample_rate_hz": "x"}, "sample_rate_hz must be an integer, not a string"),
+        ({"session": "a b"}, f"session is not a valid name; {NAME_RULE}"),
+        ({"session": "a\n"}, f"session is not a valid name; {NAME_RULE}"),
+        ({"encoding": "s16le\n"}, "encoding must be s16le or f32le"),
+        ({"encoding": "mp3"}, "encoding must be s16le or f32le"),
+        ({"face": {"feeling": -1}}, "face.feeling must be a number of at least 0.0"),
+        ({"face": {"shapes": 17 * ["x"]}}, "face.shapes must be a list of at most 16 items"),
+        ({"mouth_profile": 5}, "mouth_profile must be binary data, not an integer"),
+        ({"mouth_profile": "?"}, "mouth_profile: Invalid base64 encoded string"),
+        ({"language": 5}, "language must be a string, not an integer"),
+    ],
+)
+def test_names_the_field_and_its_rule(fields: dict[str, Any], text: str) -> None:
+    with pytest.raises(msgspec.ValidationError) as caught:
+        msgspec.convert({"request": "r", **fields}, OpenSession)
+    assert describe_field_error(caught.value) == text
+
+
+def test_other_errors_keep_their_text() -> None:
+    assert describe_field_error(ValueError("no message")) == "no message"

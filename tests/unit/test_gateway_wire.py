@@ -324,11 +324,3 @@ def test_weights_of_an_earlier_avatar_are_dropped_with_its_names() -> None:
         queue.put(MessageKind.SOUND, b"")
     left = [message for message in drain(queue) if message]
     assert left == ["new names", b"new weights"]
-
-
-def test_text_cannot_exceed_the_limit() -> None:
-    queue = ViewerQueue()
-    for number in range(2 * MAX_QUEUED):
-        queue.put(MessageKind.TEXT, str(number))
-        assert len(queue) <= MAX_QUEUED
-    assert drain(queue)[-1] == str(2 * MAX_QUEUED - 1)

@@ -34,12 +34,8 @@ class Recognizer:
         return hops
 
 
-def test_one_session_keeps_the_shortest_hop() -> None:
-    assert set(Recognizer().run(60.0, others=0.1, network=0.1)) == {1}
-
-
 @pytest.mark.parametrize(
-    ("network", "hop"), [(0.25, 1), (0.5, 2), (0.8, 3), (1.1, 4), (1.7, 6), (9.0, 6)]
+    ("network", "hop"), [(0.1, 1), (0.25, 1), (0.5, 2), (0.8, 3), (1.1, 4), (1.7, 6), (9.0, 6)]
 )
 def test_the_network_runs_less_often_under_load(network: float, hop: int) -> None:
     hops = Recognizer().run(20.0, others=0.3, network=network)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.fast_record import replace
 from kouxing.shared.settings.keys import (
     MAX_KEYS,
     MAX_ROLES,
@@ -26,8 +27,9 @@ from kouxing.shared.settings.keys import (
     save_grants,
 )
 from kouxing.shared.wire.codec import encode
-from kouxing.shared.wire.control import AllowedKey, HeartbeatReply
+from kouxing.shared.wire.control import AllowedKey
 from kouxing.shared.wire.message import MAX_MESSAGE_BYTES
+from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.usefixtures("new_keys")
 
@@ -130,6 +132,10 @@ def test_creates_no_key_for_control_on_another_machine() -> None:
     assert load_key("lamp", ("service:lamp",), control="tcp://127.0.0.1:5550")
 
 
+def empty(path: Path) -> None:
+    path.write_text("")
+
+
 def use_other_secret(path: Path) -> None:
     own, other = load_key("lamp", ()).secret, load_key("client", ()).secret
     path.write_text(path.read_text().replace(own, other))
@@ -138,17 +144,9 @@ def use_other_secret(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
     [
-        ("allowed", lambda path: path.write_text(""), r"allowed does not allow .*rm .*lamp"),
-        (
-            "lamp.key",
-            use_other_secret,
-            r"the secret key .*run: kouxing keys revoke lamp; rm .*lamp",
-        ),
-        (
-            "lamp.key",
-            lambda path: path.write_text(""),
-            r"is not a valid key file.*revoke lamp; rm -r .*lamp",
-        ),
+        ("allowed", empty, r"allowed does not allow .*rm .*lamp"),
+        ("lamp.key", use_other_secret, r"the secret key .*: kouxing keys revoke lamp; rm .*lamp"),
+        ("lamp.key", empty, r"is not a valid key file.*revoke lamp; rm -r .*lamp"),
         ("control.key", lambda path: path.write_text("{"), r"control\.key .*rm -r .*kouxing"),
         ("control.key", Path.unlink, r"control\.key .*rm -r .*kouxing"),
         ("lamp.key", Path.unlink, r"another key has the name 'lamp'"),
@@ -225,9 +223,7 @@ def test_rejects_too_many_keys_but_revokes_them(
     keys = {
         public: AllowedKey(name=grant.name, roles=list(grant.roles)) for public, grant in grants
     }
-    reply = HeartbeatReply(
-        sent_ns=0, received_ns=0, replied_ns=0, control_instance="control-1", keys=keys
-    )
+    reply = replace(SAMPLES["heartbeat-reply"], keys=keys)
     assert sum(map(len, encode(reply))) < MAX_MESSAGE_BYTES
     allowed.write_text(text + "".join(lines), encoding="ascii")
     with pytest.raises(UserError, match=f"{allowed}: .*revoke some with 'kouxing keys revoke'"):

@@ -8,8 +8,7 @@ import pytest
 from kouxing.services.cli.options import WidthSource
 from kouxing.services.cli.recordings.mouth_drawing import draw_mouth
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.languages import load_model_for_language, restrict_phones
-from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
@@ -49,17 +48,6 @@ def test_other_languages_use_their_phones_of_the_universal_model() -> None:
 def test_a_model_of_other_phones_is_an_error() -> None:
     with pytest.raises(UserError, match="the acoustic model gmm has the phones of mandarin"):
         load_model_for_language("english", "gmm")
-
-
-def test_limits_the_phones_of_a_model() -> None:
-    model = load_model("gmm")
-    limited = restrict_phones(model, ("sil", "i", "u"))
-    assert {phone.symbol for phone in recognize_recording(limited, SAMPLES)} <= {
-        "sil",
-        "i",
-        "u",
-    }
-    assert "ao" in {phone.symbol for phone in recognize_recording(model, SAMPLES)}
 
 
 def test_languages_have_codes_and_titles() -> None:

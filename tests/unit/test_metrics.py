@@ -5,11 +5,13 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
+from kouxing.shared.fast_record import replace
 from kouxing.shared.monitoring.metrics import WINDOW, LoadMeter, Metrics, percentile
 from kouxing.shared.wire.codec import decode, encode
-from kouxing.shared.wire.control import EventName, Heartbeat
+from kouxing.shared.wire.control import EventName
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.session import ErrorCode
+from tests.samples import SAMPLES
 
 
 def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
@@ -41,14 +43,7 @@ def test_a_heartbeat_with_every_counter_is_readable() -> None:
     for prefix, names in names_by_prefix.items():
         for name in names:
             metrics.count(f"{prefix}_{name}")
-    heartbeat = Heartbeat(
-        service="control",
-        instance="a",
-        role="control",
-        state="ready",
-        sent_ns=0,
-        metrics=metrics.snapshot(0.0),
-    )
+    heartbeat = replace(SAMPLES["heartbeat"], metrics=metrics.snapshot(0.0))
     assert decode(encode(heartbeat)) == heartbeat
 
 

@@ -1,4 +1,4 @@
-"""Curves of other programs: a table that is the real mouth scores 1, and a fault is named."""
+"""Curves of other programs: they are made and scored, and a fault is named."""
 
 from pathlib import Path
 
@@ -11,10 +11,13 @@ from kouxing.evaluation.lips.agreement import moments
 from kouxing.evaluation.lips.closures import closures
 from kouxing.evaluation.lips.curve_tables import fap_conversion, read_table, read_tables
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
-from kouxing.evaluation.lips.mouths import predicted_mouth, real_faps, real_mouth
+from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth, real_faps, real_mouth
 from kouxing.evaluation.lips.other_programs import load_program_faps, load_programs
+from kouxing.evaluation.rivals import tables
+from kouxing.evaluation.rivals.tables import LOUDNESS, write_tables
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
+from tests.lip_clips import write_held_out_clip
 
 TIME_S = np.arange(200) / 25.0
 LATE_S = 0.1
@@ -32,6 +35,7 @@ def clip_named(name: str) -> LipClip:
 
 
 HELD_OUT, TRAINING = clip_named("held_1"), clip_named("train_1")
+REAL = real_mouth(HELD_OUT.time_s, real_faps(HELD_OUT))
 
 
 def write_table(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
@@ -43,8 +47,12 @@ def write_table(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
 def late_opening() -> dict[str, NDArray[np.float64]]:
     """Return the opening in a unit of its own, made 0.1 s after its audio."""
     known_s = np.arange(900) / 100.0
-    mouth = real_mouth(HELD_OUT.time_s, real_faps(HELD_OUT))
-    return {"t": known_s, "opening": 0.02 * mouth.at("opening", known_s - LATE_S) + 0.5}
+    return {"t": known_s, "opening": 0.02 * REAL.at("opening", known_s - LATE_S) + 0.5}
+
+
+def correlation(mouth: Mouth) -> float:
+    """Return the correlation of an opening with the real one."""
+    return moments([(mouth, REAL)], "opening").correlation or 0.0
 
 
 def test_an_opening_is_scored_at_its_own_delay(tmp_path: Path) -> None:
@@ -56,24 +64,16 @@ def test_an_opening_is_scored_at_its_own_delay(tmp_path: Path) -> None:
     shipped, fitted = programs
     assert shipped == "mine, 100 ms"
     assert fitted.startswith("mine, fitted, ")
-    real = real_mouth(HELD_OUT.time_s, real_faps(HELD_OUT))
     for mouth_of in programs.values():
         mouth = mouth_of(HELD_OUT)
-        correlation = moments([(mouth, real)], "opening").correlation
-        assert correlation is not None
-        assert correlation > 0.99
-        assert closures(mouth, real).f1 == pytest.approx(1.0)
+        assert correlation(mouth) > 0.99
+        assert closures(mouth, REAL).f1 == pytest.approx(1.0)
 
 
 def test_the_faps_of_a_program_are_at_its_best_delay(tmp_path: Path) -> None:
     write_table(tmp_path / "held_1.csv", late_opening())
-    real = real_mouth(HELD_OUT.time_s, real_faps(HELD_OUT))
-    mouth = predicted_mouth(
-        load_program_faps(tmp_path, [HELD_OUT])(HELD_OUT, np.arange(430) / FRAME_RATE_HZ)
-    )
-    correlation = moments([(mouth, real)], "opening").correlation
-    assert correlation is not None
-    assert correlation > 0.99
+    faps_at = load_program_faps(tmp_path, [HELD_OUT])
+    assert correlation(predicted_mouth(faps_at(HELD_OUT, np.arange(430) / FRAME_RATE_HZ))) > 0.99
     with pytest.raises(UserError, match=r"add train_1\.csv"):
         load_program_faps(tmp_path, [HELD_OUT, TRAINING])
 
@@ -121,3 +121,29 @@ def test_missing_and_unusable_tables_are_errors(tmp_path: Path) -> None:
     write_table(tmp_path / "held_1.csv", {"t": np.zeros(1), "energy": np.zeros(1)})
     with pytest.raises(UserError, match="no column is a curve of a mouth"):
         load_programs([tmp_path], [HELD_OUT], [])
+
+
+def test_loudness_rises_with_the_voice(tmp_path: Path) -> None:
+    write_held_out_clip(tmp_path)
+    write_tables(tmp_path, tmp_path / "out", [LOUDNESS])
+    path = tmp_path / "out" / LOUDNESS / "cam_1.csv"
+    table = read_table(path)
+    assert table.names == ("opening",)
+    assert np.diff(table.time_s) == pytest.approx(0.01)
+    assert table.values.min() < 0.3
+    assert table.values.max() == 1.0
+    path.write_text("t,opening\n0,0.5\n")
+    write_tables(tmp_path, tmp_path / "out", [LOUDNESS])
+    assert len(read_table(path).values) == 1  # existing tables stay
+
+
+def test_unknown_and_missing_programs_are_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(UserError, match="unknown program: wava; choose from headaudio, "):
+        write_tables(tmp_path, tmp_path / "out", ["wava"])
+    write_held_out_clip(tmp_path)
+    monkeypatch.setattr(tables, "FOLDER", tmp_path)
+    for program in ("headaudio", "pylipsync"):
+        with pytest.raises(UserError, match="is not installed; run 'make report'"):
+            write_tables(tmp_path, tmp_path / "out", [program])

@@ -42,12 +42,6 @@ class Session:
         self.waiting_s += duration_s
 
 
-def test_a_fast_service_skips_nothing() -> None:
-    session = Session()
-    assert not any(session.run(60.0, speed=3.0))
-    assert session.overload.skipped_s == 0.0
-
-
 def test_a_slow_service_skips_audio_that_it_cannot_process() -> None:
     session = Session()
     assert any(session.run(30.0, speed=0.5))

@@ -149,21 +149,6 @@ def test_vtube_studio_errors_are_explained_or_ignored() -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "host", "port"),
-    [
-        ("vmc://", "127.0.0.1", 39540),
-        ("livelink://192.168.1.20", "192.168.1.20", 11111),
-        ("osc://localhost", "127.0.0.1", 9000),
-        ("vts://[::1]:8002/", "::1", 8002),
-    ],
-)
-def test_address_without_a_host_means_this_machine(url: str, host: str, port: int) -> None:
-    target = parse_target(url)
-    assert (target.host, target.port) == (host, port)
-    assert target.is_local == (host != "192.168.1.20")
-
-
-@pytest.mark.parametrize(
     ("url", "others"),
     [
         ("vmc://127.0.0.1", ["vmc://", "VMC://127.0.0.1/", "vmc://127.0.0.1:39540?"]),
@@ -173,6 +158,7 @@ def test_address_without_a_host_means_this_machine(url: str, host: str, port: in
         ("vmc://127.0.0.1:39541", ["vmc://:39541", "vmc://127.0.0.1:39541/"]),
         ("osc://pc.local?delay=2&prefix=/A/", ["OSC://PC.local:9000/?prefix=/A/&delay=2"]),
         ("vts://[::1]", ["vts://[::1]:8001", "VTS://[::1]/"]),
+        ("livelink://127.0.0.1", ["livelink://", "livelink://127.0.0.1:11111"]),
     ],
 )
 def test_all_spellings_of_an_address_are_one_target(url: str, others: list[str]) -> None:

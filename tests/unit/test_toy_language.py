@@ -10,13 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.offline.alignment import align_text, drop_pauses
 from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
-from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
@@ -36,7 +33,6 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PhoneInventory]:
     with installed_language(folder, "toy", "tests.toy_language"):
         yield load_inventory("toy")
     load_inventory.cache_clear()
-    load_lip_model.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -93,16 +89,3 @@ def test_a_text_of_the_language_is_aligned(toy: PhoneInventory, path: Path) -> N
     assert [phone.onset_s for phone in aligned] == pytest.approx(onsets_s, abs=0.15)
     with pytest.raises(UserError, match="cannot read 'xyz'"):
         align_text(load_model(path), SAMPLES, "xyz")
-
-
-def test_the_language_opens_the_mouth(toy: PhoneInventory, path: Path) -> None:
-    visemes = "dynamic-visemes"
-    config = SynthesizerConfig(lips=visemes)
-    pipeline = LivePipeline(load_model(path), load_lip_model("toy", visemes), synthesizer=config)
-    frames = pipeline.accept_waveform(SAMPLES) + pipeline.input_finished()
-    phones = [event for event in pipeline.events if isinstance(event, Phone)]
-    assert {phone.symbol for phone in phones} <= set(toy.phones)
-    a = next(phone for phone in phones if phone.final and phone.symbol == "a")
-    jaw = np.array([faps[2] for _, faps in frames])  # FAP 3, at 50 Hz
-    assert jaw[round(50 * a.onset_s) : round(50 * (a.onset_s + a.duration_s))].max() > 200
-    assert not jaw[:10].any()  # before the speech

@@ -94,12 +94,13 @@ def test_webp_is_an_animation(tmp_path: Path, channels: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "codec"), [("a.mp4", "h264"), ("a.mov", "h264"), ("a.webm", "vp9")]
+    ("name", "codec"), [("A.MP4", "h264"), ("a.mov", "h264"), ("A.WebM", "vp9")]
 )
 def test_opaque_videos_declare_their_colors(tmp_path: Path, name: str, codec: str) -> None:
-    with VideoWriter(tmp_path / name, 64, 48, 25.0, None) as writer:
-        for _ in range(5):
-            writer.write_image(np.ascontiguousarray(PICTURE[..., :3]))
+    writer = open_writer(tmp_path / name, (64, 48), 25.0, None)
+    for _ in range(5):
+        writer.write_image(np.ascontiguousarray(PICTURE[..., :3]))
+    writer.close()
     with av.open(str(tmp_path / name)) as container:
         assert container.streams.video[0].codec_context.name == codec
         assert not container.streams.audio
@@ -127,15 +128,6 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) 
     files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*"))
     assert files == names
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / files[1])), PICTURE)
-
-
-@pytest.mark.parametrize(("name", "codec"), [("OUT.MP4", "h264"), ("Out.WebM", "vp9")])
-def test_the_case_of_a_suffix_does_not_matter(tmp_path: Path, name: str, codec: str) -> None:
-    writer = open_writer(tmp_path / name, (64, 48), 25.0, 16000)
-    writer.write_image(PICTURE[..., :3])
-    writer.close()
-    with av.open(str(tmp_path / name)) as container:
-        assert container.streams.video[0].codec_context.name == codec
 
 
 @pytest.mark.parametrize(
