@@ -92,12 +92,6 @@ test("images of a page that was hidden in the meantime do not count", (t) => {
   assert.equal(numVisible, 22); // it no longer follows whether the page is hidden
 });
 
-test("images that take very long get fewer pixels within seconds", () => {
-  const drawRate = new DrawRate(2, 2, false);
-  draw(drawRate, { fullMs: 250 }); // 1 s at first
-  assert.ok(drawRate.ratio < 0.5, `${drawRate.ratio}`);
-});
-
 test("the user can halve the number of images, down to about 4 a second", () => {
   for (const [drawRate, rates] of [
     [new DrawRate(2, 2, false), [60, 30, 15, 7.5, 3.75]],

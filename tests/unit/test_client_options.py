@@ -17,17 +17,11 @@ def test_the_package_has_all_face_settings_of_the_protocol() -> None:
 @pytest.mark.parametrize(
     ("options", "hint"),
     [
-        (
-            {"sample_rate": 48000},
-            r"open_session\(\) .* 'sample_rate'; did you mean 'sample_rate_hz'",
-        ),
+        ({"sample_rate": 48000}, r"open_session\(\) .*; did you mean 'sample_rate_hz'"),
         ({"channels": 2}, "did you mean 'num_channels'"),
         ({"x": 1}, "use sample_rate_hz, num_channels, "),
         ({"lip_model": "learned"}, r"write face=\{'lip_model': \.\.\.\}"),
-        (
-            {"face": {"lip_mode": "learned"}},
-            r"set_face\(\) has no keyword 'lip_mode'; did you mean 'lip_model'",
-        ),
+        ({"face": {"lip_mode": ""}}, r"set_face\(\) has .* 'lip_mode'; did you mean 'lip_model'"),
     ],
 )
 def test_an_unknown_keyword_is_rejected_with_the_nearest(options: Any, hint: str) -> None:

@@ -128,10 +128,10 @@ def test_limits_the_number_of_tokens() -> None:
     model = random_topology(1, np.random.default_rng(0), crowded_language())
     decoder = Decoder(model)
     max_tokens = 0
-    for _ in range(60):
+    for _ in range(30):
         decoder.advance(np.zeros((1, model.num_states), np.float32))
         max_tokens = max(max_tokens, decoder._num_tokens)
     assert max_tokens == frame_search.MAX_TOKENS
     path = decoder.final_path()
-    assert (path[0].start, path[-1].end) == (0, 60)
+    assert (path[0].start, path[-1].end) == (0, 30)
     assert all(segment.end == following.start for segment, following in pairwise(path))

@@ -119,7 +119,7 @@ def test_the_gaze_leaves_the_viewer_when_speech_starts_and_returns_at_its_end() 
     away = np.mean(
         [
             np.abs(gaze_deg(animate(make_face(idle_motion_seed=s), speech))) > 1.5
-            for s in range(1, 31)
+            for s in range(1, 16)
         ],
         axis=0,
     )

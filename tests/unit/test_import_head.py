@@ -18,6 +18,14 @@ from tests.meshes import ORIGINAL, meshes, write_obj
 HALF_TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
 
 
+def import_points(mesh: Path, points: str, name: str = "points.tsv") -> tuple[Head, list[str]]:
+    """Import a mesh with its feature points; return the head and the warnings."""
+    path, output = mesh.with_name(name), mesh.with_name("out.npz")
+    path.write_text(points, encoding="utf-8")
+    warnings = import_head(mesh, path, output)
+    return Head.load(output), warnings
+
+
 def point_lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
     rows = []
     for name, vertex in head.feature_points.items():
@@ -29,7 +37,6 @@ def point_lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> Head:
     """Return a longer face in centimeters, moved and facing backwards."""
-    folder = tmp_path_factory.mktemp("import")
 
     def place(points: np.ndarray) -> np.ndarray:
         return points * [100, 112, 100] * HALF_TURN + [30, 150, -7]  # type: ignore[no-any-return]
@@ -37,13 +44,12 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Head:
     parts = meshes()
     for part in parts:
         part.vertices = place(part.vertices)
-    write_glb(folder / "face.glb", parts)
-    (folder / "points.tsv").write_text(point_lines(ORIGINAL, place), encoding="utf-8")
-    warnings = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
+    face = write_glb(tmp_path_factory.mktemp("import") / "face.glb", parts)
+    head, warnings = import_points(face, point_lines(ORIGINAL, place))
     assert warnings == [
         "no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"
     ]
-    return Head.load(folder / "face.npz")
+    return head
 
 
 def displacement(head: Head, faps: np.ndarray) -> np.ndarray:
@@ -97,10 +103,8 @@ def test_obj_with_vertex_numbers_and_seams(tmp_path: Path) -> None:
     ]
     eyes = {"3.5": ORIGINAL.eye_centers[0], "3.6": ORIGINAL.eye_centers[1]}
     rows += [f"{name} {' '.join(map(str, place))}  # inside" for name, place in eyes.items()]
-    (tmp_path / "points.txt").write_text("\n".join(rows), encoding="utf-8")
-    warnings = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
+    head, warnings = import_points(tmp_path / "face.obj", "\n".join(rows))
     assert "no eyeballs separate from the skin: the eyes do not rotate" in warnings
-    head = Head.load(tmp_path / "out.npz")
     shift = displacement(head, OPEN_MOUTH)
     assert shift[head.feature_points["2.3"], 1] < -0.4 * head.fapu["MNS"]
     # both vertices at a texture seam move and have the same normal
@@ -114,7 +118,7 @@ def test_obj_with_vertex_numbers_and_seams(tmp_path: Path) -> None:
         assert np.abs(first_of[group] - values).max() < 1e-4
 
 
-def test_reads_an_fdp_file(face: Path, tmp_path: Path) -> None:
+def test_reads_an_fdp_file(face: Path) -> None:
     skin = ORIGINAL.part("skin").vertices
     entries = "".join(
         f'<fdp name="{name}" affects="skin" index="{vertex}"><indices>1 2 3</indices></fdp>'
@@ -123,9 +127,7 @@ def test_reads_an_fdp_file(face: Path, tmp_path: Path) -> None:
     )
     mns = ORIGINAL.fapu["MNS"]
     text = f'<?xml version="1.0"?><xfdp><head><fapu MNS0="{mns}" MW0="1"/></head>{entries}</xfdp>'
-    (tmp_path / "face.fdp").write_text(text, encoding="utf-8")
-    import_head(face, tmp_path / "face.fdp", tmp_path / "out.npz")
-    head = Head.load(tmp_path / "out.npz")
+    head, _ = import_points(face, text, "face.fdp")
     scale = head.fapu["ES"] / ORIGINAL.fapu["ES"]
     assert head.fapu["MNS"] == pytest.approx(mns * scale, rel=0.02)
     assert displacement(head, OPEN_MOUTH)[head.feature_points["2.1"], 1] < -0.3 * head.fapu["MNS"]
@@ -134,6 +136,16 @@ def test_reads_an_fdp_file(face: Path, tmp_path: Path) -> None:
 @pytest.fixture
 def face(tmp_path: Path) -> Path:
     return write_glb(tmp_path / "face.glb", meshes())
+
+
+GOOD_POINTS = point_lines(ORIGINAL, lambda place: place)
+
+
+def swapped_points(*names: str) -> str:
+    """Return points some of which have the position of another."""
+    places = dict(row.split("\t", 1) for row in GOOD_POINTS.splitlines()[1:])
+    shifted = {name: places[names[(i + 1) % len(names)]] for i, name in enumerate(names)}
+    return "".join(f"{name}\t{place}\n" for name, place in (places | shifted).items())
 
 
 @pytest.mark.parametrize(
@@ -150,37 +162,15 @@ def face(tmp_path: Path) -> Path:
         ("<xfdp><fdp", "invalid XML"),
         ("<!DOCTYPE x><xfdp/>", "document type"),
         ("<xfdp><fdp name='2.1' affects='skin'/></xfdp>", "index is missing"),
+        (GOOD_POINTS.replace("\n8.1\t", "\n8.1 1 0 0 #"), "too far from the mesh.*: 8.1 by"),
+        (swapped_points("8.3", "8.4"), "MW is not positive"),
+        (swapped_points("2.1", "3.5", "3.6", "8.1"), "is not below the eyes"),
     ],
 )
-def test_rejects_bad_points(face: Path, tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "points.tsv").write_text(text, encoding="utf-8")
+def test_rejects_bad_points(face: Path, text: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
-        import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda rows: rows.replace("\n8.1\t", "\n8.1 1 0 0 #"), "too far from the mesh.*: 8.1 by"),
-        (lambda rows: swap_points(rows, "8.3", "8.4"), "MW is not positive"),
-        (lambda rows: swap_points(rows, "2.1", "3.5", "3.6", "8.1"), "is not below the eyes"),
-    ],
-)
-def test_rejects_points_that_are_not_a_face(
-    face: Path, tmp_path: Path, change: Callable[[str], str], message: str
-) -> None:
-    points = change(point_lines(ORIGINAL, lambda place: place))
-    (tmp_path / "points.tsv").write_text(points, encoding="utf-8")
-    with pytest.raises(UserError, match=message):
-        import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
-    assert not (tmp_path / "out.npz").exists()
-
-
-def swap_points(rows: str, *names: str) -> str:
-    """Swap the positions of points."""
-    places = dict(row.split("\t", 1) for row in rows.splitlines()[1:])
-    shifted = {name: places[names[(i + 1) % len(names)]] for i, name in enumerate(names)}
-    return "".join(f"{name}\t{place}\n" for name, place in (places | shifted).items())
+        import_points(face, text)
+    assert not face.with_name("out.npz").exists()
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -213,9 +203,8 @@ def test_rejects_bad_meshes(tmp_path: Path, name: str, text: str, message: str) 
     mesh = tmp_path / (name or "absent.obj")
     if name:
         mesh.write_text(text)
-    (tmp_path / "points.tsv").write_text("2.1 0\n")
     with pytest.raises(UserError, match=message):
-        import_head(mesh, tmp_path / "points.tsv", tmp_path / "out.npz")
+        import_points(mesh, "2.1 0\n")
 
 
 def test_reports_joined_lips(tmp_path: Path) -> None:
@@ -227,8 +216,6 @@ def test_reports_joined_lips(tmp_path: Path) -> None:
     }
     strip = [[points["2.2"], points["2.3"], points["2.6"]]]  # from lip to lip
     part.triangles = np.concatenate([part.triangles, strip])
-    write_glb(tmp_path / "face.glb", [part])
     rows = [f"{name} {' '.join(map(str, part.vertices[v]))}" for name, v in points.items()]
-    (tmp_path / "points.tsv").write_text("\n".join(rows), encoding="utf-8")
-    warnings = import_head(tmp_path / "face.glb", tmp_path / "points.tsv", tmp_path / "out.npz")
+    _, warnings = import_points(write_glb(tmp_path / "face.glb", [part]), "\n".join(rows))
     assert any("the lips are joined" in warning for warning in warnings)

@@ -27,7 +27,7 @@ START = initial_parameters()
 
 @pytest.mark.slow
 def test_estimates_the_parameters_behind_curves() -> None:
-    phones = utterance(0, 160)
+    phones = utterance(0, 100)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.04)
     true = replace(START, target=0.6 * START.target, offset_s=START.offset_s - 0.02)
     true.target[VISEME_INDEX["i"], JAW] = 150.0  # this speaker's own
