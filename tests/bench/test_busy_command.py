@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 from kouxing.evaluation.system import busy
 from kouxing.evaluation.system.busy import STEP_S, BusyRun
 from kouxing.evaluation.system.commands import app
-from tests.system import VOWELS_FILE
 
 
 def _run(lateness_s: list[tuple[float, float]], load_s: float) -> BusyRun:
@@ -29,13 +28,13 @@ def test_the_summary_has_worst_lateness_and_recovery_time() -> None:
 
 
 def test_the_command_prints_and_writes_the_same_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(busy, "SETTLE_S", 1.0)
     monkeypatch.setattr(busy, "QUIET_S", 1.0)
     monkeypatch.setattr(busy, "AFTER_S", 1.0)
     figures = tmp_path / "busy.json"
-    arguments = ["busy", str(VOWELS_FILE), "--programs", "1", "--seconds", "1"]
+    arguments = ["busy", str(speech), "--programs", "1", "--seconds", "1"]
     result = CliRunner().invoke(app, [*arguments, "--json", str(figures)])
     assert result.exit_code == 0, result.output
     written = json.loads(figures.read_text(encoding="utf-8"))

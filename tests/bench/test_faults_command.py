@@ -8,7 +8,6 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.system.faults import Timing
-from tests.system import SKIP_NO_AUDIO
 
 
 def test_the_command_prints_and_writes_the_same_figures(
@@ -19,8 +18,6 @@ def test_the_command_prints_and_writes_the_same_figures(
     monkeypatch.setattr("kouxing.evaluation.system.faults.TIMING", timing)
     # a busy machine starts slowly
     monkeypatch.setattr("kouxing.evaluation.system.live.END_TIMEOUT_S", 60.0)
-    for name, value in SKIP_NO_AUDIO.items():
-        monkeypatch.setenv(name, value)
     fault, figures, logs = f"{service} killed", tmp_path / "faults.json", tmp_path / "logs"
     result = CliRunner().invoke(
         app,

@@ -8,11 +8,10 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.system.commands import app
 from kouxing.evaluation.system.costs import CASES
-from tests.system import VOWELS_FILE
 
 
 def test_the_command_prints_and_writes_the_same_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.latency.NUM_REPEATS", 1)
     monkeypatch.setattr("kouxing.evaluation.system.costs.NUM_IMAGES", 3)
@@ -23,7 +22,7 @@ def test_the_command_prints_and_writes_the_same_figures(
     monkeypatch.setattr("kouxing.evaluation.system.page.SETTLE_S", 0.5)
     monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 1.0)
     figures = tmp_path / "latency.json"
-    arguments = [str(VOWELS_FILE), "--json", str(figures)]
+    arguments = [str(speech), "--json", str(figures)]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     latency = json.loads(figures.read_text(encoding="utf-8"))

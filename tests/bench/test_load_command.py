@@ -9,17 +9,16 @@ from typer.testing import CliRunner
 from kouxing.evaluation.system.commands import app
 from kouxing.evaluation.tables import format_figure
 from kouxing.services.service_kinds import KINDS
-from tests.system import VOWELS_FILE
 
 
 def test_the_command_prints_writes_and_plots_the_same_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.load.SETTLE_S", 1.0)
     figures, picture = tmp_path / "load.json", tmp_path / "load.png"
     arguments = [
         "load",
-        str(VOWELS_FILE),
+        str(speech),
         "--sessions",
         "2",
         "--seconds",

@@ -101,13 +101,11 @@ def test_controls_do_not_cover_the_mouth_on_a_phone(
     control: PageControl,
     session: Session,
     page: Browser,
-    gateway: Gateway,
     size: tuple[int, int],
     covers: str,
     edge: str,
 ) -> None:
     page.resize(*size, mobile=True)
-    page.open(gateway.page)
     page.keep_resolution()
     if covers == "settings":
         page.click("open-settings")
@@ -122,6 +120,8 @@ def test_controls_do_not_cover_the_mouth_on_a_phone(
     show_controls(page, 1)
     limit = page.evaluate(f"document.getElementById('{covers}').getBoundingClientRect().{edge}")
     rows, columns = np.nonzero(teeth(opened) & (colorfulness(closed) > 50))
+    page.evaluate("document.getElementById('settings').removeAttribute('style')")
+    page.evaluate("document.getElementById('settings').hidePopover()")
     page.resize(*SIZE_PX)
     assert len(rows) > 20
     assert np.percentile(rows if edge == "top" else columns, 90) < limit
@@ -129,11 +129,8 @@ def test_controls_do_not_cover_the_mouth_on_a_phone(
 
 @pytest.mark.usefixtures("drawing_seldom")
 @pytest.mark.parametrize(("width", "is_phone"), [(1280, False), (390, True)])
-def test_every_control_can_be_clicked(
-    page: Browser, gateway: Gateway, width: int, is_phone: bool
-) -> None:
+def test_every_control_can_be_clicked(page: Browser, width: int, is_phone: bool) -> None:
     page.resize(width, 844, mobile=is_phone)
-    page.open(gateway.page)
     shown = (
         "[...document.querySelectorAll('{} :is(button, select, input)')].filter((item) =>"
         "item.checkVisibility()).map((item, index) => (item.id ||= `control-${{index}}`))"
