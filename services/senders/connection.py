@@ -84,7 +84,10 @@ class DatagramConnection(TargetConnection):
                         self._socket = await self._open()
                         self.problem = self._tracker_problem
                     except OSError as error:
-                        self.problem = f"cannot reach {self.target.host}: {error.strerror}"
+                        self.problem = (
+                            f"cannot reach {self.target.host}: {error.strerror}; check the address"
+                            " and the network"
+                        )
                 if self._tracker_input is None and self.target.tracker_address is not None:
                     await self._open_tracker_input(*self.target.tracker_address)
                 await asyncio.sleep(RETRY_S)
@@ -99,7 +102,8 @@ class DatagramConnection(TargetConnection):
             self._tracker_problem = ""
         except OSError as error:
             self._tracker_problem = (
-                f"cannot receive from a tracker on {host}:{port}: {error.strerror}"
+                f"cannot receive from a tracker on {host}:{port}: {error.strerror}; choose another"
+                " address or port"
             )
 
     def _forward(self, packet: bytes) -> bool:
@@ -132,7 +136,9 @@ class DatagramConnection(TargetConnection):
             if error.errno == errno.ECONNREFUSED:
                 self.problem = f"no program is listening on {address}; turn its receiver on"
             else:
-                self.problem = f"cannot reach {address}: {error.strerror}"
+                self.problem = (
+                    f"cannot reach {address}: {error.strerror}; check the address and the network"
+                )
                 self._close()
             return False
         if now_s - self._last_refused_s < _ASSUME_LISTENING_AFTER_S:

@@ -108,7 +108,7 @@ def _open_file(
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     if num_bytes == 0:
-        raise UserError(f"{path}: the file is empty")
+        raise UserError(f"{path}: the file is empty; copy or record it again")
     begin = file.read(NUM_BEGIN_BYTES)
     if count_parts(file) > 1:  # FFmpeg reads one of them
         if wav := pcm_of_wav(begin):

@@ -129,4 +129,5 @@ def write_error(path: Path, error: Any) -> UserError:
         return UserError(f"cannot write {path}: the folder does not exist; run: mkdir -p {folder}")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return UserError(f"cannot write {path}: the disk is full; free some space")
-    return UserError(f"cannot write {path}: {error.strerror or error}")
+    remedy = "; choose another folder" if isinstance(error, PermissionError) else ""
+    return UserError(f"cannot write {path}: {error.strerror or error}{remedy}")

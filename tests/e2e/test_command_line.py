@@ -126,10 +126,11 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
 
         url = f"osc://127.0.0.1:{program.getsockname()[1]}"
         sender = start_python(
-            "-m", "kouxing", "send", url, "--session", "sent", control=system.control
+            "-m", "kouxing", "send", url, url, "--session", "sent", control=system.control
         )
         assert sender.stderr is not None
         assert f"sending ARKit shapes and head to {url}" in sender.stderr.readline()
+        assert "waiting for session sent to open (open sessions: " in sender.stderr.readline()
         assert weight("jawOpen") == weight("mouthSmileLeft") == 0.0
         command("express", "smile=1", "--hold", "600")
         while weight("mouthSmileLeft") < 0.5:

@@ -144,7 +144,8 @@ test("texts of the gateway are translated with their values", () => {
     toChinese("a b.mp3: cannot read audio: this is text, not audio: 'x'; use an audio file"),
     "a b.mp3：无法读取声音：这是文本，不是声音：'x'；请用声音文件",
   );
-  assert.equal(toChinese("a.wav: the file is empty\n1: unknown: why"), "a.wav：文件是空的\n1：unknown：why");
+  const empty = "a.wav: the file is empty; copy or record it again";
+  assert.equal(toChinese(`${empty}\n1: unknown: why`), "a.wav：文件是空的，请重新复制或录制\n1：unknown：why");
   assert.equal(errorToChinese("busy", "the disk is full"), "系统繁忙，请稍后再试：the disk is full");
   assert.equal(errorToChinese("new-code", "no"), "no");
   assert.equal(

@@ -82,7 +82,7 @@ def test_a_full_disk_is_reported_once_and_drops_only_whole_lines(tmp_path: Path)
     log.close()
     assert path.read_text() == "fifteen letters\nkept\n"
     assert warnings == [
-        f"cannot write {path}: No space left on device",
+        f"cannot write {path}: the disk is full; free some space",
         f"{path}: 2 lines were dropped",
     ]
 

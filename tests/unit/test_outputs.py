@@ -26,7 +26,7 @@ from kouxing.services.driver.video.video_writer import PictureSequence, check_na
 from kouxing.shared.command.terminal import check_output, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.files import output_file
-from kouxing.shared.files.output_file import open_output
+from kouxing.shared.files.output_file import open_output, write_error
 from tests.system import VOWELS_FILE
 
 
@@ -207,6 +207,12 @@ def test_a_file_is_deleted_if_the_disk_is_full(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="the disk is full"):
         fill_the_disk(path)
     assert not path.exists()
+
+
+def test_a_file_without_permission_has_a_remedy() -> None:
+    denied = PermissionError(errno.EACCES, "Permission denied")
+    text = "cannot write out/a.csv: Permission denied; choose another folder"
+    assert str(write_error(Path("out/a.csv"), denied)) == text
 
 
 def test_a_failed_export_keeps_the_older_model(

@@ -11,6 +11,8 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from kouxing.shared.files.output_file import write_error
+
 MAX_BYTES = 10_000_000  # per file; the previous file is kept as NAME.log.1
 _TOKEN = re.compile(rb"(token=)[^\s\"'&]+")
 
@@ -43,7 +45,7 @@ class LogFile:
         except OSError as error:
             self.close()
             if not self._num_dropped:
-                self._warn(f"cannot write {self._path}: {error.strerror}")
+                self._warn(str(write_error(self._path, error)))
             self._num_dropped += 1
         else:
             if self._num_dropped:

@@ -34,12 +34,15 @@ def send_to(targets: Iterable[Target], session: str, control: str, *, idle_motio
         contextlib.closing(SenderPool(_report, idle_motion=idle_motion)) as senders,
         catch_interrupt(),
     ):
-        client.status()
-        for target in targets:
+        open_sessions = [state.session for state in client.status().sessions]
+        for target in {target.url: target for target in targets}.values():
             senders.start(target)
             print_message(f"sending {target.contents} to {target.url}; press Ctrl-C to stop")
             if target.expression_hint:
                 print_message(f"{target.url}: {target.expression_hint}")
+        if session and session not in open_sessions:
+            others = ", ".join(open_sessions) or "none"
+            print_message(f"waiting for session {session} to open (open sessions: {others})")
         with _SessionFinder(session, client, senders) as search:
             _send_frames(search, client, senders)
 

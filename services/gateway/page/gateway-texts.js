@@ -2,7 +2,7 @@
 
 const CHINESE = {
   // Files: the same texts as the commands print
-  "the file is empty": "文件是空的",
+  "the file is empty; copy or record it again": "文件是空的，请重新复制或录制",
   "cannot read audio: this is {kind}": "无法读取声音：这是{kind}",
   "text, not audio: {text}; use an audio file": "文本，不是声音：{text}；请用声音文件",
   "a zip archive; unpack it first": "zip 压缩包，请先解压",
@@ -104,7 +104,8 @@ const CHINESE = {
   "{contents} of the mouth": "嘴部的{contents}",
   "{contents} and head": "{contents}和头部",
   "no program is listening on {address}; turn its receiver on": "{address} 没有程序接收，请在该程序中打开接收",
-  "cannot receive from a tracker on {host}:{port}: {reason}": "无法在 {host}:{port} 接收面部追踪数据：{reason}",
+  "cannot receive from a tracker on {host}:{port}: {reason}; choose another address or port":
+    "无法在 {host}:{port} 接收面部追踪数据：{reason}，请换一个地址或端口",
   "camera must be a port such as 39541, or ADDRESS:PORT, not {text}":
     "camera 应为端口（例如 39541）或 地址:端口，而不是 {text}",
   "camera={port} is the port of the avatar program itself; choose another port, and set the tracker to send to it":
@@ -112,7 +113,7 @@ const CHINESE = {
   "only=mouth lets another program control the head; leave out head=on":
     "only=mouth 表示头部由其他程序控制，请去掉 head=on",
   "cannot send a frame: {error}": "无法发送画面数据：{error}",
-  "cannot reach {address}: {reason}": "无法连接 {address}：{reason}",
+  "cannot reach {address}: {reason}; check the address and the network": "无法连接 {address}：{reason}，请检查地址和网络",
   "VTube Studio is asking whether kouxing may move the model; press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
   "VTube Studio's API is off; turn on 'Start API (allow plugins)' in its settings":
     "VTube Studio 的 API 未打开，请在其设置中打开“Start API (allow plugins)”",
