@@ -8,6 +8,8 @@ Angles follow ARKit's face anchor: radians to the subject's left, down, and tilt
 right. Unreal passes them on unchanged. In the app's own recordings each eye has roll = yaw *
 tan(pitch), as radians would; ``eyeLookDown`` has a positive pitch, ``eyeLookInRight`` a positive
 yaw. (Unreal's own ARKit plugin on the phone sends degrees / 180 instead.)
+
+The package PyLiveLinkFace is not used; its only release was in 2022.
 """
 
 import math
