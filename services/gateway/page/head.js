@@ -37,7 +37,7 @@ export class Head {
   #fovYDegrees = 22;
   #needsDrawing = true;
   #isSoftware; // the processor draws
-  #drawRate;
+  drawRate; // decides when images are drawn
   #images;
   #isFilmed = false;
   #size = [0, 0]; // size on the page, pixels
@@ -51,8 +51,8 @@ export class Head {
     const gl = this.#renderer.getContext();
     this.#isSoftware = drawsInSoftware(gl);
     const fullRatio = Math.min(2, Math.max(1.5, devicePixelRatio));
-    this.#drawRate = this.#isSoftware ? new DrawRate(0.5, 1, true) : new DrawRate(fullRatio, fullRatio, false);
-    this.#images = new ImageQueue(gl, this.#drawRate);
+    this.drawRate = this.#isSoftware ? new DrawRate(0.5, 1, true) : new DrawRate(fullRatio, fullRatio, false);
+    this.#images = new ImageQueue(gl, this.drawRate);
     if (!this.#isSoftware) this.#addLights();
     this.#controls = new OrbitControls(this.#camera, canvas);
     this.#controls.enablePan = false;
@@ -127,7 +127,7 @@ export class Head {
   /** Draw if the face has changed and it is time for an image. */
   draw(nowMs, onVisible) {
     if (!this.#needsDrawing || !this.#images.isDue(nowMs)) return;
-    if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize(); // this clears the canvas
+    if (this.#renderer.getPixelRatio() !== this.drawRate.ratio) this.#resize(); // this clears the canvas
     this.#needsDrawing = false;
     if (this.#faps !== null) this.#apply(this.#faps);
     this.#faps = null;
@@ -153,16 +153,6 @@ export class Head {
     return { left: radToDeg(view.theta - front.theta), up: radToDeg(view.phi - front.phi) };
   }
 
-  /** The object that decides when images are drawn. */
-  get drawRate() {
-    return this.#drawRate;
-  }
-
-  /** How long after drawing starts an image is visible, ms, to the middle of its time. */
-  get visibleDelayMs() {
-    return this.#drawRate.visibleDelayMs;
-  }
-
   /**
    * Return how the head is drawn: { isCoarse, width, height, numImages, imageMs, isCurrent }.
    *
@@ -176,7 +166,7 @@ export class Head {
       width,
       height,
       numImages: this.#images.numDrawn,
-      imageMs: this.#drawRate.imageMs,
+      imageMs: this.drawRate.imageMs,
       isCurrent: !this.#needsDrawing && !this.#images.isDrawing,
     };
   }
@@ -232,7 +222,7 @@ export class Head {
     this.#camera.setViewOffset(width, height, shiftX, (height - freeHeight) / 2, width, height);
     this.#needsDrawing = true;
     if (this.#isFilmed) return;
-    this.#renderer.setPixelRatio(this.#drawRate.ratio);
+    this.#renderer.setPixelRatio(this.drawRate.ratio);
     this.#renderer.setSize(width, height, false);
   }
 }

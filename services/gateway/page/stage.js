@@ -62,7 +62,7 @@ export class Stage {
   }
 
   get visibleDelayMs() {
-    return this.#head?.visibleDelayMs ?? 0;
+    return this.#head?.drawRate.visibleDelayMs ?? 0;
   }
 
   /** Load a head by its name; "" for the gateway's default. */

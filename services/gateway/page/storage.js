@@ -1,43 +1,35 @@
 // Stores the user's choices for the next visit. The browser's localStorage is injected as a function; it
 // throws if the browser forbids it.
 
-/** A value in the storage. It lasts until the page closes if nothing can be stored. */
-class StoredValue {
-  #storage;
-  #key;
+const PREFERENCES = "kouxing.choices";
+const MOUTH_PROFILE = "kouxing.voice"; // browsers have used it from the start
 
-  constructor(storage, key) {
-    this.#storage = storage;
-    this.#key = key;
+function read(storage, key) {
+  try {
+    return JSON.parse(storage().getItem(key));
+  } catch {
+    return null; // not written by this page
   }
+}
 
-  read() {
-    try {
-      return JSON.parse(this.#storage().getItem(this.#key));
-    } catch {
-      return null; // not written by this page
-    }
-  }
-
-  /** Store a value; null deletes it. */
-  write(value) {
-    try {
-      if (value === null) this.#storage().removeItem(this.#key);
-      else this.#storage().setItem(this.#key, JSON.stringify(value));
-    } catch {
-      // the storage is full or forbidden
-    }
+/** Store a value; null deletes it. If nothing can be stored, the value lasts until the page closes. */
+function write(storage, key, value) {
+  try {
+    if (value === null) storage().removeItem(key);
+    else storage().setItem(key, JSON.stringify(value));
+  } catch {
+    // the storage is full or forbidden
   }
 }
 
 /** The user's preferences. */
 export class Preferences {
-  #stored;
+  #storage;
   #values;
 
   constructor(storage) {
-    this.#stored = new StoredValue(storage, "kouxing.choices");
-    this.#values = { ...this.#stored.read() };
+    this.#storage = storage;
+    this.#values = { ...read(storage, PREFERENCES) };
   }
 
   /** Return a preference, or null. */
@@ -47,18 +39,18 @@ export class Preferences {
 
   set(name, value) {
     this.#values[name] = value;
-    this.#stored.write(this.#values);
+    write(this.#storage, PREFERENCES, this.#values);
   }
 }
 
 /** The mouth profile of this browser's user, which the gateway learned. */
 export class MouthProfileStore {
   current = null; // { profile (base64), learnedOn (ms since 1970), before, after } or null
-  #stored;
+  #storage;
 
   constructor(storage) {
-    this.#stored = new StoredValue(storage, "kouxing.voice"); // browsers have used it from the start
-    const stored = this.#stored.read();
+    this.#storage = storage;
+    const stored = read(storage, MOUTH_PROFILE);
     if (typeof stored?.profile === "string" && stored.profile !== "") {
       const { learntOn, learnedOn = learntOn, ...rest } = stored; // learntOn: the name in earlier versions
       this.current = { ...rest, learnedOn };
@@ -68,6 +60,6 @@ export class MouthProfileStore {
   /** Keep a profile; null deletes it. */
   keep(profile) {
     this.current = profile;
-    this.#stored.write(profile);
+    write(this.#storage, MOUTH_PROFILE, profile);
   }
 }
