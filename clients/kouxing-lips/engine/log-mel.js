@@ -10,8 +10,6 @@ export class LogMel {
   #hop;
   #window;
   #floor;
-  #bands; // weights of the bins from the first edge of each band
-  #edges;
   #memory;
   #even; // sums and differences of the samples at equal distances from the ends
   #odd;
@@ -19,6 +17,9 @@ export class LogMel {
   #sines;
   #real; // parts of the spectrum, (bins,)
   #imaginary;
+  #power; // (bins,), and zeros
+  #weights; // (bands, bins and zeros)
+  #sums; // (bands,)
   #samples = new Float32Array(0);
 
   constructor({ arrays, constants: { mel } }) {
@@ -26,21 +27,17 @@ export class LogMel {
     this.#hop = mel.HOP_SAMPLES;
     this.#window = Float64Array.from(mel.HANN);
     this.#floor = mel.FLOOR;
-    this.#edges = mel.EDGES;
-    const { shape, values } = arrays["mel.bands"];
-    this.#bands = mel.EDGES.map(([first, end], band) =>
-      Float64Array.from({ length: end - first }, (_, i) => values[(first + i) * shape[1] + band]),
-    );
-    const [numBins, numDistances] = [shape[0], Math.ceil(shape[0] / LANES) * LANES];
-    const sizes = [numDistances, numDistances, numBins * numDistances, numBins * numDistances, numBins, numBins];
+    const { shape: [numBins, numBands], values } = arrays["mel.bands"];
+    const width = Math.ceil(numBins / LANES) * LANES;
+    const sizes = [width, width, numBins * width, numBins * width, numBins, numBins, width, numBands * width, numBands];
     this.#memory = new ProductMemory(sizes.reduce((sum, size) => sum + alignedBytes(Float32Array, size), 0));
-    [this.#even, this.#odd, this.#cosines, this.#sines, this.#real, this.#imaginary] = sizes.map((size) =>
-      this.#memory.array(Float32Array, size),
-    );
+    [this.#even, this.#odd, this.#cosines, this.#sines, this.#real, this.#imaginary, this.#power, this.#weights, this.#sums] =
+      sizes.map((size) => this.#memory.array(Float32Array, size));
     for (let i = 0; i < this.#cosines.length; i++) {
-      const phase = (2 * Math.PI * Math.floor(i / numDistances) * (i % numDistances)) / this.#size;
+      const phase = (2 * Math.PI * Math.floor(i / width) * (i % width)) / this.#size;
       [this.#cosines[i], this.#sines[i]] = [Math.cos(phase), Math.sin(phase)];
     }
+    values.forEach((weight, i) => (this.#weights[(i % numBands) * width + Math.floor(i / numBands)] = weight));
   }
 
   /** Accept samples at 16 kHz, in [-1, 1]; return the new feature frames. */
@@ -51,24 +48,15 @@ export class LogMel {
     const frames = [];
     let begin = 0;
     for (; begin + this.#size <= known.length; begin += this.#hop) {
-      frames.push(this.#bandsOf(this.#powerSpectrum(known.subarray(begin, begin + this.#size))));
+      this.#computePower(known.subarray(begin, begin + this.#size));
+      this.#multiply(this.#power, this.#weights, this.#sums);
+      frames.push(this.#sums.map((sum) => (Math.log10(Math.max(sum, this.#floor)) + 4) / 4));
     }
     this.#samples = known.slice(begin);
     return frames;
   }
 
-  #bandsOf(powers) {
-    const bands = new Float32Array(this.#edges.length);
-    for (let band = 0; band < bands.length; band++) {
-      const [weights, first] = [this.#bands[band], this.#edges[band][0]];
-      let total = 0;
-      for (let i = 0; i < weights.length; i++) total += weights[i] * powers[first + i];
-      bands[band] = (Math.log10(Math.max(total, this.#floor)) + 4) / 4;
-    }
-    return bands;
-  }
-
-  #powerSpectrum(samples) {
+  #computePower(samples) {
     const [size, half, window] = [this.#size, this.#size / 2, this.#window];
     for (let i = 0; i <= half; i++) {
       const first = window[i] * samples[i];
@@ -77,7 +65,7 @@ export class LogMel {
     }
     this.#multiply(this.#even, this.#cosines, this.#real);
     this.#multiply(this.#odd, this.#sines, this.#imaginary);
-    return this.#real.map((real, bin) => real ** 2 + this.#imaginary[bin] ** 2);
+    this.#power.set(this.#real.map((real, bin) => real ** 2 + this.#imaginary[bin] ** 2));
   }
 
   #multiply(vector, matrix, out) {
