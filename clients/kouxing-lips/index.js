@@ -203,31 +203,28 @@ export class LipSync extends EventTarget {
     await this.#open({ sampleRateHz: context.sampleRate }, port1);
     this.#check(choice);
     const input = new AudioWorkletNode(context, "kouxing-lips", { channelCount: 1, channelCountMode: "explicit", numberOfOutputs: 0 });
-    this.#isPlayed = node.isPlayed;
-    const delay = node.isPlayed ? new DelayNode(context, { delayTime: SHOW_AFTER_S, maxDelayTime: 1 }) : null;
+    const output = elementOutputs.get(source);
+    const isBuffer = isInstance(source, "AudioBuffer");
+    this.#isPlayed = isBuffer || output !== undefined;
     node.connect(input);
-    const isElement = isInstance(source, "HTMLMediaElement");
-    if (isElement) node.disconnect(context.destination);
-    if (delay) node.connect(delay).connect(context.destination);
+    if (isBuffer) node.connect(new DelayNode(context, { delayTime: SHOW_AFTER_S })).connect(context.destination);
+    if (output) changeFollowers(output, 1);
     this.#source = {
       node,
       release() {
         input.port.postMessage(null);
         node.disconnect(input);
-        if (delay) {
-          node.disconnect(delay);
-          delay.disconnect();
-        }
-        if (isElement) node.connect(context.destination);
-        if (isInstance(source, "AudioBuffer")) {
+        if (output) changeFollowers(output, -1);
+        if (isBuffer) {
           node.onended = null;
           node.stop();
+          node.disconnect();
         }
         onRelease();
       },
     };
     input.port.postMessage(port2, [port2]);
-    if (isInstance(source, "AudioBuffer")) {
+    if (isBuffer) {
       node.start();
       node.onended = () => this.dispatchEvent(new Event("ended"));
     }
@@ -349,30 +346,33 @@ function isInstance(object, className) {
   return object.constructor?.name === className || isInstance(Object.getPrototypeOf(object), className);
 }
 
-// An element allows only one node, and is heard only through it. The node of an element that is not followed is
-// connected to the destination.
-const elementNodes = new WeakMap();
+// An element allows only one node, and is heard only through it: { node, delay, numFollowers } by element. The delay is
+// zero while no lip sync follows the element. Several can follow it, for example for several avatars.
+const elementOutputs = new WeakMap();
 
-/** Return the audio node of a source. Its property isPlayed is true if the page plays the sound. */
+function changeFollowers(output, change) {
+  output.numFollowers += change;
+  output.delay.delayTime.value = output.numFollowers > 0 ? SHOW_AFTER_S : 0;
+}
+
+/** Return the audio node of a source. */
 function sourceNode(context, source) {
-  const current = isInstance(source, "AudioNode") ? source : elementNodes.get(source);
+  const current = isInstance(source, "AudioNode") ? source : elementOutputs.get(source)?.node;
   if (current && current.context !== context) {
     throw new Error("the source belongs to another audio context; pass that context to LipSync.create() as context");
   }
-  if (isInstance(source, "AudioNode")) return Object.assign(source, { isPlayed: false });
+  if (current) return current;
   if (isInstance(source, "MediaStreamTrack")) source = new MediaStream([source]);
   if (isInstance(source, "MediaStream")) {
     if (source.getAudioTracks().length === 0) throw new Error("the stream has no audio track");
-    return Object.assign(new MediaStreamAudioSourceNode(context, { mediaStream: source }), { isPlayed: false });
+    return new MediaStreamAudioSourceNode(context, { mediaStream: source });
   }
-  if (isInstance(source, "AudioBuffer")) {
-    return Object.assign(new AudioBufferSourceNode(context, { buffer: source }), { isPlayed: true });
-  }
+  if (isInstance(source, "AudioBuffer")) return new AudioBufferSourceNode(context, { buffer: source });
   if (isInstance(source, "HTMLMediaElement")) {
-    if (current) return current;
-    const node = Object.assign(new MediaElementAudioSourceNode(context, { mediaElement: source }), { isPlayed: true });
-    node.connect(context.destination);
-    elementNodes.set(source, node);
+    const node = new MediaElementAudioSourceNode(context, { mediaElement: source });
+    const delay = new DelayNode(context);
+    node.connect(delay).connect(context.destination);
+    elementOutputs.set(source, { node, delay, numFollowers: 0 });
     return node;
   }
   throw new TypeError("expected a MediaStream, a track, an AudioBuffer, an <audio> or <video> element, or an audio node");

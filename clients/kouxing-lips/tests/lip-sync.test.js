@@ -46,12 +46,14 @@ class FakeNode {
   stop() {}
 }
 
+class AudioNode extends FakeNode {}
+
 class AudioBuffer {}
 
 class HTMLMediaElement {}
 
-/** A node that knows the nodes to which it is connected. */
-class ElementNode extends FakeNode {
+/** A node that has a context, and throws an error if it is disconnected from a node to which it is not connected. */
+class ElementNode extends AudioNode {
   outputs = new Set();
   constructor(nodeContext) {
     super();
@@ -66,7 +68,9 @@ class ElementNode extends FakeNode {
   }
 }
 
-class AudioNode {}
+class DelayNode extends FakeNode {
+  delayTime = { value: 0 };
+}
 
 class FakeContext extends EventTarget {
   state = "running";
@@ -109,7 +113,7 @@ test.beforeEach(() => {
     MediaStreamAudioSourceNode: FakeNode,
     AudioBufferSourceNode: FakeNode,
     MediaElementAudioSourceNode: ElementNode,
-    DelayNode: FakeNode,
+    DelayNode,
     MessageChannel: class {},
   });
 });
@@ -169,14 +173,9 @@ test("a closed lip sync, a closed context and a source of another context give a
 
 test("sources of another realm, such as an iframe, are followed", async () => {
   const lips = await LipSync.create({ context });
-  const follow = async (source) => {
-    const listening = lips.listenTo(source);
-    await open();
-    await listening;
-  };
-  await follow(runInNewContext("class MediaStream { getAudioTracks() { return [1]; } } new MediaStream()"));
+  await followWith(lips, runInNewContext("class MediaStream { getAudioTracks() { return [1]; } } new MediaStream()"));
   const node = runInNewContext("class AudioNode { connect() {} disconnect() {} } class GainNode extends AudioNode {} new GainNode()");
-  await follow(Object.assign(node, { context }));
+  await followWith(lips, Object.assign(node, { context }));
   assert.equal(lips.node, node);
   await assert.rejects(lips.listenTo(Object.assign(node, { context: new FakeContext() })), /belongs to another audio context/);
 });
@@ -289,26 +288,63 @@ test("a wrong source is rejected, and the current one is still followed", async 
   assert.ok(stream.track.isLive);
 });
 
+/** Let a lip sync of its own follow a source. */
+async function follow(source) {
+  const lips = await LipSync.create({ context });
+  await followWith(lips, source);
+  return lips;
+}
+
+async function followWith(lips, source) {
+  const listening = lips.listenTo(source);
+  await open();
+  await listening;
+}
+
+const outputDelayS = (node) => [...node.outputs].find((output) => output instanceof DelayNode).delayTime.value;
+
 test("a media element is always heard: directly, or delayed while it is followed", async () => {
   const lips = await LipSync.create({ context });
   const element = new HTMLMediaElement();
   let node = null;
   for (let time = 0; time < 2; time++) {
-    const listening = lips.listenTo(element);
-    await open();
-    await listening;
+    await followWith(lips, element);
     ({ node } = lips);
     assert.equal(node.outputs.size, 2); // the worklet and the delay
-    assert.ok(!node.outputs.has(context.destination));
+    assert.ok(outputDelayS(node) > 0);
     lips.stop();
-    assert.deepEqual([...node.outputs], [context.destination]);
+    assert.equal(node.outputs.size, 1);
+    assert.equal(outputDelayS(node), 0);
   }
   const listening = lips.listenTo(element);
   await opening();
   lips.stop();
   FakeWorker.newest.answer("opened");
   await assert.rejects(listening, aborted);
-  assert.deepEqual([...node.outputs], [context.destination]);
+  assert.equal(outputDelayS(node), 0);
+});
+
+test("several lip syncs can follow one media element, which is heard once", async () => {
+  const element = new HTMLMediaElement();
+  const first = await follow(element);
+  const second = await follow(element);
+  const { node } = first;
+  assert.equal(second.node, node);
+  assert.equal(node.outputs.size, 3); // two worklets and the delay
+  first.stop();
+  assert.ok(outputDelayS(node) > 0);
+  second.stop();
+  assert.equal(outputDelayS(node), 0);
+});
+
+test("a media element is still played after its node was followed", async () => {
+  const element = new HTMLMediaElement();
+  const lips = await follow(element);
+  const { node } = lips;
+  await followWith(lips, node);
+  assert.equal(outputDelayS(node), 0); // heard directly
+  await followWith(lips, element);
+  assert.ok(outputDelayS(node) > 0);
 });
 
 test("a buffer that is replaced does not report its end", async () => {
