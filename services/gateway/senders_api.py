@@ -54,7 +54,7 @@ class SendersApi:
                     self.pool.start(self._allowed_target(url))
                     self._on_started()
                 case [("stop", str(url))]:
-                    self.pool.stop(parse_target(url).url)
+                    self.pool.stop(parse_target(url))
                 case [("delay_ms", int() | float() as delay_ms)] if not isinstance(delay_ms, bool):
                     self.pool.set_delay(parse_delay_s(delay_ms))
                 case _:
@@ -82,11 +82,13 @@ class SendersApi:
 
     def _state(self) -> web.Response:
         states = self.pool.states()
-        running = {state.target for state in states}
+        running = {parse_target(state.target).key for state in states}
         return web.json_response(
             {
                 "senders": [asdict(state) for state in states],
-                "stopped": [url for url in self._configured if url not in running],
+                "stopped": [
+                    url for url, target in self._configured.items() if target.key not in running
+                ],
             },
             dumps=lambda answer: json.dumps(answer, ensure_ascii=False),
         )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from kouxing.services.senders.face_frame import FaceFrame
-from kouxing.services.senders.target import Target
+from kouxing.services.senders.target import Target, TrackerPortError
 from kouxing.services.senders.tracker_input import TrackerInput, open_tracker_input
 
 RETRY_S = 1.0
@@ -61,6 +61,7 @@ class DatagramConnection(TargetConnection):
         self._last_refused_s = -_ASSUME_LISTENING_AFTER_S
         self._newest_frame: FaceFrame | None = None
         self._tracker_input: tuple[asyncio.DatagramTransport, TrackerInput] | None = None
+        self._is_forwarding = False  # whether the tracker's newest packet was sent
         self._tracker_problem = ""  # shown while the target itself has no problem
 
     @abstractmethod
@@ -83,6 +84,8 @@ class DatagramConnection(TargetConnection):
                     try:
                         self._socket = await self._open()
                         self.problem = self._tracker_problem
+                    except TrackerPortError as error:
+                        self.problem = str(error)
                     except OSError as error:
                         self.problem = (
                             f"cannot reach {self.target.host}: {error.strerror}; check the address"
@@ -110,14 +113,14 @@ class DatagramConnection(TargetConnection):
         if self._newest_frame is None:
             return False
         packets, has_mouth = self.with_mouth(packet, self._newest_frame)
-        self._send(packets)
+        self._is_forwarding = self._send(packets)
         return has_mouth
 
     def send(self, frame: FaceFrame) -> bool:
         """Send the datagrams of a frame, unless a tracker's packets contain its mouth."""
         self._newest_frame = frame
         if self._tracker_input is not None and self._tracker_input[1].is_live:
-            return True
+            return self._is_forwarding
         return self._send(self.encode(frame))
 
     def _send(self, datagrams: Iterable[bytes]) -> bool:
@@ -163,7 +166,11 @@ class DatagramConnection(TargetConnection):
         try:
             udp.setblocking(False)
             udp.connect(address)
-        except OSError:
+            is_this_machine = udp.getsockname()[0] == udp.getpeername()[0]
+            tracker_address = self.target.tracker_address
+            if is_this_machine and tracker_address and tracker_address[1] == self.target.port:
+                raise TrackerPortError(self.target.port)  # packets would circulate forever
+        except (OSError, TrackerPortError):
             udp.close()
             raise
         return udp

@@ -4,6 +4,7 @@ Other distributions add protocols by entry points of the group ``kouxing.senders
 has the name of the protocol. Its value is the ``package:Class`` of a ``TargetConnection``.
 """
 
+import ipaddress
 import re
 from collections.abc import Mapping
 from functools import lru_cache
@@ -13,7 +14,12 @@ from urllib.parse import SplitResult, parse_qsl, quote, urlsplit, urlunsplit
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import OscConnection
-from kouxing.services.senders.target import Target, is_host, parse_delay_s
+from kouxing.services.senders.target import (
+    Target,
+    TrackerPortError,
+    is_host,
+    parse_delay_s,
+)
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError
@@ -62,8 +68,7 @@ def parse_target(url: str) -> Target:
         host, port = parts.hostname or LOOPBACK, parts.port
     except ValueError:
         raise _address_error(url) from None
-    if host == "localhost":
-        host = LOOPBACK
+    host = _normalize_host(host)
     protocol = protocols().get(parts.scheme)
     is_bare = parts.path in ("", "/") and not parts.fragment and parts.username is None
     is_readable = url.isprintable() and " " not in url
@@ -84,6 +89,13 @@ def parse_target(url: str) -> Target:
     except UserError as error:
         raise UserError(f"{url}: {error}") from None
     return target
+
+
+def _normalize_host(host: str) -> str:
+    try:
+        return str(ipaddress.ip_address(host))
+    except ValueError:
+        return LOOPBACK if host == "localhost" else host
 
 
 def _normalize(
@@ -115,10 +127,7 @@ def _check_combination(target: Target) -> None:
         and is_loopback(target.host)
         and target.tracker_address[1] == target.port
     ):
-        raise UserError(
-            f"camera={target.port} is the port of the avatar program itself; choose another port,"
-            " and set the tracker to send to it"
-        )
+        raise TrackerPortError(target.port)
 
 
 def _parse_options(url: str, query: str, protocol: type[TargetConnection]) -> dict[str, str]:

@@ -27,6 +27,7 @@ PAUSE_S = 0.5  # a frame that is this much later than other frames follows a pau
 MAX_COUNTED = 1000  # frames in the window
 
 Faps = NDArray[np.float32]
+TargetKey = tuple[str, str, int]  # ``Target.key``
 Result = TypeVar("Result")
 
 
@@ -34,7 +35,7 @@ Result = TypeVar("Result")
 class SenderState:
     """The state of a sender for display."""
 
-    target: str  # its ``url``
+    target: str  # its ``Target.url``
     delay_ms: float  # additional delay of each frame
     contents: str  # description of the data
     rate_hz: float  # frames per second, over the last 2 s
@@ -92,7 +93,7 @@ class SenderPool:
 
     def __init__(self, report: Callable[[str, str], None], *, idle_motion: bool) -> None:
         self._report = report
-        self._senders: dict[str, _Sender] = {}
+        self._senders: dict[TargetKey, _Sender] = {}
         self._rest = RestingFace(idle_motion=idle_motion)
         self._playout = PlayoutClock()
         self._newest = np.zeros(NUM_FAPS, np.float32)
@@ -104,15 +105,15 @@ class SenderPool:
         self._thread.start()
 
     def start(self, target: Target) -> None:
-        """Start sending to a target, unless its address is already in use.
+        """Start sending to a target. If it runs with other options, they are replaced.
 
         Raises ``UserError`` if there are too many targets.
         """
         self._call(lambda: self._start(target))
 
-    def stop(self, url: str) -> None:
-        """Stop sending to a target, given by its ``Target.url``."""
-        self._call(lambda: self._stop(url))
+    def stop(self, target: Target) -> None:
+        """Stop sending to a target, whatever its options are."""
+        self._call(lambda: self._stop(target.key))
 
     def set_delay(self, delay_s: float) -> None:
         """Set the delay of all targets; replaces the delays in their addresses."""
@@ -151,8 +152,8 @@ class SenderPool:
 
     async def _end(self) -> None:
         tasks = [sender.task for sender in self._senders.values()]
-        for url in list(self._senders):
-            self._stop(url)
+        for key in list(self._senders):
+            self._stop(key)
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def _call(self, work: Callable[[], Result]) -> Result:
@@ -162,18 +163,22 @@ class SenderPool:
         return asyncio.run_coroutine_threadsafe(run(), self._loop).result()
 
     def _start(self, target: Target) -> None:
-        if target.url in self._senders:
-            return
+        running = self._senders.get(target.key)
+        if running is not None:
+            if running.connection.target == target:
+                return
+            self._stop(target.key)
         if len(self._senders) >= MAX_SENDERS:
             raise UserError(f"already sending to {MAX_SENDERS} programs; stop one first")
         connection = make_connection(target)
         task = self._loop.create_task(connection.run())
-        self._senders[target.url] = _Sender(connection, task, target.delay_s)
+        task.add_done_callback(lambda ended: _show_error(connection, ended))
+        self._senders[target.key] = _Sender(connection, task, target.delay_s)
         if self._timer is None:
             self._tick()
 
-    def _stop(self, url: str) -> None:
-        sender = self._senders.pop(url, None)
+    def _stop(self, key: TargetKey) -> None:
+        sender = self._senders.pop(key, None)
         if sender is not None:
             sender.task.cancel()
             if sender.timer is not None:
@@ -189,12 +194,12 @@ class SenderPool:
     def _states(self) -> list[SenderState]:
         since_s = self._loop.time() - RATE_WINDOW_S
         states = []
-        for url, sender in self._senders.items():
+        for sender in self._senders.values():
             while sender.sent_s and sender.sent_s[0] < since_s:
                 sender.sent_s.popleft()
             states.append(
                 SenderState(
-                    target=url,
+                    target=sender.connection.target.url,
                     delay_ms=round(1e3 * sender.delay_s, 3),
                     contents=sender.connection.target.contents,
                     rate_hz=len(sender.sent_s) / RATE_WINDOW_S,
@@ -220,11 +225,11 @@ class SenderPool:
             weight = max(0.0, 1.0 - stalled_s / FADE_S)
             time_s = self._session_time_s + now_s - self._newest_s
             self._queue(FaceFrame(self._rest.blend(self._newest, weight, now_s), time_s), now_s)
-        for url, sender in self._senders.items():
+        for sender in self._senders.values():
             problem = sender.connection.problem
             if problem != sender.reported:
                 sender.reported = problem
-                self._report(url, problem)
+                self._report(sender.connection.target.url, problem)
 
     def _queue(self, frame: FaceFrame, earliest_s: float) -> None:
         for sender in self._senders.values():
@@ -247,3 +252,10 @@ class SenderPool:
                 is_sent, sender.connection.problem = False, f"cannot send a frame: {error!r}"
             if is_sent:
                 sender.sent_s.append(time.monotonic())
+
+
+def _show_error(connection: TargetConnection, task: asyncio.Task[None]) -> None:
+    """Show the error that ended a connection, which may be of another distribution."""
+    error = None if task.cancelled() else task.exception()
+    if error is not None:
+        connection.problem = f"the connection ended: {error!r}; stop and restart sending"

@@ -13,13 +13,18 @@ MAX_DELAY_MS = 10_000.0
 class Target:
     """A program that receives the face."""
 
-    url: str  # identifies the target; equal for all spellings of its address
+    url: str  # its address with all options
     protocol: str  # one of ``protocols.protocols``
     frame_contents: str  # what a frame contains; empty: the shapes
     host: str
     port: int
     options: Mapping[str, str]  # options of the protocol
     delay_s: float = 0.0  # additional delay of each frame
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Identifies the target: two targets with one key are the same program."""
+        return self.protocol, self.host, self.port
 
     @property
     def is_mouth_only(self) -> bool:
@@ -66,6 +71,16 @@ class Target:
         return parse_tracker_address(option) if option else None
 
 
+class TrackerPortError(UserError):
+    """The tracker's packets arrive at the port of the target itself."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(
+            f"camera={port} is the port of the avatar program itself; choose another port,"
+            " and set the tracker to send to it"
+        )
+
+
 def is_host(text: str) -> bool:
     """Return whether a text can be a host: no part of a name is empty or longer than 63 bytes."""
     try:
@@ -81,6 +96,7 @@ def parse_tracker_address(option: str) -> tuple[str, int]:
     Raises ``UserError`` if the port is not a number from 1 to 65535, or the address is invalid.
     """
     host, _, port = option.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")  # of an IPv6 address
     is_port = port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16
     if not (is_port and is_host(host)):
         raise UserError(f"camera must be a port such as 39541, or ADDRESS:PORT, not {option!r}")

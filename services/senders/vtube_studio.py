@@ -65,7 +65,7 @@ class VTubeStudioProtocol:
         invalid or reports an error that requires a new connection.
         """
         try:
-            message = json.loads(text)
+            message = parse_json(text)
             kind, data = message["messageType"], message["data"]
             handlers = {
                 "AuthenticationTokenResponse": self._on_token,

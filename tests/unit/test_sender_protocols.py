@@ -143,7 +143,7 @@ def test_vtube_studio_errors_are_explained_or_ignored() -> None:
     assert "another plugin" in dialogue.problem
     dialogue.reply(response("InjectParameterDataResponse"))
     assert dialogue.problem == ""
-    for nonsense in ("x", "[]", "{}", response("AuthenticationTokenResponse")):
+    for nonsense in ("x", "[" * 100_000, "[]", "{}", response("AuthenticationTokenResponse")):
         with pytest.raises(UserError, match="not VTube Studio"):
             dialogue.reply(nonsense)
 
@@ -157,13 +157,19 @@ def test_vtube_studio_errors_are_explained_or_ignored() -> None:
         ("livelink://127.0.0.1?name=口%26型", ["livelink://?delay=0&name=%E5%8F%A3%26型"]),
         ("vmc://127.0.0.1:39541", ["vmc://:39541", "vmc://127.0.0.1:39541/"]),
         ("osc://pc.local?delay=2&prefix=/A/", ["OSC://PC.local:9000/?prefix=/A/&delay=2"]),
-        ("vts://[::1]", ["vts://[::1]:8001", "VTS://[::1]/"]),
+        ("vts://[::1]", ["vts://[::1]:8001", "VTS://[0:0:0:0:0:0:0:1]/"]),
         ("livelink://127.0.0.1", ["livelink://", "livelink://127.0.0.1:11111"]),
     ],
 )
-def test_all_spellings_of_an_address_are_one_target(url: str, others: list[str]) -> None:
+def test_all_spellings_of_an_address_become_one(url: str, others: list[str]) -> None:
     assert [parse_target(other) for other in others] == [parse_target(url)] * len(others)
     assert parse_target(url).url == url
+
+
+def test_options_do_not_identify_a_target() -> None:
+    assert parse_target("vmc://?delay=120").key == parse_target("vmc://?delay=1.2e2").key
+    keys = {parse_target(url).key for url in ("vmc://", "osc://", "vmc://:1", "vmc://pc")}
+    assert len(keys) == 4
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """A tracker's packets with the mouth of the sound."""
 
+import errno
 import struct
+from unittest import mock
 
 import pytest
 from hypothesis import given
@@ -133,6 +135,22 @@ async def test_a_flood_is_cut_and_bad_packets_do_not_count_as_a_face() -> None:
     assert len(forwarded) == 600
 
 
+@with_fake_time
+async def test_forwarded_packets_count_only_if_they_are_sent() -> None:
+    connection = connection_to("vmc://?camera=39541")
+    udp = mock.Mock()
+    connection._socket = udp
+    tracker = TrackerInput(connection._forward)
+    connection._tracker_input = mock.Mock(), tracker
+    (packet,) = bundle_messages([encode_message("/VMC/Ext/Blend/Apply")])
+    assert connection.send(MOUTH_FRAME)
+    tracker.datagram_received(packet, None)
+    assert connection.send(MOUTH_FRAME)
+    udp.send.side_effect = ConnectionRefusedError(errno.ECONNREFUSED, "refused")
+    tracker.datagram_received(packet, None)
+    assert not connection.send(MOUTH_FRAME)
+
+
 @pytest.mark.parametrize("camera", ["0", "65536", "phone", "1.2.3.4:", "-1", "a..b:1"])
 def test_rejects_an_invalid_address_of_a_tracker(camera: str) -> None:
     with pytest.raises(UserError, match="camera must be a port"):
@@ -141,4 +159,5 @@ def test_rejects_an_invalid_address_of_a_tracker(camera: str) -> None:
 
 def test_only_local_trackers_may_be_started_from_a_page() -> None:
     assert parse_target("vmc://?camera=39541").is_local
+    assert parse_target("vmc://?camera=[::1]:39541").tracker_address == ("::1", 39541)
     assert not parse_target("vmc://?camera=0.0.0.0:39541").is_local
