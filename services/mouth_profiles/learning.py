@@ -169,11 +169,13 @@ def fit_profile(observations: Observations, fraction: float = 1.0) -> MouthProfi
 
 
 def measure_gain(lip_predictor: GruLipPredictor, observations: Observations) -> ProfileGain:
-    """Fit a profile to the first three quarters, and measure it on the last quarter.
+    """Fit a profile to the first three quarters of the tracked speech, and measure it on the rest.
 
     Raises like ``fit_profile``.
     """
-    first_held_out = round((1 - _HELD_OUT) * len(observations))
+    num_known = np.cumsum(_is_known(observations))
+    num_learned = round((1 - _HELD_OUT) * num_known[-1]) if len(num_known) else 0
+    first_held_out = int(np.searchsorted(num_known, num_learned, side="right"))
     profile = fit_profile(observations[:first_held_out], 1 - _HELD_OUT)
     held_out = observations[first_held_out:]
     delay_s = choose_delay(lip_predictor.delays_s, FACE_DELAY_S)
@@ -181,7 +183,7 @@ def measure_gain(lip_predictor: GruLipPredictor, observations: Observations) -> 
     versions = (held_out.tracked, held_out.predicted, apply_profile(profile, held_out))
     tracked, before, after = (lip_measures(faps[:, delay]) for faps in versions)
     return ProfileGain(
-        speech_s=len(held_out) * ENCODER_FRAME_S,
+        speech_s=_tracked_s(held_out),
         delay_s=delay_s,
         before=correlate_curves([(before, tracked)]),
         after=correlate_curves([(after, tracked)]),
@@ -206,6 +208,11 @@ def _is_known(observations: Observations) -> NDArray[np.bool_]:
     unknown = np.isnan(observations.tracked[..., _is_tracked(observations)])
     known: NDArray[np.bool_] = ~unknown.any(axis=(1, 2)) & (unknown.shape[2] > 0)
     return known
+
+
+def _tracked_s(observations: Observations) -> float:
+    """Return the duration of the speech with tracked lips."""
+    return int(_is_known(observations).sum()) * ENCODER_FRAME_S
 
 
 def _fit(observations: Observations, strength: float) -> MouthProfile:
@@ -253,7 +260,7 @@ class LearnedProfile:
     """A mouth profile and its measured gain."""
 
     content: bytes
-    speech_s: float  # duration of the speech for learning
+    speech_s: float  # duration of the speech with tracked lips
     gain: ProfileGain  # gain of a profile that was learned from the first three quarters
 
     def figures(self) -> dict[str, object]:
@@ -279,7 +286,7 @@ def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     observations = Observations.join([observe(lip_predictor, filmed) for filmed in recordings])
     return LearnedProfile(
         content=fit_profile(observations).to_bytes(lip_predictor.digest),
-        speech_s=len(observations) * ENCODER_FRAME_S,
+        speech_s=_tracked_s(observations),
         gain=measure_gain(lip_predictor, observations),
     )
 

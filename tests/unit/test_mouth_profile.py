@@ -113,6 +113,20 @@ def test_ten_seconds_of_speech_are_enough() -> None:
     assert measure_gain(MODEL, speech).speech_s == 2.5
 
 
+def test_only_speech_with_tracked_lips_counts() -> None:
+    speech = filmed_speech(1000)
+    speech.tracked[:400] = speech.tracked[600:700] = np.nan
+    gain = measure_gain(MODEL, speech)
+    assert gain.speech_s == 2.5
+    assert len(gain.time_s) == 125
+    speech.tracked[900:] = np.nan
+    with pytest.raises(UserError, match="only 6 s of speech show the lips"):
+        measure_gain(MODEL, speech)
+    speech.tracked[:] = np.nan
+    with pytest.raises(UserError, match="only 0 s of speech show the lips"):
+        measure_gain(MODEL, speech)
+
+
 @pytest.mark.parametrize(("interval_s", "hole_s"), [(0.04, 0.16), (0.2, 0.6)])
 def test_interpolates_slow_images_but_not_holes(interval_s: float, hole_s: float) -> None:
     frame_s = np.arange(0, 10, interval_s)

@@ -65,7 +65,10 @@ def decode_text(content: bytes, language: str) -> DecodedText:
         no_match_encoding="utf-8",
     )
     likely = detected["encoding"] if detected["confidence"] >= _MIN_CONFIDENCE else None
-    for encoding in (likely or "utf-8", *encodings):  # chardet does not recognize some short texts
+    # chardet does not recognize some short texts, or reads them as rare Chinese characters
+    candidates = [(likely or "utf-8").lower(), *encodings]
+    candidates.sort(key=lambda encoding: _has_rare_characters(content, encoding))
+    for encoding in candidates:
         with contextlib.suppress(UnicodeDecodeError):
             text = content.decode(encoding)
             if all(ord(letter) >= 32 or letter.isspace() for letter in text):
@@ -75,3 +78,16 @@ def decode_text(content: bytes, language: str) -> DecodedText:
         "this is not a text file, or its encoding is unknown; save the spoken text as plain"
         " text in UTF-8"
     )
+
+
+def _has_rare_characters(content: bytes, encoding: str) -> bool:
+    """Return whether a Chinese encoding gives characters outside GB 2312, or level 1 of Big5."""
+    try:
+        match encoding:
+            case "gb18030":
+                content.decode("gb2312")
+            case "big5":
+                return any(letter.encode("big5") >= b"\xc7" for letter in content.decode("big5"))
+    except UnicodeDecodeError:
+        return True
+    return False
