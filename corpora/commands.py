@@ -20,6 +20,7 @@ from kouxing.shared.command.terminal import (
     write_json,
 )
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.output_file import open_output
 
 if TYPE_CHECKING:
     from kouxing.services.mouth_profiles.learning import FilmedSpeech
@@ -44,7 +45,8 @@ def adapt(
 
     check_output(output, json_file, inputs=sources, force=force)
     learned = learn_mouth_profile([_read(source) for source in sources])
-    output.write_bytes(learned.content)
+    with open_output(output) as file:
+        file.write(learned.content)
     columns = ("correlation with the tracked lips", "without the profile", "with it")
     rows = [
         (measure, *("-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures))

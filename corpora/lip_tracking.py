@@ -1,6 +1,7 @@
 """Track the lips in a video: a clip with audio and lip motion, but without images."""
 
 import csv
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,7 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import plural
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
+from kouxing.shared.files.output_file import open_output
 from kouxing.shared.files.user_file import check_content, open_file
 
 MAX_DURATION_S = 1200.0
@@ -101,8 +103,6 @@ def track_video(video: Path, clip: Path, audio_track: int | None) -> tuple[int, 
     faps[has_face] = compute_mouth_faps(
         landmarks, np.interp(time_s[has_face], levels[:, 0], levels[:, 1])
     )
-    soundfile.write(clip.with_suffix(".flac"), samples, MEDIA_RATE_HZ)
-    _write_tracks(clip.with_suffix(".csv"), time_s, faps)
     metadata = {
         "clip": clip.stem,
         "kind": "tracked video (MediaPipe face mesh)",
@@ -113,17 +113,25 @@ def track_video(video: Path, clip: Path, audio_track: int | None) -> tuple[int, 
         "frames": len(has_face),
         "frames_ok": int(has_face.sum()),
     }
-    clip.with_suffix(".json").write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
+    with (  # older files are replaced at the end, so they never belong to two recordings
+        open_output(clip.with_suffix(".json")) as json_file,
+        open_output(clip.with_suffix(".csv")) as csv_file,
+        open_output(clip.with_suffix(".flac")) as audio_file,
+    ):
+        soundfile.write(audio_file, samples, MEDIA_RATE_HZ, format="FLAC")
+        csv_file.write(_format_tracks(time_s, faps).encode())
+        json_file.write(f"{json.dumps(metadata, indent=1)}\n".encode())
     return int(has_face.sum()), len(has_face)
 
 
-def _write_tracks(path: Path, time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> None:
+def _format_tracks(time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> str:
     columns = [index for index in range(faps.shape[1]) if not np.isnan(faps[:, index]).all()]
     names = [f"F{MOUTH_FAPS[index]}_{FAPS[MOUTH_FAPS[index] - 1].name}" for index in columns]
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["t", "ok", *names])
-        for time, row in zip(time_s, faps[:, columns], strict=True):
-            is_seen = not np.isnan(row).any()
-            values = [f"{value:.1f}" if is_seen else "" for value in row]
-            writer.writerow([f"{time:.4f}", int(is_seen), *values])
+    table = io.StringIO()
+    writer = csv.writer(table)
+    writer.writerow(["t", "ok", *names])
+    for time, row in zip(time_s, faps[:, columns], strict=True):
+        is_seen = not np.isnan(row).any()
+        values = [f"{value:.1f}" if is_seen else "" for value in row]
+        writer.writerow([f"{time:.4f}", int(is_seen), *values])
+    return table.getvalue()

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.wait import wait_until
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 
 _TIMEOUT_S = 120.0
@@ -210,4 +211,4 @@ def write_wav(path: Path, samples: NDArray[np.float32], rate_hz: int) -> None:
     """Write samples (num_samples, num_channels) to a WAV file of 16 bits."""
     with wave.open(str(path), "wb") as file:
         file.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
-        file.writeframes((samples * 32767).astype("<i2").tobytes())
+        file.writeframes(as_integers(samples).tobytes())

@@ -27,6 +27,7 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio.audio_file import read_audio
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import UserError
@@ -287,8 +288,8 @@ class LoadGenerator:
             except Refused as refusal:
                 self.refusals[refusal.code] = self.refusals.get(refusal.code, 0) + 1
                 continue
-            sound = np.clip(speaker_audio(speech, number), -1.0, 1.0)
-            speaker = Speaker(session, np.round(sound * 32767).astype("<i2").tobytes())
+            pcm = as_integers(speaker_audio(speech, number)).tobytes()
+            speaker = Speaker(session, pcm)
             session.results(FapFrame, on_result=speaker.record)
             self.speakers.append(speaker)
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from typer.testing import CliRunner
 
+from kouxing.corpora import lip_tracking
 from kouxing.corpora.commands import adapt_app, track_app
 from kouxing.corpora.lip_clips import read_clip
 from kouxing.services.driver.video.video_writer import VideoWriter
@@ -32,7 +34,7 @@ def run(app: object, *arguments: object) -> None:
     RUNNER.invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)  # type: ignore[arg-type]
 
 
-def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
+def test_tracks_the_lips_in_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nobody = np.zeros((144, 192, 3), np.uint8)
     shut, wide = picture("woman_rest"), picture("woman_a")
     with VideoWriter(tmp_path / "me.mp4", 192, 144, 25.0, 16_000) as writer:
@@ -49,6 +51,11 @@ def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
     assert np.median(jaw[32:53]) > 80
     assert np.isnan(depth).all()
     assert np.isnan(clip.faps[55:]).all()
+    older = {path: path.read_bytes() for path in tmp_path.glob("me.*")}
+    monkeypatch.setattr(lip_tracking, "_format_tracks", mock.Mock(side_effect=OSError(28, "full")))
+    with pytest.raises(UserError, match="the disk is full"):
+        run(track_app, tmp_path / "me.mp4", "-o", tmp_path / "me", "--force")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == older
 
 
 def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
