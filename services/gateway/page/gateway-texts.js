@@ -112,6 +112,7 @@ const CHINESE = {
     "camera={port} 是虚拟形象程序自己的端口；请换一个端口，并让面部追踪程序发送到它",
   "only=mouth lets another program control the head; leave out head=on":
     "only=mouth 表示头部由其他程序控制，请去掉 head=on",
+  "the connection ended: {error}; stop and restart sending": "连接已结束：{error}；请停止后重新发送",
   "cannot send a frame: {error}": "无法发送画面数据：{error}",
   "cannot reach {address}: {reason}; check the address and the network": "无法连接 {address}：{reason}，请检查地址和网络",
   "VTube Studio is asking whether kouxing may move the model; press Allow there": "VTube Studio 正在询问是否允许 kouxing，请在那里点“Allow”",
