@@ -39,12 +39,9 @@ STEP_S = 0.02  # interval of the lateness values
 _PROC = Path("/proc")
 
 
-@dataclass(frozen=True, slots=True)
-class UsageRate:
-    """Resources that a service used per second."""
-
-    cpu_cores: float
-    wake_ups: float  # wake-ups of all threads
+UsageRate = dict[
+    str, float
+]  # a service's ``cpu_cores``, and ``wake_ups`` of its threads per second
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,19 +215,18 @@ def _measure_usage(
     before = {name: _read_usage(process) for name, process in processes.items()}
     action()
     passed_s = time.monotonic() - started_s
+    after = {name: _read_usage(process) for name, process in processes.items()}
     return {
-        name: UsageRate(
-            *(
-                (now - then) / passed_s
-                for now, then in zip(_read_usage(process), before[name], strict=True)
-            )
-        )
-        for name, process in processes.items()
+        name: {
+            resource: (after[name][resource] - used) / passed_s
+            for resource, used in before[name].items()
+        }
+        for name in processes
     }
 
 
-def _read_usage(process_id: int) -> tuple[float, int]:
-    """Return the CPU seconds of a process and the number of wake-ups of its threads.
+def _read_usage(process_id: int) -> UsageRate:
+    """Return the CPU seconds of a process and the number of wake-ups of its threads so far.
 
     Raises ``UserError`` if the system has no /proc, or the process has ended.
     """
@@ -250,4 +246,4 @@ def _read_usage(process_id: int) -> tuple[float, int]:
         for line in state.splitlines()
         if line.startswith("voluntary_ctxt_switches")
     )
-    return cpu_s, wake_ups
+    return {"cpu_cores": cpu_s, "wake_ups": wake_ups}

@@ -27,10 +27,7 @@ from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
 from kouxing.services.synthesizer.modifiers.feeling import FeelingModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
 from kouxing.services.synthesizer.modifiers.nonverbal import ExpressionModifier, NonverbalModifier
-from kouxing.services.synthesizer.modifiers.speech_motion import (
-    IdleMotionSettings,
-    SpeechMotionModifier,
-)
+from kouxing.services.synthesizer.modifiers.speech_motion import SpeechMotionModifier
 from kouxing.services.synthesizer.phone_renumberer import PhoneRenumberer
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.face.expression_motion import JAW, mix_expression
@@ -224,10 +221,10 @@ class FaceAnimator:
         """Set how strongly the face shows the feeling in the voice, 0 to 1."""
         self._feeling.amount = amount
 
-    def set_idle_motion(self, change: IdleMotionSettings) -> None:
-        """Change the idle motion of the face. A field that is None changes nothing."""
+    def set_idle_motion(self, **settings: bool | None) -> None:
+        """Change the idle motion, if any, as ``SpeechMotionModifier.set_idle_motion``."""
         if self._idle_motion is not None:
-            self._idle_motion.set_idle_motion(change)
+            self._idle_motion.set_idle_motion(**settings)
 
     def set_lip_model(self, lip_model: LipModel) -> None:
         """Change the lip model with a continuous transition."""

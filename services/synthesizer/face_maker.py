@@ -6,7 +6,6 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.services.synthesizer.modifiers.speech_motion import IdleMotionSettings
 from kouxing.services.synthesizer.session import SynthesizerSession
 from kouxing.shared.errors import StartFailure, UserError
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
@@ -42,7 +41,7 @@ class FaceMaker:
         )
         if settings.expressions:
             face.set_expressions(settings.expressions, settings.hold_s)
-        face.set_idle_motion(_idle_motion_settings(settings))
+        _set_idle_motion(face, settings)
         return face
 
     def change(self, session: SynthesizerSession, settings: FaceSettings) -> None:
@@ -57,7 +56,7 @@ class FaceMaker:
             session.face.set_expressiveness(settings.expressiveness)
         if settings.feeling is not None:
             session.face.set_feeling(settings.feeling)
-        session.face.set_idle_motion(_idle_motion_settings(settings))
+        _set_idle_motion(session.face, settings)
         if settings.expressions is not None:
             session.face.set_expressions(settings.expressions, settings.hold_s)
         session.add_shapes(settings.shapes or ())
@@ -80,7 +79,7 @@ class FaceMaker:
             return self._load_lip_model(start, self._config.lips)
 
 
-def _idle_motion_settings(settings: FaceSettings) -> IdleMotionSettings:
-    return IdleMotionSettings(
+def _set_idle_motion(face: FaceAnimator, settings: FaceSettings) -> None:
+    face.set_idle_motion(
         still=settings.still, eye_contact=settings.eye_contact, listening=settings.listening
     )

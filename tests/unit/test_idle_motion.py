@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator
-from kouxing.services.synthesizer.modifiers.speech_motion import IdleMotionSettings
 from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.idle_motion import IdleMotion
 from kouxing.shared.phones.events import Progress, SpeechChange
@@ -132,9 +131,9 @@ def test_a_listener_looks_at_the_viewer_and_nods_and_blinks_slowly_in_pauses() -
     faps = []
     for seed in SEEDS:
         face = make_face(idle_motion_seed=seed)
-        face.set_idle_motion(IdleMotionSettings(listening=True))
+        face.set_idle_motion(listening=True)
         relaxed = face.relax(500)
-        face.set_idle_motion(IdleMotionSettings(listening=False))
+        face.set_idle_motion(listening=False)
         faps.append(np.array([values for _, values in relaxed + face.relax(50)]))
     away = np.abs([gaze_deg(run[:500]) for run in faps]) > 1.5
     assert away.mean() < 0.15
@@ -145,7 +144,7 @@ def test_a_listener_looks_at_the_viewer_and_nods_and_blinks_slowly_in_pauses() -
 
 def test_a_still_face_with_eye_contact_only_breathes_and_blinks() -> None:
     face = make_face(idle_motion_seed=3)
-    face.set_idle_motion(IdleMotionSettings(still=True, eye_contact=True))
+    face.set_idle_motion(still=True, eye_contact=True)
     faps = animate(face, STRONG * 5)[150:]
     assert not faps[:, BROW].any()
     assert np.abs(faps[:, [YAW, ROLL]]).max() < 0.15 * DEGREE

@@ -45,7 +45,7 @@ from kouxing.training.encoder.singing import sing
 from kouxing.training.model_card import write_card
 from kouxing.training.model_files import save_blocks, topology_arrays
 from kouxing.training.networks.batches import FrameTargets, LabeledRecording
-from kouxing.training.networks.labels import STATES_PER_PHONE, DataMix, alignment_statistics, label
+from kouxing.training.networks.labels import STATES_PER_PHONE, alignment_statistics, label
 from kouxing.training.networks.whisper import init_encoder, load_whisper
 from kouxing.training.seed import SEED
 from kouxing.training.training_set import FRAMES_PER_MINUTE, load_examples
@@ -55,7 +55,8 @@ from kouxing.training.training_set import FRAMES_PER_MINUTE, load_examples
 BLOCK_LENGTH, _RIGHT_CONTEXT, _PAST = 2, 14, 124
 _ACOUSTIC_SCALE = 0.5
 _PHONE_PENALTY, _RATE_WEIGHT = 3.2, 120.0  # chosen on speech of many rates, for `light` too
-_DATA_MIX = DataMix({"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52)
+# fractions of the kinds of speech with text, and of recordings without text
+_KINDS, _UNTRANSCRIBED = {"sentence": 0.16, "word": 0.06, "synthetic": 0.26}, 0.52
 _SUNG_EVERY, _SUNG_WEIGHT = 10, 0.8  # every 10th recording has a sung copy; its relative weight
 _MAX_SUNG_FRAMES = 800  # limit for the sung part of a recording
 
@@ -92,7 +93,8 @@ def train_blocks(
         alignments, recordings = label(
             examples,
             untranscribed,
-            _DATA_MIX,
+            _KINDS,
+            _UNTRANSCRIBED,
             aligner=before,
             encoder=whole,
             errors=errors,

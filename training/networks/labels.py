@@ -45,14 +45,6 @@ _TEACHER_SET = 2000  # recordings of each kind that the teacher is trained on
 _FULL_FOLDER_MINUTES = 45  # longer folders get the weight of this much speech
 
 
-@dataclass(frozen=True, slots=True)
-class DataMix:
-    """Composition of a training set."""
-
-    kinds: Mapping[str, float]  # fraction of each kind of speech with text
-    untranscribed: float  # fraction of recordings without text
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alignment:
     """The state of each frame of a recording."""
@@ -65,7 +57,8 @@ class Alignment:
 def label(
     examples: Sequence[Example],
     untranscribed: Sequence[Path],
-    mix: DataMix,
+    kinds: Mapping[str, float],
+    fraction: float,
     *,
     aligner: AcousticModel,
     encoder: WholeEncoder,
@@ -74,14 +67,15 @@ def label(
     """Align and label recordings; those with text come first, in random order.
 
     ``examples`` have text and samples, in the language of ``aligner``. ``untranscribed`` are
-    folders of recordings without text. ``encoder`` is Whisper's, for the teacher. Returns the
-    alignments of the recordings with text, and all recordings.
+    folders of recordings without text. ``kinds`` is the fraction of each kind of speech with text
+    in training, and ``fraction`` that of the recordings without text. ``encoder`` is Whisper's, for
+    the teacher. Returns the alignments of the recordings with text, and all recordings.
     """
     rng = np.random.default_rng(SEED)
     folders = [load_untranscribed(folder, errors) for folder in untranscribed]
     in_random_order = [examples[index] for index in rng.permutation(len(examples))]
     aligned, alignments = _align_examples(aligner, in_random_order)
-    recordings = _recordings(aligned, alignments, mix)
+    recordings = _recordings(aligned, alignments, kinds)
     num_of_kind: Counter[str] = Counter()
     teacher_set = []
     for example, recording in zip(aligned, recordings, strict=True):
@@ -101,7 +95,7 @@ def label(
     counted = [min(size, _FULL_FOLDER_MINUTES * FRAMES_PER_MINUTE) for size in sizes]
     for pairs, size, count in zip(pairs_by_folder, sizes, counted, strict=True):
         for sound, targets in pairs:
-            weight = mix.untranscribed * count / sum(counted) * len(targets) / size
+            weight = fraction * count / sum(counted) * len(targets) / size
             labeled.append(LabeledRecording(samples=sound, targets=targets, weight=weight))
     width = max(recording.targets.states.shape[1] for recording in labeled)
     return alignments, [
@@ -110,18 +104,18 @@ def label(
 
 
 def _recordings(
-    examples: Sequence[Example], alignments: Sequence[Alignment], mix: DataMix
+    examples: Sequence[Example], alignments: Sequence[Alignment], kinds: Mapping[str, float]
 ) -> list[LabeledRecording]:
     """Weight recordings: a kind of speech has a fixed total weight; rare speakers weigh more."""
     pairs = list(zip(examples, alignments, strict=True))
-    frames = dict.fromkeys(mix.kinds, 0.0)
+    frames = dict.fromkeys(kinds, 0.0)
     for example, alignment in pairs:
         frames[example.kind] += example.weight * len(alignment.states)
     return [
         LabeledRecording(
             samples=example.samples,
             targets=FrameTargets.hard(alignment.states),
-            weight=mix.kinds[example.kind]
+            weight=kinds[example.kind]
             * example.weight
             * len(alignment.states)
             / frames[example.kind],

@@ -62,14 +62,16 @@ def train_universal(
     torch.manual_seed(SEED)
     errors = RowErrors()
     inventory = load_inventory(UNIVERSAL)
-    data = read_training_set(mandarin, learners, languages, clips, errors, any_license=any_license)
+    recordings, weights = read_training_set(
+        mandarin, learners, languages, clips, errors, any_license=any_license
+    )
     folder, states_file, checkpoint = (
         output.with_suffix(end) for end in (".features", ".states.npz", ".readout.pt")
     )
     store = FeatureStore(folder, FeatureEncoder(model, LAYERS))
-    store.standardize(data.recordings)
-    stored = list(store.read(data.recordings))
-    by_name = {recording.utterance_id: recording for recording in data.recordings}
+    store.standardize(recordings)
+    stored = list(store.read(recordings))
+    by_name = {recording.utterance_id: recording for recording in recordings}
     aligner = Aligner(by_name, inventory)
     saved = load_or_compute(states_file, partial(_aligned_states, aligner, stored))
     pieces = np.split(saved["states"].astype(np.int64), np.cumsum(saved["lengths"])[:-1])
@@ -79,11 +81,11 @@ def train_universal(
         BlockReadout(WIDTH, STATES_PER_PHONE * len(inventory), READOUT),
         aligned,
         states,
-        [data.weights[features.name] for features in aligned],
+        [weights[features.name] for features in aligned],
         num_steps=num_steps,
         checkpoint=checkpoint,
     )
-    topology, log_prior = _statistics(by_name, states, data.weights, inventory)
+    topology, log_prior = _statistics(by_name, states, weights, inventory)
     readout.mean[:] = torch.from_numpy(store.mean)
     readout.deviation[:] = torch.from_numpy(store.deviation)
     extension = export_extension(readout, model, LAYERS)
@@ -105,7 +107,7 @@ def train_universal(
         title="Universal phones: a second readout of the block network",
         details=f"on layers of `blocks.npz`, which is not changed, seed {SEED}, "
         f"{num_steps} steps of {CROPS_S:.0f} s of audio, on the recordings below",
-        recordings=data.recordings,
+        recordings=recordings,
         errors=errors,
     )
     errors.report_to(print_message)

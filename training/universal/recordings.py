@@ -7,7 +7,7 @@ import random
 import zlib
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from kouxing.corpora.lip_clips import read_clips
@@ -37,14 +37,6 @@ _FRACTIONS = {"learners": 0.27, "mandarin": 0.15, "en": 0.10, "emodb": 0.10, "gr
 _SYNTHETIC_FRACTION = 0.16
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingSet:
-    """Recordings with the phones of their words, and their sampling weights."""
-
-    recordings: list[Utterance]
-    weights: dict[str, float]  # by the recording's id
-
-
 def read_training_set(
     mandarin: Sequence[Path],
     learners: Sequence[Path],
@@ -53,8 +45,8 @@ def read_training_set(
     errors: RowErrors,
     *,
     any_license: bool,
-) -> TrainingSet:
-    """Read the recordings that are not held out.
+) -> tuple[list[Utterance], dict[str, float]]:
+    """Read the recordings that are not held out, and their sampling weights by id.
 
     ``mandarin`` are Mandarin corpora, ``learners`` English by native speakers of Mandarin,
     ``languages`` corpora of several languages, and ``clips`` a folder with clips of GRID. Without
@@ -87,7 +79,7 @@ def read_training_set(
             weights[recording.utterance_id] = fraction * recording.seconds / total_s
     if not recordings:
         raise errors.no_recording_error("in the corpora")
-    return TrainingSet(recordings, weights)
+    return recordings, weights
 
 
 def _group_of(recording: Utterance) -> str:

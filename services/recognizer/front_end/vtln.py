@@ -101,24 +101,21 @@ def _low_pass_taps() -> NDArray[np.float64]:
 _TAPS = _low_pass_taps()
 
 
-class NccfPitchTracker:
-    """Streaming pitch of every feature frame; any chunking gives the same frames.
-
-    Frame ``t`` is the same as in ``features.LogMel`` and ready at the same sample.
-    """
+class PitchedLogMel:
+    """Streaming log energy and log-mel bands with the pitch; any chunking gives the same frames."""
 
     def __init__(self) -> None:
+        self._log_mel = LogMel()
         # The zeros before the first sample make frame 0 end at its last sample.
         self._samples = np.zeros(_NUM_TAPS - _DECIMATION, dtype=np.float32)
         self._low = np.zeros(_SPAN_SAMPLES - _FRAME_SAMPLES)
 
-    def accept_waveform(
-        self, samples: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
         """Accept samples, shape (n,), 16 kHz, in [-1, 1].
 
-        Returns the pitch of the new feature frames, (frames,), 70 to 380 Hz or 0 if unvoiced, and
-        its strength, (frames,), 0 to 1, above ``VOICED_STRENGTH`` in voiced sounds.
+        Returns the new feature frames, shape (frames, 43): log energy, 40 log-mel bands, the pitch
+        (70 to 380 Hz, or 0 if unvoiced) and its strength, 0 to 1, above ``VOICED_STRENGTH`` in
+        voiced sounds.
         """
         self._samples = np.concatenate([self._samples, samples.astype(np.float32, copy=False)])
         low = np.empty(max(0, (len(self._samples) - _NUM_TAPS) // _DECIMATION + 1))
@@ -130,7 +127,7 @@ class NccfPitchTracker:
         strength = np.empty(num_ready, dtype=np.float32)
         _track(self._low, pitch_hz, strength)
         self._low = self._low[_HOP_SAMPLES * num_ready :]
-        return pitch_hz, strength
+        return np.column_stack([self._log_mel.accept_waveform(samples), pitch_hz, strength])
 
 
 class VocalTractNormalizer:
@@ -162,23 +159,6 @@ class VocalTractNormalizer:
     def reset(self) -> None:
         """Reset the speaker's statistics."""
         self._state = np.zeros(2)  # sum of ln(f_ref / pitch) over voiced frames; their number
-
-
-class PitchedLogMel:
-    """Streaming log energy and log-mel bands with the pitch; any chunking gives the same frames."""
-
-    def __init__(self) -> None:
-        self._log_mel = LogMel()
-        self._pitch = NccfPitchTracker()
-
-    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Accept samples, shape (n,), 16 kHz, in [-1, 1].
-
-        Returns the new feature frames, shape (frames, 43): log energy, 40 log-mel bands, the pitch
-        in Hz and its strength.
-        """
-        log_mel = self._log_mel.accept_waveform(samples)
-        return np.column_stack([log_mel, *self._pitch.accept_waveform(samples)])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -26,7 +26,6 @@ the sound.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,15 +68,6 @@ _BROWS = fap_slice("raise_l_i_eyebrow", "raise_r_o_eyebrow")
 _BROW_UNITS = np.array([*_BROW.values()], np.float32)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IdleMotionSettings:
-    """Settings of the idle motion. A field that is None changes nothing."""
-
-    still: bool | None = None  # whether the head and the brows hold still
-    eye_contact: bool | None = None  # whether the eyes stay on the viewer
-    listening: bool | None = None  # whether another person speaks
-
-
 class SpeechMotionModifier:
     """Idle motion with movements that accompany speech; seed and sound define the motion."""
 
@@ -93,15 +83,24 @@ class SpeechMotionModifier:
         self._tilt, self._turn = _Movement(_SLOW_S), _Movement(_SLOW_S)
         self._lift = TwoPoleFilter(0.0)
 
-    def set_idle_motion(self, change: IdleMotionSettings) -> None:
-        """Change the settings; fields that are None change nothing."""
-        if change.still is not None:
-            self._is_still = self._idle.is_still = change.still
-        if change.eye_contact is not None:
-            self._idle.has_eye_contact = change.eye_contact
-        if change.listening is not None:
-            self._has_heard_pause |= self._is_listening and not change.listening
-            self._is_listening = change.listening
+    def set_idle_motion(
+        self,
+        *,
+        still: bool | None = None,
+        eye_contact: bool | None = None,
+        listening: bool | None = None,
+    ) -> None:
+        """Set whether head and brows hold still, the eyes stay on the viewer, another speaks.
+
+        None changes nothing.
+        """
+        if still is not None:
+            self._is_still = self._idle.is_still = still
+        if eye_contact is not None:
+            self._idle.has_eye_contact = eye_contact
+        if listening is not None:
+            self._has_heard_pause |= self._is_listening and not listening
+            self._is_listening = listening
 
     def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Add the motion to a frame, FAPs (68,), in place."""
