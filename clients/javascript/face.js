@@ -238,14 +238,14 @@ export class KouxingFace extends HTMLElement {
     const shapes = this.set === "faps" ? "" : this.set;
     const gateway = this.getAttribute("gateway") ?? location.origin;
     let shown = { session: null };
-    let isFirst = true; // whether the first attempt to connect has no result yet
+    let numFailures = 1; // in a row; if the first attempt after a lost connection succeeds, nothing is reported
     const handlers = {
       connected: (isConnected) => {
         if (this.#viewer === null) return; // closed by this element
         const text = `cannot connect to the gateway at ${gateway}; start it with: kouxing run --set gateway.trusted_origins=${location.origin}`;
+        numFailures = isConnected ? 0 : numFailures + 1;
         if (isConnected) this.#note.textContent = "";
-        else if (isFirst) this.#showError(new Error(text), text);
-        isFirst = false;
+        else if (numFailures === 2) this.#showError(new Error(text), text);
       },
       frame: (mediaTime, faps) => shapes || this.#player.addFrame(mediaTime, faps),
       rest: (faps) => shapes || this.#setRest(faps, []),

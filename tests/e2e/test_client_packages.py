@@ -321,6 +321,22 @@ def test_the_web_component_reports_wrong_addresses(faces: Browser) -> None:
     faces.page_errors.clear()
 
 
+def test_the_web_component_reports_that_the_gateway_has_ended(faces: Browser) -> None:
+    faces.evaluate(
+        "own.failure = ''; window.RealSocket = WebSocket; window.sockets = [];"
+        "window.WebSocket = class { constructor() { sockets.push(this); } close() {} };"
+        "own.setAttribute('gateway', 'http://ended'); sockets[0].onopen(); sockets[0].onclose()"
+    )
+    faces.wait_for("sockets.length === 2")
+    assert faces.evaluate("own.failure") == ""
+    faces.evaluate("sockets[1].onclose()")
+    assert "cannot connect to the gateway at http://ended" in faces.evaluate("own.failure")
+    restore = "own.setAttribute('gateway', own.dataset.gateway)"
+    faces.evaluate(f"window.WebSocket = RealSocket; {restore}")
+    faces.wait_for("own.shadowRoot.querySelector('p').textContent === ''")
+    faces.page_errors.clear()
+
+
 def test_the_web_component_releases_its_webgl_context_when_it_is_removed(faces: Browser) -> None:
     context = "own.shadowRoot.querySelector('canvas').getContext('webgl2')"
     faces.evaluate(
