@@ -242,7 +242,8 @@ export class KouxingFace extends HTMLElement {
     const handlers = {
       connected: (isConnected) => {
         if (this.#viewer === null) return; // closed by this element
-        const text = `cannot connect to the gateway at ${gateway}; start it with: kouxing run --set gateway.trusted_origins=${location.origin}`;
+        const other = this.hasAttribute("gateway") ? "" : "set the attribute gateway to its address, or ";
+        const text = `cannot connect to the gateway at ${gateway}; ${other}start it with: kouxing run --set gateway.trusted_origins=${location.origin}`;
         numFailures = isConnected ? 0 : numFailures + 1;
         if (isConnected) this.#note.textContent = "";
         else if (numFailures === 2) this.#showError(new Error(text), text);

@@ -316,6 +316,8 @@ def test_the_web_component_reports_wrong_addresses(faces: Browser) -> None:
         faces.evaluate(f"own.failure = ''; own.setAttribute('gateway', '{address}')")
         faces.wait_for(f"own.failure.includes('{text}')")
         assert text in faces.evaluate("own.shadowRoot.querySelector('p').textContent")
+    faces.evaluate("own.removeAttribute('gateway')")
+    faces.wait_for("own.failure.includes('set the attribute gateway to its address')")
     faces.evaluate("own.setAttribute('gateway', own.dataset.gateway)")
     faces.wait_for("own.shadowRoot.querySelector('p').textContent === ''")
     faces.page_errors.clear()

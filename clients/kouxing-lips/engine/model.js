@@ -34,7 +34,7 @@ export async function loadModel(base, { phones = false } = {}) {
   const [encoder, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, folder))));
   const model = parseHeader(header, folder);
   if (model.format !== FORMAT) {
-    throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; export them again`);
+    throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; run kouxing export web again`);
   }
   const phoneArrays = phones ? unpack(phonesBlob, model.phoneArrays) : null;
   return {
