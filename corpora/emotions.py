@@ -55,12 +55,16 @@ def read_emotions(folder: Path, *, any_license: bool = True) -> list[EmotionReco
             if not (any_license or may_distribute(row["license"])):
                 continue
             match = _EMOTION.search(row["note"])
+            if match and match[1] not in FEELINGS:
+                raise UserError(
+                    f"{manifest}: the emotion {match[1]!r} is unknown; use {', '.join(FEELINGS)}"
+                )
             recording = EmotionRecording(
                 folder / row["path"],
                 row["speaker"],
                 row["license"],
                 float(row["seconds"]) / 60,
-                match[1] if match and match[1] in FEELINGS else None,
+                match[1] if match else None,
                 _stressed(folder / row["phones_path"]) if row.get("phones_path") else (),
             )
             recordings.append(recording)
@@ -72,11 +76,14 @@ def read_emotions(folder: Path, *, any_license: bool = True) -> list[EmotionReco
 
 
 def _stressed(path: Path) -> tuple[float, ...]:
-    return tuple(
-        float(row["start_s"])
-        for row in read_rows(path, ("start_s", "marks"))
-        if _STRESS_MARKS & set(row["marks"].split(","))
-    )
+    try:
+        return tuple(
+            float(row["start_s"])
+            for row in read_rows(path, ("start_s", "marks"))
+            if _STRESS_MARKS & set(row["marks"].split(","))
+        )
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; write the times as numbers") from error
 
 
 def speakers_of(recordings: Sequence[EmotionRecording]) -> list[str]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.feature_cache import read_audio
-from kouxing.corpora.speech_corpus import may_distribute
+from kouxing.corpora.speech_corpus import may_distribute, may_share
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import select_lip_faps
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -162,8 +162,8 @@ def training_clips(clips: Iterable[LipClip], *, any_license: bool = False) -> li
 def no_clip_error(folder: Path) -> UserError:
     """Make the error that a model cannot be trained on any clip of a folder."""
     return UserError(
-        f"no clip in {folder} may be used; use clips with a free license, or kouxing train"
-        " --any-license"
+        f"no clip in {folder} has a license that allows training; add clips with a free license,"
+        " or use kouxing train --any-license"
     )
 
 
@@ -297,18 +297,16 @@ def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
     return aligned_phones(model, clip) or recognize_recording(model, clip.samples)
 
 
-def write_clip_archive(folder: Path, archive: Path) -> int:
-    """Write the clips of a folder that may be shared to a ZIP file, and return their number.
+def write_clip_archive(folder: Path, archive: Path) -> tuple[int, set[str]]:
+    """Write the clips of a folder that may be shared to a ZIP file.
+
+    Returns their number, and the licenses of all other clips.
 
     ``held.txt`` names all held-out clips. ``clips.tsv`` lists split, language, speaker and license
     of each clip. Raises ``UserError`` if no clip may be shared, or the file cannot be written.
     """
-    clips = [
-        clip
-        for clip in read_clips(folder, language=None)
-        # a model may use footage by third parties, but nobody may share it
-        if may_distribute(clip.license) and "third part" not in clip.license
-    ]
+    all_clips = read_clips(folder, language=None)
+    clips = [clip for clip in all_clips if may_share(clip.license)]
     if not clips:
         raise UserError(f"{folder}: no clip has a license that allows sharing, such as CC BY")
     rows = [(c.name, c.split, c.language, c.speaker, c.license.replace("\t", " ")) for c in clips]
@@ -325,4 +323,4 @@ def write_clip_archive(folder: Path, archive: Path) -> int:
     except OSError as error:
         unfinished.unlink(missing_ok=True)
         raise write_error(archive, error) from None
-    return len(clips)
+    return len(clips), {clip.license or "none" for clip in all_clips if clip not in clips}

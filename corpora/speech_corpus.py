@@ -46,10 +46,13 @@ LANGUAGES = Path(__file__).with_name("languages.tsv")  # held-out recordings in 
 _FREE_LICENSE = re.compile(
     r"apache|\bmit\b|cc0|cc[ -]by(?!-nc|-nd)(?!-sa-nc)|unlicense|public domain|synthetic", re.I
 )
-# Exceptions in a license, and footage by third parties, exclude it.
+# Restrictions in a license, and footage from films, exclude it.
 _CLOSED_LICENSE = re.compile(
-    r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube", re.I
+    r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube"
+    r"|\bnot\b|-style|research only|academic",
+    re.I,
 )
+_THIRD_PARTY = re.compile(r"\b(third|3rd)[ -]part", re.I)
 _MIN_PHONE_S = 0.03
 _MAX_WORD_PHONES = 8  # a recording with more phones is connected speech
 _MAX_LIST_BYTES = 256 << 20
@@ -136,6 +139,14 @@ def may_distribute(license_name: str) -> bool:
     return bool(_FREE_LICENSE.search(license_name)) and not _CLOSED_LICENSE.search(license_name)
 
 
+def may_share(license_name: str) -> bool:
+    """Return whether the data itself may be shared.
+
+    A model may be trained on footage by third parties, but the footage may not be shared.
+    """
+    return may_distribute(license_name) and not _THIRD_PARTY.search(license_name)
+
+
 def read_corpus(
     folder: Path,
     errors: RowErrors,
@@ -203,6 +214,8 @@ def _utterance(row: dict[str, str], inventory: PhoneInventory, *, any_license: b
             f"its license ({license_name or 'none'}) does not allow distributing a model;"
             " 'kouxing train --any-license' uses it"
         )
+    if row["path"].endswith("|"):  # in Kaldi's wav.scp
+        raise UserError("commands are not supported; write the path of an audio file")
     if not path.is_file():
         raise UserError(f"no audio file {path}")
     if inventory.language == UNIVERSAL:
@@ -285,6 +298,5 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 def _read_pairs(path: Path) -> Iterator[tuple[str, str]]:
     for line in split_lines(path, read_text(path, _MAX_LIST_BYTES)):
-        key, _, value = line.strip().partition(" ")
-        if key:
-            yield key, value.strip()
+        if fields := line.split(maxsplit=1):  # at spaces or tabs
+            yield fields[0], "".join(fields[1:]).strip()

@@ -64,7 +64,7 @@ def universal_words(row: dict[str, str]) -> list[Syllable]:
         return [(phone,) for phone in _english_phones(row["arpabet"].split())]
     language = "zh" if row.get("pinyin") else row.get("language", "")
     if language == "yue":
-        return [_cantonese_phones(row["text"])]
+        return [_cantonese_phones(syllable) for syllable in row["text"].split()]
     inventory = _inventories_by_code().get(language)
     if inventory is None:
         raise UserError(

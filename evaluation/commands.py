@@ -268,8 +268,10 @@ def pack_clips(
     from kouxing.corpora.lip_clips import write_clip_archive
 
     check_output(archive, force=force)
-    num_clips = write_clip_archive(clips, archive)
+    num_clips, closed_licenses = write_clip_archive(clips, archive)
     print_message(f"wrote {plural(num_clips, 'clip')} to {archive}")
+    if closed_licenses:
+        print_message(f"left out clips with these licenses: {'; '.join(sorted(closed_licenses))}")
 
 
 @app.command(rich_help_panel=_LIPS)

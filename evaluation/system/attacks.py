@@ -30,7 +30,6 @@ from kouxing.evaluation.system.wait import wait_until
 from kouxing.evaluation.tables import percentiles
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
-from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.client_connection import connect_client
@@ -139,8 +138,8 @@ def _result(
 
 def _delays_ms(control: str, speech: NDArray[np.float32]) -> dict[str, float | None]:
     """Stream a session through all phases; return the 95th percentile of its delays by phase."""
-    with connect_client(control) as client:
-        times_s, delays_s, _ = stream(client, speech, SynthesizerConfig().delay_ms / 1e3)
+    with connect_client(control) as client, client.open_session(encoding="f32le") as session:
+        times_s, delays_s, _ = stream(session, speech)
     phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
     phase = np.digitize(times_s, phase_ends_s)
     delays_ms = [delays_s[phase == number] * 1e3 for number in range(len(PHASES))]

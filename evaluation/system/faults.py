@@ -29,7 +29,6 @@ from kouxing.evaluation.system.live import ReceivedResults, speak, speak_undistu
 from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.client_connection import connect_client
@@ -256,7 +255,6 @@ def _measure_fault(
 ) -> FaultOutcome:
     fault = FAULTS[name]
     sound = np.resize(sentence, round(timing.length_s * MEDIA_RATE_HZ))
-    delay_s = SynthesizerConfig().delay_ms / 1e3
     with (
         _start_system(fault, folder, timing, console) as system,
         system.on_client(),
@@ -265,6 +263,7 @@ def _measure_fault(
         if not undisturbed:
             undisturbed.append(speak_undisturbed(client, sound))
         sessions, num_refused = _open_all(client, fault.num_sessions)
+        delay_s = sessions[0].info["facts"]["delay_ms"] / 1e3
         actions = fault.actions(system, sessions[0].name, timing)
         start_s = time.monotonic()
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from kouxing_client import Client
+from kouxing_client import Client, Session
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -25,7 +25,6 @@ from kouxing.evaluation.system.live import CHUNK_S, speak
 from kouxing.evaluation.system.systems import run_all_services
 from kouxing.evaluation.tables import percentiles
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.command.client_connection import connect_client
@@ -51,10 +50,12 @@ def measure(path: Path, console: Console, language: str | None = None) -> Latenc
     ``language`` is the language of the speech. If None, it is the recognizer's.
     """
     sound = to_16_khz(*read_audio(path))
-    delay_s = SynthesizerConfig().delay_ms / 1e3
     with run_all_services(console) as system, connect_client(system.control) as client:
         before = _cpu_s(client)
-        delays = [stream(client, sound, delay_s, language)[1:] for _ in range(NUM_REPEATS)]
+        delays = []
+        for _ in range(NUM_REPEATS):
+            with client.open_session(encoding="f32le", language=language) as session:
+                delays.append(stream(session, sound)[1:])
         time.sleep(1.0)  # for the last heartbeats
         after = _cpu_s(client)
     audio_s = NUM_REPEATS * len(sound) / MEDIA_RATE_HZ
@@ -64,22 +65,22 @@ def measure(path: Path, console: Console, language: str | None = None) -> Latenc
     return Latency(
         chunk_to_frame_ms=percentiles(to_frame_ms),
         sound_to_frame_ms=percentiles(from_sound_ms),
-        delay_ms=delay_s * 1e3,
+        delay_ms=session.info["facts"]["delay_ms"],
         num_frames=len(to_frame_ms),
         cpu_s_per_audio_s={name: (after[name] - before[name]) / audio_s for name in after},
     )
 
 
 def stream(
-    client: Client, sound: NDArray[np.float32], delay_s: float, language: str | None = None
+    session: Session, sound: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Stream in real time; return media time and both latencies of every frame, seconds.
 
-    Frames after the last sample are omitted. Raises ``UserError`` if the session does not complete.
+    The session takes 32-bit floats. Frames after the last sample are omitted. Raises ``UserError``
+    if the session does not complete.
     """
-    session = client.open_session(encoding="f32le", language=language)
+    delay_s = session.info["facts"]["delay_ms"] / 1e3
     (received,) = speak([session], sound)
-    session.close()
     if received.error or not received.ended:
         reason = received.error or "the last frame did not arrive"
         raise UserError(f"{reason}; close other programs and try again")

@@ -111,11 +111,14 @@ def _text_at(content: bytes, start: int) -> tuple[str, int]:
 
 
 def bundle_messages(messages: Iterable[bytes]) -> Iterator[bytes]:
-    """Yield bundles with all messages in order, each as large as a datagram allows."""
+    """Yield bundles with all messages in order, each as large as a datagram allows.
+
+    A message that is larger than a datagram is alone in a bundle.
+    """
     bundle = _HEADER
     for content in messages:
         element = struct.pack(">i", len(content)) + content
-        if len(bundle) + len(element) > MAX_BYTES:
+        if bundle != _HEADER and len(bundle) + len(element) > MAX_BYTES:
             yield bundle
             bundle = _HEADER
         bundle += element

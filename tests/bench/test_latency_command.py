@@ -21,6 +21,7 @@ def test_the_command_prints_and_writes_the_same_figures(
     monkeypatch.setattr("kouxing.evaluation.system.page.SIZE_PX", (320, 240))
     monkeypatch.setattr("kouxing.evaluation.system.page.SETTLE_S", 0.5)
     monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 1.0)
+    monkeypatch.setenv("KOUXING_SYNTHESIZER_DELAY_MS", "100")  # also for the started services
     figures = tmp_path / "latency.json"
     arguments = [str(speech), "--json", str(figures)]
     result = CliRunner().invoke(app, arguments)
@@ -28,7 +29,7 @@ def test_the_command_prints_and_writes_the_same_figures(
     latency = json.loads(figures.read_text(encoding="utf-8"))
     assert latency["num_frames"] > 0
     assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
-    assert latency["delay_ms"] == 60.0
+    assert latency["delay_ms"] == 100.0
     assert latency["sound_to_frame_ms"]["p50"] > 0
     assert set(latency["cpu_s_per_audio_s"]) >= {"recognizer", "synthesizer"}
     assert list(latency["sessions"]) == [

@@ -62,8 +62,10 @@ test("every text that the page uses exists in both languages, and every text is 
   }
   const files = readdirSync(PAGE).filter((name) => /\.(js|html)$/.test(name) && name !== "texts.js");
   const source = files.map((name) => readFileSync(new URL(name, PAGE), "utf8")).join("\n");
-  for (const [, key] of source.matchAll(/(?:\bsay\("|data-(?:text|title|label)=")([\w-]+)"/g)) {
-    assert.ok(key in TEXTS, key);
+  for (const start of ['\\btranslate\\("', 'data-(?:text|title|label)="']) {
+    const keys = [...source.matchAll(new RegExp(`${start}([\\w-]+)"`, "g"))].map(([, key]) => key);
+    assert.ok(keys.length > 20, start);
+    for (const key of keys) assert.ok(key in TEXTS, key);
   }
   for (const key of Object.keys(TEXTS)) {
     assert.ok(key.includes(".") || source.includes(`"${key}"`), `${key} is not used`);

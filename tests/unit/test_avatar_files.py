@@ -211,13 +211,20 @@ def test_limits_the_size_of_a_draco_mesh_before_it_is_decoded(
         read_glb(path)
 
 
+@pytest.mark.parametrize(
+    ("size", "problem"),
+    [
+        ((700_000, 2_100_000), "a mesh has 700000 triangles; reduce it to 666666"),
+        ((12, 3_000_000), "a mesh has 3000000 points; reduce it to 2000000"),
+    ],
+)
 def test_limits_the_points_of_a_draco_mesh_because_its_attributes_are_unknown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], problem: str
 ) -> None:
     path = edit(write_glb(tmp_path / "my.glb", meshes({"jawOpen": SHAPES["jawOpen"]})), draco)
-    monkeypatch.setattr(glb_file, "read_mesh_size", lambda _: (700_000, 2_100_000))
+    monkeypatch.setattr(glb_file, "read_mesh_size", lambda _: size)
     monkeypatch.setattr(DracoPy, "decode", lambda _: pytest.fail("the mesh was decoded"))
-    with pytest.raises(UserError, match="a mesh has 700000 triangles; reduce it to 666666"):
+    with pytest.raises(UserError, match=problem):
         read_glb(path)
 
 

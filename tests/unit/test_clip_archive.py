@@ -1,6 +1,7 @@
 """The archive of clips contains only those whose licenses allow sharing, with their parts."""
 
 import json
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -16,13 +17,19 @@ def test_packs_the_clips_that_may_be_shared(tmp_path: Path) -> None:
     folder.mkdir()
     write_held_out_clip(folder)
     about = folder / "cam_1.json"
-    for name in ("MIT; footage by third parties", "CC BY-NC 4.0"):
+    for name in (
+        "MIT; footage by third parties", "CC BY 4.0 (3rd-party clips)", "CC BY-NC 4.0", "not CC0",
+        "CC BY 4.0 (footage by Third Parties)",
+    ):  # fmt: skip
         about.write_text(json.dumps({"language": "zh", "license": name}))
         with pytest.raises(UserError, match="no clip has a license that allows sharing"):
             write_clip_archive(folder, archive)
     assert not archive.exists()
     about.write_text(json.dumps({"speaker": "ann", "language": "zh", "license": "CC BY 4.0"}))
-    assert write_clip_archive(folder, archive) == 1
+    for path in folder.glob("cam_1.*"):
+        shutil.copy(path, path.with_name("cam_2" + path.suffix))
+    (folder / "cam_2.json").write_text(json.dumps({"license": "CC BY-NC 4.0"}))
+    assert write_clip_archive(folder, archive) == (1, {"CC BY-NC 4.0"})
     with zipfile.ZipFile(archive) as file:
         file.extractall(tmp_path / "copy")
     (copy,) = read_clips(tmp_path / "copy")

@@ -59,10 +59,13 @@ def test_reads_emotions_and_rejects_a_folder_without(folder: Path) -> None:
     calm, loud, other = read_emotions(folder, any_license=False)
     assert (calm.emotion, loud.emotion, other.emotion) == ("boredom", "anger", None)
     assert calm.stressed_s == (0.5, 1.5)
+    (folder / "bad.tsv").write_text("start_s\tmarks\n0,5\t1\n")
     for columns, row, problem in (
         (COLUMNS, "calm.wav\tann\tCC0\t2.5\tcalm\t", "names no emotion"),
         ("path speaker", "calm.wav\tann", "lacks the columns license, seconds, note; it has "),
         (COLUMNS, "calm.wav\tann\tCC0\tlong\temotion fear\t", "write the seconds as a number"),
+        (COLUMNS, "calm.wav\tann\tCC0\t2.5\temotion joy\t", "'joy' is unknown; use anger"),
+        (COLUMNS, "calm.wav\tann\tCC0\t2.5\temotion fear\tbad.tsv", "bad.tsv: could not convert"),
     ):
         write_manifest(folder, columns, [row])
         with pytest.raises(UserError, match=problem):

@@ -64,6 +64,16 @@ def test_a_tracker_without_shapes_does_not_replace_the_session() -> None:
     assert not has_mouth
 
 
+def test_a_message_larger_than_a_datagram_is_alone_in_a_bundle() -> None:
+    large = encode_message("/long", "x" * 2000)
+    small = encode_message("/VMC/Ext/OK", 1)
+    messages = [[*read_osc([bundle])] for bundle in bundle_messages([large, small])]
+    assert [[address for address, _ in bundle] for bundle in messages] == [
+        ["/long"],
+        ["/VMC/Ext/OK"],
+    ]
+
+
 def test_live_link_keeps_everything_but_the_mouth() -> None:
     tracked = frame_of(jawOpen=0.1, eyeBlinkLeft=0.4, mouthSmileLeft=0.8)
     tracked.faps[48] = 0.2e5  # the head's yaw

@@ -40,7 +40,7 @@ def write_corpus(folder: Path, rows: list[str], num_audio: int = 3) -> None:
 def test_reads_a_kaldi_folder(tmp_path: Path) -> None:
     write_corpus(tmp_path, [])
     (tmp_path / "manifest.tsv").unlink()
-    (tmp_path / "wav.scp").write_text(f"u1 0.wav\nu2 {tmp_path}/1.wav\n")
+    (tmp_path / "wav.scp").write_text(f"u1\t0.wav\nu2 {tmp_path}/1.wav\n")
     (tmp_path / "text").write_text("u1 你好\nu2 你 好 吗\n", encoding="utf-8")
     (tmp_path / "utt2spk").write_text("u1 anna\nu2 bob\n")
     rows = read_corpus(tmp_path, RowErrors(), MANDARIN)
@@ -55,7 +55,7 @@ def test_reads_a_kaldi_folder(tmp_path: Path) -> None:
     held_out = tmp_path.rename(tmp_path.with_name("test"))
     rows = read_corpus(held_out, errors, MANDARIN, split="test")
     assert [u.utterance_id for u in rows] == ["u1"]
-    assert "line 2 (u2): no audio file" in errors.messages[0]
+    assert "line 2 (u2): commands are not supported" in errors.messages[0]
     assert "line 3 (u3): no text" in errors.messages[1]
     errors = RowErrors()
     assert read_corpus(held_out, errors, MANDARIN, split="train") == []
@@ -102,6 +102,7 @@ def test_licenses_that_allow_distribution() -> None:
     for closed in (
         "CC-BY-NC-ND-4.0", "CC BY-NC 4.0", "CC BY-SA-NC", "Apache-2.0 with exceptions", "",
         "MIT (repo); film clip", "MIT (repo sample); YouTube footage", "all rights reserved",
+        "not CC0", "MIT-style, research only",
     ):  # fmt: skip
         assert not may_distribute(closed), closed
 

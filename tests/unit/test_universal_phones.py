@@ -105,6 +105,7 @@ def test_reads_phones_from_ipa_arpabet_and_pinyin_columns() -> None:
 )
 def test_cantonese_syllables(syllable: str, phones: str) -> None:
     assert words_of(text=syllable, language="yue") == [phones]
+    assert words_of(text=f"{syllable} nei5", language="yue") == [phones, "n e ih"]
 
 
 def test_labels_of_a_stop_are_one_phone(tmp_path: Path) -> None:

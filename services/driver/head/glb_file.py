@@ -170,8 +170,10 @@ class GlbFile:
             compressed = primitive["extensions"][_DRACO]
             data = self.view(compressed["bufferView"])
             num_faces, num_points = read_mesh_size(data)
-            if max(3 * num_faces, num_points) > MAX_COUNT:
+            if 3 * num_faces > MAX_COUNT:
                 raise UserError(f"a mesh has {num_faces} triangles; reduce it to {MAX_COUNT // 3}")
+            if num_points > MAX_COUNT:
+                raise UserError(f"a mesh has {num_points} points; reduce it to {MAX_COUNT}")
             indices = primitive["attributes"].values()
             kinds = [self.item("accessors", index)["type"] for index in indices]
             num_values = 3 * num_faces + num_points * sum(_NUM_COMPONENTS[kind] for kind in kinds)
