@@ -81,12 +81,16 @@ function connect() {
   const socket = new WebSocket(url);
   socket.binaryType = "arraybuffer";
   let names = [];
+  let problem = `cannot connect to the gateway; run: kouxing run --set gateway.trusted_origins=${location.origin}`;
+  socket.onopen = () => {
+    problem = "the connection to the gateway is lost; connecting again";
+  };
   socket.onmessage = ({ data }) => {
     if (typeof data === "string") {
       const message = JSON.parse(data);
       if (message.type === "shapes") names = message.names;
       if (message.type === "session") note.textContent = message.session ?? "no session; start one in the gateway's page";
-      if (message.type === "error") note.textContent = message.text;
+      if (message.type === "error") note.textContent = problem = message.text;
       return;
     }
     const type = new DataView(data).getUint8(0);
@@ -94,7 +98,7 @@ function connect() {
     if (WEIGHTS.includes(type)) show(names, new Float32Array(data, HEADER_BYTES));
   };
   socket.onclose = () => {
-    note.textContent = "cannot connect to the gateway; run: kouxing run --set gateway.trusted_origins=" + location.origin;
+    note.textContent = problem;
     setTimeout(connect, RETRY_MS);
   };
 }

@@ -59,8 +59,8 @@ public sealed class KouxingStream : IDisposable
                     await ReceiveAsync(socket);
                 }
             }
-            catch (WebSocketException) { } // the gateway is not running
-            catch (OperationCanceledException) { return; }
+            catch (OperationCanceledException) when (_stop.IsCancellationRequested) { return; }
+            catch (Exception) { } // the gateway is not running, or a message is damaged: connect again
             await Task.Delay(RetryMs);
         }
     }
@@ -96,7 +96,7 @@ public sealed class KouxingStream : IDisposable
 
     void ReadBinary(byte[] message)
     {
-        if (message[0] != WeightsOfFrame && message[0] != WeightsAtRest) return;
+        if (message.Length < HeaderBytes || message[0] != WeightsOfFrame && message[0] != WeightsAtRest) return;
         var weights = new float[(message.Length - HeaderBytes) / sizeof(float)];
         Buffer.BlockCopy(message, HeaderBytes, weights, 0, weights.Length * sizeof(float));
         Weights = weights;

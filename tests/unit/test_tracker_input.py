@@ -65,13 +65,8 @@ def test_a_tracker_without_shapes_does_not_replace_the_session() -> None:
 
 
 def test_a_message_larger_than_a_datagram_is_alone_in_a_bundle() -> None:
-    large = encode_message("/long", "x" * 2000)
-    small = encode_message("/VMC/Ext/OK", 1)
-    messages = [[*read_osc([bundle])] for bundle in bundle_messages([large, small])]
-    assert [[address for address, _ in bundle] for bundle in messages] == [
-        ["/long"],
-        ["/VMC/Ext/OK"],
-    ]
+    large, small = encode_message("/long", "x" * 2000), encode_message("/short", 1)
+    assert [b"/long" in bundle for bundle in bundle_messages([large, small])] == [True, False]
 
 
 def test_live_link_keeps_everything_but_the_mouth() -> None:
