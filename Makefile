@@ -25,7 +25,7 @@ PAGE_MODULES := three/LICENSE three/build/three.core.js three/build/three.module
 	three/examples/jsm/utils/BufferGeometryUtils.js three/examples/jsm/utils/SkeletonUtils.js \
 	@mediapipe/face_mesh
 MOS := evaluation/mos/page
-CLIENT := proto/node
+NODE_EXAMPLE := examples/node
 JAVASCRIPT := clients/javascript
 LIPS := clients/kouxing-lips
 LIPS_MODELS := $(LIPS)/models/model.json
@@ -77,7 +77,7 @@ wheel: .venv/installed $(PAGE)/node_modules/.package-lock.json
 	ls -l dist
 
 test: .venv/installed-dev setup $(COMPILED) $(LIPS_MODELS) \
-		$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR))
+		$(patsubst %,%/node_modules/.package-lock.json,$(NODE_EXAMPLE) $(JAVASCRIPT) $(LIPS) $(AVATAR))
 	$(STAGES) $(TEST_STAGES)
 
 test-python:
@@ -168,7 +168,7 @@ lock: .venv/installed-dev
 	printf '%s\n' $(RIVAL_PACKAGES) | $(COMPILE) --output-file $(RIVALS)/requirements.lock -
 
 clean:
-	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(CLIENT)/node_modules \
+	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(NODE_EXAMPLE)/node_modules \
 		$(JAVASCRIPT)/node_modules $(LIPS)/node_modules $(LIPS)/models $(AVATAR)/node_modules \
 		$(RIVALS)/node_modules $(RIVALS)/.venv \
 		$(PAGE)/head*.glb build dist out
@@ -194,7 +194,7 @@ $(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
 	$(NPM) $(PAGE) ci
 	touch $@ $(PAGE)/node_modules/.package-lock.json
 
-$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(LIPS) $(AVATAR) $(RIVALS)): \
+$(patsubst %,%/node_modules/.package-lock.json,$(NODE_EXAMPLE) $(JAVASCRIPT) $(LIPS) $(AVATAR) $(RIVALS)): \
 		%/node_modules/.package-lock.json: %/package-lock.json | .venv/installed
 	$(NPM) $* ci
 	touch $@

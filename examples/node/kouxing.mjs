@@ -1,5 +1,5 @@
 // Connections and messages of kouxing's protocol, for follow.mjs and stream.mjs.
-// Needs Node 18 or newer, and: npm install zeromq @msgpack/msgpack
+// Needs Node 18 or newer, and the packages that npm ci installs from package.json.
 
 import { randomBytes } from "node:crypto";
 import { readFile } from "node:fs/promises";
