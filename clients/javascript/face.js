@@ -134,7 +134,7 @@ export class KouxingFace extends HTMLElement {
    *
    * @param audio HTMLAudioElement that plays the sound; null for silence
    * @returns a promise that is resolved at the end, or when another recording starts. If the face is removed or gets
-   *   another model while the recording is loaded, it is rejected with an AbortError, which the caller can ignore.
+   *   another model before the recording starts, it is rejected with an AbortError, which the caller can ignore.
    */
   async play(audio = null) {
     const url = this.getAttribute("recording");
@@ -144,16 +144,22 @@ export class KouxingFace extends HTMLElement {
     const bytes = await fetchFile(url).catch(({ message }) => {
       throw new Error(`${url}: ${message}`);
     });
-    if (this.#avatar !== avatar) throw new DOMException("the face was removed, or its model changed", "AbortError");
+    this.#checkAvatar(avatar);
     const { names, frames } = readRecording(bytes);
     const set = names === null ? "faps" : chooseSet(names);
     if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);
     await audio?.play();
+    if (this.#avatar !== avatar) audio?.pause();
+    this.#checkAvatar(avatar);
     await new Promise((onEnded) => {
       this.#recording?.onEnded();
       const nowS = recordingClock(audio);
       this.#recording = { names, frames, nowS, onEnded };
     });
+  }
+
+  #checkAvatar(avatar) {
+    if (this.#avatar !== avatar) throw new DOMException("the face was removed, or its model changed", "AbortError");
   }
 
   /** The local lip sync: a promise of a LipSync of kouxing-lips. Its sources move the model. */

@@ -282,6 +282,13 @@ def test_the_web_component_plays_no_recording_after_it_was_removed(
     )
     assert result == "AbortError"
     faces.wait_for("arkit.set === 'arkit'")
+    result = faces.evaluate(
+        "window.audio = { play() { const face = arkit, { parentElement, nextSibling } = face;"
+        " face.remove(); parentElement.insertBefore(face, nextSibling); }, pause() { audio.isPaused = true; } };"
+        "arkit.play(audio).catch(({ name }) => `${name} ${audio.isPaused}`)"
+    )
+    assert result == "AbortError true"
+    faces.wait_for("arkit.set === 'arkit'")
 
 
 def test_a_web_component_outside_the_page_starts_no_lip_sync(faces: Browser) -> None:
