@@ -17,24 +17,31 @@ R = TypeVar("R")
 _function: Callable[[Any], Any]  # the function that a worker process runs
 
 
+def num_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def process_in_order(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Yield the function's result for each item, in order.
 
     Processes are forked when the iteration starts, so the function may use large data in memory.
     They are killed if the iteration ends early, for example by Ctrl-C.
     """
-    num_cores = len(os.sched_getaffinity(0))
-    if num_cores < _MIN_CORES:
+    num_processes = num_cores()
+    if num_processes < _MIN_CORES:
         yield from map(function, items)
         return
     results: deque[Future[R]] = deque()
     others = multiprocessing.active_children()
     context = multiprocessing.get_context("fork")
-    pool = ProcessPoolExecutor(num_cores, context, _start_worker, (function,))
+    pool = ProcessPoolExecutor(num_processes, context, _start_worker, (function,))
     try:
         for item in items:
             results.append(pool.submit(_process, item))
-            if len(results) > _AHEAD_PER_CORE * num_cores:
+            if len(results) > _AHEAD_PER_CORE * num_processes:
                 yield results.popleft().result()
         while results:
             yield results.popleft().result()

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.corpora.figures import new_figure
+from kouxing.corpora.parallel import num_cores
 from kouxing.evaluation.system.live import CHUNK, CHUNK_S
 from kouxing.evaluation.system.systems import run_all_services
 from kouxing.evaluation.system.wait import wait_until
@@ -111,8 +112,7 @@ def measure(
         for num in step_sizes(num_sessions):
             steps.append(_step(system.control, speech, num, step_s, delay_s, language))
             time.sleep(PAUSE_S)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return Load(steps, cores or 1, machine_load, delay_s * 1e3)
+    return Load(steps, num_cores(), machine_load, delay_s * 1e3)
 
 
 def step_sizes(maximum: int) -> list[int]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kouxing.corpora import parallel
-from kouxing.corpora.parallel import process_in_order
+from kouxing.corpora.parallel import num_cores, process_in_order
 from tests.system import LIMIT_S, start_python
 
 # Ctrl-C reaches all processes, or only the first, while one of them works on an endless item.
@@ -32,16 +32,21 @@ main.main()
 """
 
 
-@pytest.mark.parametrize("num_cores", [1, 4])
+@pytest.mark.parametrize("num_available", [1, 4])
 def test_results_have_the_order_of_the_items(
-    monkeypatch: pytest.MonkeyPatch, num_cores: int
+    monkeypatch: pytest.MonkeyPatch, num_available: int
 ) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: range(num_cores))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: range(num_available))
     table = np.arange(1000)  # the processes share it
     results = process_in_order(lambda item: (int(table[item]), os.getpid()), range(200))
     numbers, processes = zip(*results, strict=True)
     assert numbers == tuple(range(200))
-    assert (set(processes) == {os.getpid()}) == (num_cores == 1)
+    assert (set(processes) == {os.getpid()}) == (num_available == 1)
+
+
+def test_a_system_without_affinity_uses_all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert num_cores() == os.cpu_count()
 
 
 def test_an_error_reaches_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
