@@ -114,6 +114,16 @@ async def test_answers_with_the_error_of_the_learner(program: str, text: str) ->
 
 
 @async_test
+async def test_learning_that_takes_too_long_can_be_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(upload_handlers, "LEARNING_TIMEOUT_S", 0.0)
+    async with serve(fake_learner(HANG)) as post:
+        text = "learning took longer than 0 s; try again later"
+        assert await post(str(tmp_path / "process").encode()) == error(503, text)
+
+
+@async_test
 async def test_a_recording_that_is_too_large_is_rejected() -> None:
     async with serve(fake_learner(REVERSE)) as post:
         assert await post(bytes(MAX_RECORDING_BYTES + 1)) == error(
@@ -135,7 +145,7 @@ async def test_learns_one_mouth_at_a_time_with_low_priority_and_stops_on_close(
         assert hanging.is_running
         assert await post() == error(503, LearnMouthHandler.busy_text)
         hanging.close()
-        assert await first == error(422, "the gateway is stopping")
+        assert await first == error(503, "the gateway is stopping")
         await wait_until_ended(process)
         assert not hanging.is_running
         assert await post() == error(503, "the gateway is stopping")
@@ -160,7 +170,7 @@ async def test_does_not_learn_from_a_recording_that_arrives_after_close(
         hanging.close()
 
     async with serve(hanging) as post:
-        assert await post(record()) == error(422, "the gateway is stopping")
+        assert await post(record()) == error(503, "the gateway is stopping")
         assert not hanging.is_running
 
 

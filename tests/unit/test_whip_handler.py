@@ -12,6 +12,7 @@ from kouxing_client import KouxingError, Refused
 from kouxing.services.gateway.audio.audio_sessions import AudioClient
 from kouxing.services.gateway.audio.sample_sentence import SampleSentence
 from kouxing.services.gateway.viewers.viewer_handler import ViewerHandler
+from kouxing.services.gateway.web.limits import BURST_S
 from kouxing.services.gateway.web.web_application import OpenWebSockets
 from kouxing.services.gateway.webrtc.whip_handler import MAX_COMMANDS, WhipHandler, _Client
 from kouxing.shared.monitoring.metrics import Metrics
@@ -28,7 +29,7 @@ class FakeSession:
     is_closed = False
 
     def __init__(self, error: KouxingError | None = None) -> None:
-        self.num_flushes = 0
+        self.num_flushes = self.num_packets = 0
         self._error = error
 
     def skip(self, num_frames: int) -> None:
@@ -37,6 +38,10 @@ class FakeSession:
     def send(self, pcm: bytes, num_frames: int) -> None:
         if self._error is not None:
             raise self._error
+        self.num_packets += 1
+
+    def take_errors(self) -> list[KouxingError]:
+        return []
 
     async def flush(self) -> None:
         self.num_flushes += 1
@@ -62,10 +67,16 @@ class FakeChannel:
 
 
 class FakePeer:
-    """A connection that ends after one packet."""
+    """A connection that ends after a number of packets of 1 s."""
+
+    rate_hz = 16_000
+
+    def __init__(self, num_packets: int = 1) -> None:
+        self._num_packets = num_packets
 
     async def receive_audio(self) -> AsyncIterator[tuple[int, bytes, int]]:
-        yield 0, bytes(4), 1
+        for _ in range(self._num_packets):
+            yield 0, bytes(32_000), 16_000
 
 
 @pytest.fixture
@@ -92,6 +103,14 @@ async def test_the_session_can_end_before_the_connection(
         messages = [str(await viewer.queue.get()) for _ in range(len(viewer.queue))]
     assert json.loads(messages[-1])["text"] == "it has ended"
     assert client.is_ending
+
+
+@with_fake_time
+async def test_audio_faster_than_real_time_is_dropped_after_a_burst(handler: WhipHandler) -> None:
+    session = cast("Any", FakeSession())
+    peer = cast("Any", FakePeer(1000))
+    await handler._stream(_Client(None), peer, session, contextlib.AsyncExitStack())
+    assert session.num_packets == BURST_S
 
 
 @with_fake_time

@@ -65,7 +65,7 @@ class UploadHandler(ABC):
         try:
             return await self.answer(request)
         except UserError as error:
-            return _upload_error(422, str(error))
+            return _upload_error(503 if self._is_closing else 422, str(error))
         finally:
             self._is_busy = False
 
@@ -198,9 +198,9 @@ class LearnMouthHandler(UploadHandler):
                 request, self._command, LEARNING_TIMEOUT_S, content=recording
             )
         except TimeoutError:
-            raise UserError(
-                f"learning took longer than {LEARNING_TIMEOUT_S:g} s; try again later"
-            ) from None
+            return _upload_error(
+                503, f"learning took longer than {LEARNING_TIMEOUT_S:g} s; try again later"
+            )
         if status == USER_ERROR:
             raise UserError(messages)
         if status != 0:

@@ -53,6 +53,15 @@ class RealTimeLimit:
     def __init__(self) -> None:
         self._used_until_s = 0.0  # when all data so far would end in real time
 
+    def admit(self, duration_s: float) -> bool:
+        """Charge for data of a given duration; return False if it must be dropped instead."""
+        now_s = asyncio.get_running_loop().time()
+        used_until_s = max(self._used_until_s, now_s) + duration_s
+        if used_until_s > now_s + BURST_S:
+            return False
+        self._used_until_s = used_until_s
+        return True
+
     async def wait(self, duration_s: float) -> None:
         """Charge for data of a given duration; return when more may be read."""
         now_s = asyncio.get_running_loop().time()

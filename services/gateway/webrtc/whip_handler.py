@@ -151,10 +151,13 @@ class WhipHandler:
         stack: contextlib.AsyncExitStack,
     ) -> None:
         """Stream a client's sound into its session until it disconnects, then close the stack."""
+        rate_limit = RealTimeLimit()
         async with stack:
             LOG.info("a WebRTC client is streaming", extra={"session": session.name})
             try:
                 async for num_lost, pcm, num_samples in peer.receive_audio():
+                    if not rate_limit.admit(num_samples / peer.rate_hz):
+                        continue  # a client cannot be slowed down
                     session.skip(num_lost)
                     session.send(pcm, num_samples)
                     for error in session.take_errors():
@@ -200,7 +203,7 @@ class WhipHandler:
                 if channel.readyState != "open":
                     return
                 channel.send(message)
-                while channel.bufferedAmount > MAX_BUFFERED_BYTES:
+                while channel.readyState == "open" and channel.bufferedAmount > MAX_BUFFERED_BYTES:
                     await asyncio.sleep(BUFFER_CHECK_S)
 
     async def _handle_commands(
