@@ -219,7 +219,7 @@ class Receiver:
         while True:
             try:
                 packet = self.socket.recv(2048)
-            except BlockingIOError:
+            except OSError:  # no packet is left, or one is too large
                 break
             self.num_packets += 1
         keys = shape_keys("arkit") if packet else {}
@@ -253,7 +253,7 @@ class KOUXING_OT_follow(bpy.types.Operator):
             port = context.scene.kouxing_port
             self.report({"ERROR"}, f"cannot use port {port}: {error.strerror}; choose another")
             return {"CANCELLED"}
-        bpy.app.timers.register(RECEIVER.poll)
+        bpy.app.timers.register(RECEIVER.poll, persistent=True)  # also in the next file
         return {"FINISHED"}
 
 
