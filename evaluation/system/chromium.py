@@ -47,51 +47,65 @@ class Chromium:
         program = find_chromium()
         if program is None:
             raise UserError("Chromium is not installed; install the package chromium")
-        self._process = subprocess.Popen(  # noqa: S603 - found on the path
-            [
-                program,
-                *("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle"),
-                *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
-                *("--no-first-run", "--disable-background-networking", "--disable-sync"),
-                "--disable-component-update",
-                # pages of the address bar, which need more time than the rest of the start
-                "--disable-features=WebUIOmniboxPopup,WebUIOmniboxAimPopup",
-                "--autoplay-policy=document-user-activation-required",
-                *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
-                f"--use-file-for-fake-audio-capture={microphone}",
-                *([f"--use-file-for-fake-video-capture={camera}"] if camera else []),
-                f"--window-size={size_px[0]},{size_px[1]}",
-                f"--user-data-dir={folder}",
-                "--remote-debugging-port=0",
-                "about:blank",
-            ],
-            stderr=subprocess.DEVNULL,
-        )
+        command = [
+            program,
+            *("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle"),
+            *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
+            *("--no-first-run", "--disable-background-networking", "--disable-sync"),
+            "--disable-component-update",
+            # pages of the address bar, which need more time than the rest of the start
+            "--disable-features=WebUIOmniboxPopup,WebUIOmniboxAimPopup",
+            "--autoplay-policy=document-user-activation-required",
+            *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
+            f"--use-file-for-fake-audio-capture={microphone}",
+            *([f"--use-file-for-fake-video-capture={camera}"] if camera else []),
+            f"--window-size={size_px[0]},{size_px[1]}",
+            f"--user-data-dir={folder}",
+            "--remote-debugging-port=0",
+            "about:blank",
+        ]
+        folder.mkdir(parents=True, exist_ok=True)
+        self._messages = folder / "messages.txt"
+        with self._messages.open("wb") as messages:
+            self._process = subprocess.Popen(command, stderr=messages)  # noqa: S603 - on the path
         self._loop = asyncio.new_event_loop()
+        self._connections: list[aiohttp.ClientSession | aiohttp.ClientWebSocketResponse] = []
         self._num_sent = 0
         self.page_errors: list[str] = []
+        try:
+            self._port = self._wait_for_port(folder)
+            self._loop.run_until_complete(self._connect())
+            self.command("Runtime.enable")
+            self.command("Log.enable")
+            self.resize(*size_px)
+        except BaseException:
+            self.close()
+            raise
+
+    def _wait_for_port(self, folder: Path) -> int:
         port_file = folder / "DevToolsActivePort"
-        if not wait_until(
-            lambda: port_file.is_file() and "\n" in port_file.read_text(), _TIMEOUT_S
-        ):
-            self._process.kill()
-            raise UserError(f"{program} did not start within {_TIMEOUT_S:g} s")
-        self._port = int(port_file.read_text().split()[0])
-        self._loop.run_until_complete(self._connect())
-        self.command("Runtime.enable")
-        self.command("Log.enable")
-        self.resize(*size_px)
+
+        def has_started() -> bool:
+            return port_file.is_file() and "\n" in port_file.read_text()
+
+        wait_until(lambda: has_started() or self._process.poll() is not None, _TIMEOUT_S)
+        if not has_started():
+            messages = self._messages.read_text("utf-8", "replace").splitlines()
+            raise UserError(f"Chromium did not start: {messages[-1] if messages else 'no message'}")
+        return int(port_file.read_text().split()[0])
 
     async def _connect(self) -> None:
         self._http = aiohttp.ClientSession()
+        self._connections.append(self._http)
         async with self._http.get(f"http://127.0.0.1:{self._port}/json/list") as answer:
             targets = await answer.json()
         url = next(target for target in targets if target["type"] == "page")["webSocketDebuggerUrl"]
         self._socket = await self._http.ws_connect(url, max_msg_size=0)
+        self._connections.append(self._socket)
 
     def close(self) -> None:
         """Close the browser."""
-        for connection in (self._socket, self._http):
+        for connection in reversed(self._connections):
             self._loop.run_until_complete(connection.close())
         self._loop.close()
         self._process.terminate()
