@@ -284,7 +284,8 @@ def test_the_web_component_plays_no_recording_after_it_was_removed(
     faces.wait_for("arkit.set === 'arkit'")
     result = faces.evaluate(
         "window.audio = { play() { const face = arkit, { parentElement, nextSibling } = face;"
-        " face.remove(); parentElement.insertBefore(face, nextSibling); }, pause() { audio.isPaused = true; } };"
+        " face.remove(); parentElement.insertBefore(face, nextSibling); },"
+        " pause() { audio.isPaused = true; } };"
         "arkit.play(audio).catch(({ name }) => `${name} ${audio.isPaused}`)"
     )
     assert result == "AbortError true"
