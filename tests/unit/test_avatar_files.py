@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.head import glb_file
 from kouxing.services.driver.head.glb_head import read_glb
+from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.scene import load_head
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
@@ -257,20 +258,19 @@ def test_the_content_decides_between_text_and_binary(tmp_path: Path) -> None:
 def test_reads_a_gltf_with_its_buffer_in_its_folder_only(tmp_path: Path) -> None:
     document, binary = read_chunks(write_glb(tmp_path / "my.glb", meshes(SHAPES)))
     (tmp_path / "my face.bin").write_bytes(binary)
-    (tmp_path / "my.glb").unlink()
     gltf = tmp_path / "my.gltf"
-    document["buffers"][0]["uri"] = "my%20face.bin"
-    gltf.write_text(json.dumps(document), encoding="utf-8")
-    assert shape_error(load_head(str(gltf)), JAW) < 0.25
-    for uri in ("../my.bin", "/etc/hostname", "file:///etc/hostname", "%2e%2e/my.bin"):
+
+    def load(uri: str) -> Head:
         document["buffers"][0]["uri"] = uri
         gltf.write_text(json.dumps(document), encoding="utf-8")
+        return load_head(str(gltf))
+
+    assert shape_error(load("my%20face.bin"), JAW) < 0.25
+    for uri in ("../my.bin", "/etc/hostname", "file:///etc/hostname", "%2e%2e/my.bin"):
         with pytest.raises(UserError, match="not in its folder"):
-            load_head(str(gltf))
-    document["buffers"][0]["uri"] = "other.bin"
-    gltf.write_text(json.dumps(document), encoding="utf-8")
+            load(uri)
     with pytest.raises(UserError, match=r"my\.gltf: its file 'other.bin' is missing; copy it"):
-        load_head(str(gltf))
+        load("other.bin")
 
 
 def describe_vrm(

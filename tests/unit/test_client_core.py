@@ -284,16 +284,8 @@ def test_failing_on_result_does_not_keep_other_sessions_open(reason: str) -> Non
     other = harness.subscribe()
     if reason == "last frame":
         harness.sockets.publish("faps 1", EndOfFaps(session="s", epoch=1, sequence=1))
-    phone = Phone(
-        session="s",
-        epoch=1,
-        sequence=1,
-        index=0,
-        symbol="a",
-        duration=1600,
-        confidence=1.0,
-        final=True,
-    )
+    stamp: dict[str, Any] = {"session": "s", "epoch": 1, "sequence": 1}
+    phone = Phone(**stamp, index=0, symbol="a", duration=1600, confidence=1.0, final=True)
     harness.sockets.at("phones 1")[0].unread.append(phone)
     harness.session.end(None if reason == "closed by the program" else KouxingError(reason))
     assert inbox.is_over

@@ -1,5 +1,6 @@
 """Decisions about connections, without sockets: who is disconnected, and who never."""
 
+from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import cast
 from unittest import mock
@@ -62,6 +63,10 @@ def harness(monkeypatch: pytest.MonkeyPatch) -> SocketHarness:
     return SocketHarness(monkeypatch)
 
 
+def disconnected(connections: Iterable[PeerConnection | None]) -> list[PeerConnection]:
+    return [connection for connection in connections if connection and connection.is_disconnected]
+
+
 def test_a_budget_recovers_and_a_blocked_one_recovers_later() -> None:
     now_s = 100.0
     budget = PeerBudget(clock=lambda: now_s)
@@ -112,7 +117,7 @@ def test_sheds_the_owner_with_the_most_undelivered_bytes(harness: SocketHarness)
     harness.traffic = dict.fromkeys((1, 2, 3), Traffic(read=200_000))
     harness.traffic[4] = Traffic(read=300_000)
     harness.enforce_limits(1.0)
-    assert sum(connection.is_disconnected for connection in many) == 1
+    assert len(disconnected(many)) == 1
     assert not single.is_disconnected
 
 
@@ -129,19 +134,17 @@ def test_peers_that_read_too_little_are_disconnected(harness: SocketHarness) -> 
     harness.traffic = dict.fromkeys(range(1, 6), Traffic(acknowledged=1000, unsent=1))
     harness.enforce_limits(2.0)
     assert other.unread == MAX_QUEUED, "libzmq drops more"
-    assert sum(connection.is_disconnected for connection in silent) == 2
+    assert len(disconnected(silent)) == 2
     assert not other.is_disconnected
 
 
 @pytest.mark.parametrize("key", ["key", ""])
 def test_one_peer_cannot_take_all_connections(harness: SocketHarness, key: str) -> None:
-    connections_made = []
+    opened = []
     for number in range(1, 10):
-        connections_made.append(harness.deliver(number, key))
+        opened.append(harness.deliver(number, key))
         harness.enforce_limits(0.0)
-    assert [connection.is_disconnected for connection in connections_made] == [False] * 7 + [
-        True
-    ] * 2
+    assert disconnected(opened) == opened[7:]
 
 
 def test_clients_cannot_use_connections_of_services_or_other_keys(harness: SocketHarness) -> None:
@@ -151,14 +154,14 @@ def test_clients_cannot_use_connections_of_services_or_other_keys(harness: Socke
         harness.enforce_limits(0.0)
     honest += [harness.deliver(3, "service"), harness.deliver(4, "laptop")]
     harness.enforce_limits(0.0)
-    assert not any(connection.is_disconnected for connection in honest)
+    assert not disconnected(honest)
     assert len(harness.limiter.connections_to(harness.socket)) == 10 + 2
 
 
 def test_services_can_use_connections_that_clients_do_not_use(harness: SocketHarness) -> None:
     services = [harness.deliver(number, "service") for number in range(20)]
     harness.enforce_limits(0.0)
-    assert [connection.is_disconnected for connection in services] == [False] * 15 + [True] * 5
+    assert disconnected(services) == services[15:]
     for number in range(20, 30):
         harness.deliver(number, f"key {number}")
     harness.enforce_limits(0.0)
@@ -208,10 +211,7 @@ def test_silent_connections_make_room(harness: SocketHarness) -> None:
     silent = [harness.limiter.find(number, harness.socket) for number in range(10)]
     talker = harness.deliver(10, "talker")
     harness.enforce_limits(0.0)
-    assert [connection.is_disconnected for connection in silent if connection] == [True] + [
-        False
-    ] * 9
-    assert not talker.is_disconnected
+    assert disconnected([*silent, talker]) == silent[:1]
 
 
 @pytest.mark.parametrize(

@@ -42,12 +42,16 @@ def face_curves() -> FrameStream:
 )
 def test_reads_what_it_wrote(tmp_path: Path, name: str, form: CurveFormat, has_head: bool) -> None:
     path, curves = tmp_path / name, face_curves()
-    CURVE_EXPORTERS[path.suffix](path, ExportOptions(curve_format=form)).write(curves)
+    write(path, curves, form)
     animation = read_table(path)
     assert animation.frame_rate_hz == pytest.approx(RATE_HZ)
     faps = np.array([row for _, _, row in curves.rows])
     np.testing.assert_allclose(animation.faps[:, JAW], faps[:, JAW], atol=5.0)
     np.testing.assert_allclose(animation.faps[:, HEAD_YAW], 5000.0 * has_head, atol=1.0)
+
+
+def write(path: Path, curves: FrameStream, form: CurveFormat = CurveFormat.FAPS) -> None:
+    CURVE_EXPORTERS[path.suffix](path, ExportOptions(curve_format=form)).write(curves)
 
 
 def slow_curves(frame_rate_hz: float) -> FrameStream:
@@ -59,22 +63,19 @@ def slow_curves(frame_rate_hz: float) -> FrameStream:
 
 def test_a_live_link_take_keeps_its_rate(tmp_path: Path) -> None:
     path = tmp_path / "take.csv"
-    exporter = CURVE_EXPORTERS[".csv"](path, ExportOptions(curve_format=CurveFormat.LIVELINK))
-    exporter.write(slow_curves(6.0))
+    write(path, slow_curves(6.0), CurveFormat.LIVELINK)
     animation = read_table(path)
     assert animation.frame_rate_hz == pytest.approx(6.0, abs=0.01)
     assert len(animation.faps) == 20
     path.unlink()
     with pytest.raises(UserError, match=r"take\.csv: .*at least 6 frames .* has 5; use --as arkit"):
-        exporter.write(slow_curves(5.0))
+        write(path, slow_curves(5.0), CurveFormat.LIVELINK)
     assert not path.exists()
 
 
 def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:
     path = tmp_path / "take.csv"
-    CURVE_EXPORTERS[".csv"](path, ExportOptions(curve_format=CurveFormat.LIVELINK)).write(
-        face_curves()
-    )
+    write(path, face_curves(), CurveFormat.LIVELINK)
     header, *rows = csv.reader(path.read_text().splitlines())
     assert header[:3] == ["Timecode", "BlendShapeCount", "EyeBlinkLeft"]
     assert header[16:20] == ["JawForward", "JawRight", "JawLeft", "JawOpen"]
@@ -86,7 +87,7 @@ def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:
 
 def test_tables_have_the_phone_of_each_frame(tmp_path: Path) -> None:
     path = tmp_path / "face.csv"
-    CURVE_EXPORTERS[".csv"](path, ExportOptions()).write(face_curves())
+    write(path, face_curves())
     phones = [row["phone"] for row in csv.DictReader(path.read_text().splitlines())]
     assert phones[4:16] == ["", *["a"] * 10, ""]
 

@@ -1,23 +1,16 @@
 """Each phone of a session counts once, even if several recognizers publish it."""
 
+from typing import Any
+
 import pytest
 from kouxing_client import Phone, Speech
 from kouxing_client.messages import SILENCE
 from kouxing_client.phone_track import PhoneTrack
 
 
-def phone(
-    symbol: str, index: int, onset: int, *, epoch: int = 1, final: bool = True, duration: int = 100
-) -> Phone:
-    return Phone(
-        symbol=symbol,
-        index=index,
-        media_time=onset,
-        epoch=epoch,
-        duration=duration,
-        confidence=1.0,
-        final=final,
-    )
+def phone(symbol: str, index: int, onset: int, **changes: Any) -> Phone:
+    fields = {"epoch": 1, "duration": 100, "confidence": 1.0, "final": True} | changes
+    return Phone(symbol=symbol, index=index, media_time=onset, **fields)
 
 
 def restart(track: PhoneTrack, time: int, *, active: bool = True) -> list[tuple[str, int]]:

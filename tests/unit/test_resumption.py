@@ -32,7 +32,7 @@ from tests.system import DEMO, samples_of_file
 
 TOLERANCE_S = 0.03  # of onsets: the networks received other audio before
 CHUNK = 1600  # samples: 100 ms
-SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:72_000]
+SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:60_000]
 
 
 def phone(index: int, onset_s: float, duration_s: float, *, final: bool = True) -> Phone:
