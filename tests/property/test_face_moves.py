@@ -144,7 +144,7 @@ lip_models = st.sampled_from(["learned", "dynamic-visemes", "ferguson"])
 MOVES = [move_to_another_synthesizer, move_to_another_recognizer]
 
 
-@settings(max_examples=16)
+@settings(max_examples=12)
 @given(move=st.sampled_from(MOVES), lips=lip_models, cut=cuts)
 def test_another_process_continues_anywhere(
     move: Callable[[str, int], list[Frame]], lips: str, cut: int

@@ -1,4 +1,4 @@
-"""npz files: valid files are read; others are rejected before anything is unpacked."""
+"""npz files that are damaged or too large are rejected before anything is unpacked."""
 
 import io
 import tracemalloc
@@ -24,15 +24,6 @@ def npy(array: np.ndarray, **header: object) -> bytes:
     else:
         np.save(stream, array)
     return stream.getvalue()
-
-
-def test_arrays_round_trip(tmp_path: Path) -> None:
-    arrays = {"a": np.arange(6).reshape(2, 3), "b": np.array("text"), "c": np.zeros((0, 4))}
-    np.savez_compressed(tmp_path / "a.npz", allow_pickle=False, **arrays)
-    again = read_arrays(tmp_path / "a.npz", MIB, "a model")
-    assert again.keys() == arrays.keys()
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(again[name], array)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,12 @@
 """``speak`` handles the events about its session's video."""
 
 import io
-from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import pytest
-from kouxing_client.messages import Event
+from kouxing_client.messages import Event, Phone
 from rich.console import Console
 
 from kouxing.services.cli.system import streaming
@@ -16,42 +17,21 @@ FAILED = Event(session="s", name="error", detail="no-video: no encoder")
 RECORDED = Event(session="s", name="recorded", detail="out/s.mp4")
 
 
-class FakeSession:
-    """A session without audio. Each read returns the next events."""
+def make_session(reads: list[list[Event]]) -> Any:
+    """Return a session without audio and results; each read of its events returns the next ones."""
+    phones = SimpleNamespace(num_missed=0, has_ended=False)
 
-    name = "s"
-
-    def __init__(self, *reads: list[Event]) -> None:
-        self._reads = list(reads)
-
-    def events(self) -> "FakeSession":
-        return self
-
-    def frames(self) -> "FakeResults":
-        return FakeResults()
-
-    def results(self, *_classes: type, **_options: object) -> "FakeResults":
-        return FakeResults()
-
-    def available(self, _timeout_s: float = 0.0) -> Iterator[Event]:
-        yield from self._reads.pop(0)
-
-    def take_errors(self) -> list[Any]:
+    def read_phones(_timeout_s: float) -> list[Phone]:
+        phones.has_ended = True
         return []
 
-    def finish(self) -> None:
-        """End no audio."""
-
-
-class FakeResults:
-    """No results."""
-
-    num_missed = 0
-    has_ended = False
-
-    def available(self, _timeout_s: float = 0.0) -> Iterator[Event]:
-        self.has_ended = True
-        return iter(())
+    phones.available = read_phones
+    session = mock.Mock(results=lambda *_, **__: phones)
+    session.name = "s"
+    session.frames().available.return_value = []
+    session.take_errors.return_value = []
+    session.events = lambda: SimpleNamespace(available=lambda _timeout_s=0.0: reads.pop(0))
+    return session
 
 
 @pytest.mark.parametrize(
@@ -69,12 +49,15 @@ def test_waits_for_a_video_that_ends_early(
 ) -> None:
     monkeypatch.setattr(streaming, "_drawn_s", lambda *_: 0.0)
     source = AudioSource("silence", 16_000, 1, 0.0, iter(()))
-    console = Console(file=io.StringIO(), width=200)
-    client: Any = None
-    session: Any = FakeSession(*reads)
-    streamer = streaming._Streamer(client, session, source, console, is_recorded=True)
+    output = io.StringIO()
+    problems = [event.detail for read in reads for event in read if event.name == "error"]
+    streamer = streaming._Streamer(
+        mock.Mock(),
+        make_session(reads[:]),
+        source,
+        Console(file=output, width=200),
+        is_recorded=True,
+    )
     streamer.run(paced=False)
     assert streamer.summarize(0.0).video == video
-    problems = [event.detail for read in reads for event in read if event.name == "error"]
-    assert isinstance(console.file, io.StringIO)
-    assert all(problem in console.file.getvalue() for problem in problems)
+    assert all(problem in output.getvalue() for problem in problems)
