@@ -1,12 +1,10 @@
 """Chunks and other sessions do not affect results; invariants of search and output rule."""
 
-from functools import cache
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
 from kouxing.services.recognizer.live.live_decoder import LiveDecoder
@@ -22,11 +20,6 @@ CUTS = st.lists(st.integers(0, 32_000), max_size=60)
 
 def pieces(samples: np.ndarray, cuts: list[int]) -> list[np.ndarray]:
     return np.split(samples, sorted(cut for cut in cuts if cut <= len(samples)))
-
-
-@cache
-def cached_model(name: str = "blocks") -> AcousticModel:
-    return load_model(name)
 
 
 def last_phone_after(decoder: Decoder, row: np.ndarray) -> LastPhone:
@@ -46,7 +39,7 @@ def test_chunks_do_not_affect_resampling(cuts: list[int], rate_hz: int) -> None:
 @settings(max_examples=30)
 @given(cuts=CUTS, name=st.sampled_from(["gmm", "blocks"]))
 def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
-    model = cached_model(name)
+    model = load_model(name)
     front_end = model.create_front_end()
     parts = [front_end.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
     undivided = model.create_front_end().accept_waveform(NOISE)
@@ -77,7 +70,7 @@ def test_frames_with_low_confidence_do_not_count() -> None:
 def test_a_search_continues_from_the_state_of_another(
     seed: int, num_frames: int, data: st.DataObject
 ) -> None:
-    topology = cached_model().topology
+    topology = load_model().topology
     rng = np.random.default_rng(seed)
     rows = rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32)
     at = data.draw(st.integers(0, num_frames - 1))
@@ -106,7 +99,7 @@ def scores_of(topology: Topology, phones: list[str], frames_per_state: int) -> n
 
 
 def test_surplus_phones_are_withdrawn() -> None:
-    topology = cached_model().topology
+    topology = load_model().topology
     rows = scores_of(topology, ["h", "ao", "m", "a"], 10)
     other = scores_of(topology, ["b", "a", "d", "e", "g", "u"], 1)
     decoder = LiveDecoder(topology, OutputRuleConfig(1, 0.0))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lips.lip_predictor import GruLipPredictor, load_lip_predictor
+from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.lips.mouth_profile import MouthProfile
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.sessions.session import (
@@ -45,14 +45,11 @@ def recognizer() -> Recognizer:
     return Recognizer(load_model())
 
 
-@cache
-def lip_predictor() -> GruLipPredictor:
-    return load_lip_predictor()
-
-
 def make_session(epoch: int = 1, **opening: Any) -> RecognizerSession:
     start = with_opening(replace(START, epoch=epoch), **opening)
-    return RecognizerSession(start, recognizer(), lip_predictor(), SOCKET, SOCKET, 0.0, math.inf)
+    return RecognizerSession(
+        start, recognizer(), load_lip_predictor(), SOCKET, SOCKET, 0.0, math.inf
+    )
 
 
 def chunk(
@@ -216,12 +213,13 @@ def test_a_mouth_profile_that_does_not_fit_is_not_used() -> None:
 
 
 def test_a_session_gets_the_lip_positions_of_its_mouth_profile() -> None:
+    predictor = load_lip_predictor()
     profile = MouthProfile(
         scale=np.zeros(15, np.float32),
         offset=np.full(15, 77, np.float32),
-        residual=np.zeros(lip_predictor().residual_shape, np.float32),
+        residual=np.zeros(predictor.residual_shape, np.float32),
     )
-    session = make_session(mouth_profile=profile.to_bytes(lip_predictor().digest))
+    session = make_session(mouth_profile=profile.to_bytes(predictor.digest))
     session.stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
     recognizer().decode_streams([session.stream])
     results = session.new_results()

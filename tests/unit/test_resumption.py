@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from kouxing_client.messages import Message, Speech
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.live.live_decoder import StreamOutput
-from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.services.recognizer.sessions.resumption import (
     GRID_S,
     WARM_UP_S,
@@ -18,11 +16,7 @@ from kouxing.services.recognizer.sessions.resumption import (
     ResumeFilter,
 )
 from kouxing.shared.clock import to_samples, to_seconds
-from kouxing.shared.phones.events import (
-    Phone,
-    SpeechChange,
-    Waveform,
-)
+from kouxing.shared.phones.events import Phone, SpeechChange, Waveform
 from kouxing.shared.wire.events import event_to_message
 from kouxing.shared.wire.final_time import QUIET, FinalTimeTracker
 from kouxing.shared.wire.speech import AudioState, Progress
@@ -39,16 +33,11 @@ def phone(index: int, onset_s: float, duration_s: float, *, final: bool = True) 
     return lips.phone(index, "a", onset_s, duration_s, final=final)
 
 
-@pytest.fixture(scope="module")
-def model() -> AcousticModel:
-    return load_model()
-
-
 def recognize(
-    model: AcousticModel, begin: int, resumption: ResumeFilter, speech_time: int = 0
+    begin: int, resumption: ResumeFilter, speech_time: int = 0
 ) -> list[list[StreamOutput]]:
     """Return the results after each chunk from a sample on, and after the end."""
-    stream = LiveStream(model, OutputRuleConfig(), speech_time=speech_time)
+    stream = LiveStream(load_model(), speech_time=speech_time)
     outputs = []
     for start in range(begin, len(SAMPLES), CHUNK):
         media_time, samples = resumption.align((start, SAMPLES[start : start + CHUNK]), 16_000)
@@ -58,9 +47,9 @@ def recognize(
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(model: AcousticModel) -> list[list[StreamOutput]]:
+def uninterrupted() -> list[list[StreamOutput]]:
     """The results of a session without a loss."""
-    return recognize(model, 0, ResumeFilter(0.0))
+    return recognize(0, ResumeFilter(0.0))
 
 
 def state_at_loss(
@@ -83,11 +72,11 @@ def final_phones(outputs: Sequence[StreamOutput]) -> list[Phone]:
 
 @pytest.mark.parametrize("lost_s", [2.0, 3.0])
 def test_two_recognizers_emit_the_phones_of_one(
-    model: AcousticModel, uninterrupted: list[list[StreamOutput]], lost_s: float
+    uninterrupted: list[list[StreamOutput]], lost_s: float
 ) -> None:
     before, final_s, begin = state_at_loss(uninterrupted, lost_s)
     assert 0.0 < final_s < lost_s
-    after = [*chain.from_iterable(recognize(model, begin, ResumeFilter(final_s)))]
+    after = [*chain.from_iterable(recognize(begin, ResumeFilter(final_s)))]
     expected = final_phones([*chain.from_iterable(uninterrupted)])
     phones = final_phones(before) + final_phones(after)
     assert [phone.symbol for phone in phones] == [phone.symbol for phone in expected]
@@ -97,13 +86,13 @@ def test_two_recognizers_emit_the_phones_of_one(
 
 @pytest.mark.parametrize("lost_s", [2.3, 3.4])
 def test_phones_come_as_early_as_without_a_loss(
-    model: AcousticModel, uninterrupted: list[list[StreamOutput]], lost_s: float
+    uninterrupted: list[list[StreamOutput]], lost_s: float
 ) -> None:
     before, final_s, begin = state_at_loss(uninterrupted, lost_s)
     (start_s,) = (
         output.time_s for output in before if isinstance(output, SpeechChange) and output.active
     )
-    after = recognize(model, begin, ResumeFilter(final_s), to_samples(start_s))
+    after = recognize(begin, ResumeFilter(final_s), to_samples(start_s))
     from_s = final_s + 0.3
     expected = first_chunks(uninterrupted[begin // CHUNK :], from_s)
     actual = first_chunks(after, from_s)

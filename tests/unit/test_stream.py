@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from kouxing_client.messages import Message
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
@@ -37,14 +36,9 @@ E = TypeVar("E")
 
 
 @cache
-def model() -> AcousticModel:
-    return load_model()
-
-
-@cache
 def results_of_vowels(chunk: int | None = None, *, with_lips: bool = True) -> list[StreamOutput]:
     """Return the results of an undisturbed session, which several tests compare with theirs."""
-    return recognize_live(model(), SAMPLES, chunk, **(FACE if with_lips else {}))
+    return recognize_live(load_model(), SAMPLES, chunk, **(FACE if with_lips else {}))
 
 
 def of_kind(kind: type[E], outputs: Sequence[StreamOutput]) -> list[E]:
@@ -68,7 +62,7 @@ def assert_same(
 @pytest.mark.parametrize(("rate_hz", "size"), [(16_000, 97), (44_100, 1021)])
 def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
     expected, outputs = (
-        recognize_live(model(), SAMPLES, chunk, sample_rate_hz=rate_hz, **FACE)
+        recognize_live(load_model(), SAMPLES, chunk, sample_rate_hz=rate_hz, **FACE)
         for chunk in (None, size)
     )
     assert messages_of(outputs) == messages_of(expected)
@@ -78,7 +72,7 @@ def test_chunk_sizes_do_not_affect_results(rate_hz: int, size: int) -> None:
 
 def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
     alone = of_kind(Phone, results_of_vowels(with_lips=False))
-    stream = LiveStream(model(), **FACE)
+    stream = LiveStream(load_model(), **FACE)
     gap = len(SAMPLES) + MAX_JITTER_SAMPLES + 1
     stream.stream.accept_waveform(SAMPLES, 0)
     outputs = stream.feed(SAMPLES, gap) + stream.finish()
@@ -104,7 +98,7 @@ def test_a_gap_ends_the_speech_and_recognition_restarts_after_it() -> None:
 
 
 def test_skips_to_newer_audio() -> None:
-    stream = LiveStream(model(), **FACE)
+    stream = LiveStream(load_model(), **FACE)
     outputs = stream.feed(SAMPLES[:8000])
     stream.stream.skip_to(40_000)
     outputs += stream.feed(SAMPLES, 40_000) + stream.finish()
@@ -119,7 +113,7 @@ def test_skips_to_newer_audio() -> None:
 @pytest.mark.parametrize("cuts", [[9600, 14_400], [320, 10_240], [0, 50_000]])
 def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
     expected = results_of_vowels(320)
-    stream = LiveStream(model(), **FACE)
+    stream = LiveStream(load_model(), **FACE)
     outputs = []
     for number, part in enumerate(np.split(SAMPLES, cuts)):
         stream.stream.set_light_model(number == 1)
@@ -136,7 +130,7 @@ def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
 
 
 def test_jitter_is_not_a_gap() -> None:
-    stream = LiveStream(model())
+    stream = LiveStream(load_model())
     outputs = stream.feed(SAMPLES[:8000], 0) + stream.feed(
         SAMPLES[8000:], 8000 + MAX_JITTER_SAMPLES
     )
@@ -146,7 +140,7 @@ def test_jitter_is_not_a_gap() -> None:
 
 
 def test_a_flush_ends_the_speech_and_drops_it() -> None:
-    stream = LiveStream(model())
+    stream = LiveStream(load_model())
     spoken = of_kind(Phone, stream.feed(SAMPLES[:16_000]))
     assert spoken
     stream.stream.flush()
@@ -167,7 +161,7 @@ def test_a_flush_ends_the_speech_and_drops_it() -> None:
 def test_lip_positions_are_known_5_ms_before_the_face_frame(rate_hz: int, before_s: float) -> None:
     times_s = np.arange(round((before_s + len(SAMPLES) / RATE_HZ) * rate_hz)) / rate_hz
     samples = np.interp(times_s, before_s + np.arange(len(SAMPLES)) / RATE_HZ, SAMPLES, left=0.0)
-    stream = LiveStream(model(), sample_rate_hz=rate_hz, **FACE)
+    stream = LiveStream(load_model(), sample_rate_hz=rate_hz, **FACE)
     newest_s, is_speaking, lags_s = 0.0, False, []
     for event in stream.feed(samples.astype(np.float32)):
         if isinstance(event, LipPositions):
@@ -182,14 +176,14 @@ def test_lip_positions_are_known_5_ms_before_the_face_frame(rate_hz: int, before
 
 def test_other_sessions_do_not_affect_results() -> None:
     recordings = [SAMPLES, SAMPLES[8000:], SAMPLES[:9000]]
-    together = recognize_together(model(), recordings, **FACE)
+    together = recognize_together(load_model(), recordings, **FACE)
     for samples, outputs in zip(recordings, together, strict=True):
-        assert messages_of(outputs) == messages_of(recognize_live(model(), samples, **FACE))
+        assert messages_of(outputs) == messages_of(recognize_live(load_model(), samples, **FACE))
 
 
 def test_lips_may_be_early_and_phones_are_the_same() -> None:
     expected = results_of_vowels(320)
-    recognizer = Recognizer(model())
+    recognizer = Recognizer(load_model())
     stream = recognizer.create_stream(**FACE)
     outputs: list[StreamOutput] = []
     num_early = 0
@@ -215,7 +209,7 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
     outputs: list[list[StreamOutput]] = []
     num_early = 0
     for continues in (False, True):
-        recognizer = Recognizer(model())
+        recognizer = Recognizer(load_model())
         stream = recognizer.create_stream(**FACE)
         stream.set_hop(4)
         results: list[StreamOutput] = []
@@ -246,7 +240,7 @@ def test_lips_continue_during_scoring_and_results_are_the_same() -> None:
 
 
 def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
-    recognizer = Recognizer(model())
+    recognizer = Recognizer(load_model())
     stream = recognizer.create_stream(**FACE)
     stream.set_hop(4)
     recognizer.decode_streams([stream])
@@ -268,7 +262,7 @@ def test_no_audio_follows_during_scoring_after_queued_events_or_a_gap() -> None:
 
 def test_a_longer_hop_changes_only_the_phones() -> None:
     expected = results_of_vowels(320)
-    stream = LiveStream(model(), **FACE)
+    stream = LiveStream(load_model(), **FACE)
     stream.stream.set_hop(4)
     outputs = [*stream.feed(SAMPLES, chunk=320), *stream.finish()]
     assert_same((LipPositions, Progress, SpeechChange), outputs, expected)
@@ -280,21 +274,21 @@ def test_a_longer_hop_changes_only_the_phones() -> None:
 
 
 def hello_phones() -> list[Phone]:
-    return of_kind(Phone, recognize_live(model(), HELLO, 320))
+    return of_kind(Phone, recognize_live(load_model(), HELLO, 320))
 
 
 @pytest.mark.slow
 def test_silence_and_noise_have_no_phones() -> None:
     noise = np.random.default_rng(0).normal(0, 0.01, 32_000).astype(np.float32)
-    outputs = recognize_live(model(), noise, 320)
+    outputs = recognize_live(load_model(), noise, 320)
     assert not any(isinstance(output, Phone | SpeechChange) for output in outputs)
-    assert recognize_recording(model(), noise) == []
+    assert recognize_recording(load_model(), noise) == []
 
 
 @pytest.mark.slow
 def test_warm_up_compiles_everything_and_changes_no_result() -> None:
     expected = hello_phones()
-    Recognizer(model()).warm_up()
+    Recognizer(load_model()).warm_up()
     assert frame_search.advance_frames.signatures
     assert path_records.count_record_paths.signatures
     assert path_records.compact_records.signatures
