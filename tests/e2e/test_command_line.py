@@ -56,10 +56,10 @@ def test_silence_and_clipping_give_warnings(
 
 
 def test_speak_sends_raw_audio_from_standard_input_and_saves_the_video(system: System) -> None:
-    pcm = (samples_of_file(SENTENCE) * 32767).astype("<i2").tobytes()
+    pcm = (samples_of_file(SENTENCE)[:16_000] * 32767).astype("<i2").tobytes()
     result = kouxing("speak", "-", "--fast", "--record", control=system.control, stdin=pcm)
     assert result.returncode == 0, result.stderr
-    assert "phones in 2.3 s" in result.stderr
+    assert "phones in 1.0 s" in result.stderr
     assert "wrote" in result.stderr
 
 
@@ -162,13 +162,9 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["listen", "two words"], "letters, digits"),
         (["listen", "heard", "-o", "face.txt"], ".jsonl"),
         (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "this format holds faps"),
-        (["listen", "heard", "--as", "phones", "-o", "a.csv"], "--output does not apply to phones"),
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
-        (["send", "http://127.0.0.1"], "write vmc://HOST"),
-        (["express", "heard", "glee=1"], "joy, sadness, anger"),
         (["express", "heard", "joy=2"], "between 0 and 1"),
-        (["express", "heard", "joy"], "joy=0.4"),
         (["express", "heard", "joy=1", "--hold", "-1"], "0 to 3600"),
         (["express", "nobody", "joy=1"], "'nobody' does not exist (open sessions: none); to"),
     ],

@@ -3,7 +3,6 @@
 The pages run the recipes of docs/clients/local.md.
 """
 
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,12 +10,14 @@ import numpy as np
 import pytest
 
 from kouxing.evaluation.system.chromium import serve_folder
+from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.shared.face.shapes import SHAPE_SETS
+from tests import heads
 from tests.browser import Browser
 from tests.documents import code_blocks
 from tests.e2e.lips_page import PACKAGE
 from tests.glb_writer import Mesh, write_glb
-from tests.system import DEMO, NODE, ROOT
+from tests.system import DEMO, ROOT
 
 PACKAGES = PACKAGE / "node_modules"
 CLIENT_PACKAGES = ROOT / "clients" / "javascript" / "node_modules"
@@ -86,8 +87,7 @@ def run(browser: Browser, site: Path, body: str, done: str) -> None:
 
 
 def test_five_lines_move_a_three_vrm_avatar(browser: Browser, site: Path) -> None:
-    avatar = site / "avatar.vrm"
-    subprocess.run([NODE.with_name("kouxing"), "head", "export", "--force", avatar], check=True)
+    export_glb(heads.load("woman", "coarse"), site / "avatar.vrm")
     before, loop = find_recipe("expressionManager").split("// in your render loop")
     body = f"""
 import {{ VRMLoaderPlugin }} from "@pixiv/three-vrm";

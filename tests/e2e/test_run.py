@@ -12,14 +12,15 @@ from pathlib import Path
 
 import av
 import pytest
+import soundfile
 
 from tests.e2e.conftest import CommandRunner
 from tests.system import (
     CTRL_C_COMMAND,
+    HELLO,
     LIGHT_MODEL,
     LIMIT_S,
     VIDEO_RATE_HZ,
-    VOWELS_FILE,
     child_environment,
     kouxing,
     own_addresses,
@@ -28,7 +29,6 @@ from tests.system import (
     wait_until,
 )
 
-SENTENCE = VOWELS_FILE
 CTRL_C_AT_FIRST_IMAGE = """
 import signal
 from kouxing.services.driver.video.video_writer import VideoWriter
@@ -43,19 +43,25 @@ VideoWriter.write_image = interrupt
 """
 
 
-def test_the_demo_writes_a_video_and_stops(tmp_path: Path) -> None:
-    result = kouxing(
-        "run", "--play", SENTENCE, "--stop-after", environment=own_environment(tmp_path)
-    )
+@pytest.fixture(scope="module")
+def speech(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second of speech."""
+    path = tmp_path_factory.mktemp("speech") / "speech.wav"
+    soundfile.write(path, HELLO[:16_000], 16_000)
+    return path
+
+
+def test_the_demo_writes_a_video_and_stops(tmp_path: Path, speech: Path) -> None:
+    result = kouxing("run", "--play", speech, "--stop-after", environment=own_environment(tmp_path))
     assert result.returncode == 0, result.stderr
     assert "demo.mp4" in result.stderr
     with av.open(str(tmp_path / "demo.mp4")) as film:
         assert len(film.streams.audio) == 1
-        assert sum(1 for _ in film.decode(video=0)) >= 2.2 * VIDEO_RATE_HZ
+        assert sum(1 for _ in film.decode(video=0)) >= 0.9 * VIDEO_RATE_HZ
 
 
 def test_runs_on_free_ports_until_it_is_interrupted(
-    command: CommandRunner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: CommandRunner, tmp_path: Path, speech: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     environment = {"XDG_RUNTIME_DIR": str(tmp_path), **LIGHT_MODEL}
     options = ["--set", "driver.view=none", "--set", f"driver.out={tmp_path}", "--no-browser"]
@@ -77,7 +83,7 @@ def test_runs_on_free_ports_until_it_is_interrupted(
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert "kouxing" in answer.read().decode()
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-        status, _, stderr = command("speak", SENTENCE)
+        status, _, stderr = command("speak", speech)
         assert status == 0, stderr
         _, shown, _ = command("status")
         assert (len(re.findall("recognizer-", shown)), len(re.findall("driver-", shown))) == (2, 1)
@@ -150,10 +156,10 @@ def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
     assert "Traceback" not in log
 
 
-def test_an_interrupted_render_leaves_no_file(tmp_path: Path) -> None:
+def test_an_interrupted_render_leaves_no_file(tmp_path: Path, speech: Path) -> None:
     program = CTRL_C_AT_FIRST_IMAGE + CTRL_C_COMMAND
     result = subprocess.run(
-        [sys.executable, "-c", program, "render", SENTENCE, "face.mp4"],
+        [sys.executable, "-c", program, "render", speech, "face.mp4"],
         env=child_environment(),
         cwd=tmp_path,
         capture_output=True,

@@ -128,9 +128,8 @@ def run_program(folder: Path, name: str) -> tuple[Frames, Weights]:
     return (integers / 32768).astype(np.float32), rows
 
 
-@pytest.mark.parametrize("name", ["bilabials-female", "hello-male"])
-def test_a_c_program_has_the_servers_visemes(folder: Path, name: str) -> None:
-    sound, rows = run_program(folder, name)
+def test_a_c_program_has_the_servers_visemes(folder: Path) -> None:
+    sound, rows = run_program(folder, "bilabials-female")
     numbers, delays_ms, weights = rows[:, 0], rows[:, 1], rows[:, 3:]
     assert numbers.tolist() == [*range(len(rows))]
     assert delays_ms[10:].max() == 60
