@@ -141,11 +141,11 @@ export class KouxingFace extends HTMLElement {
     if (!url) throw new Error("<kouxing-face> needs the attribute recording; add it");
     const avatar = this.#avatar;
     if (avatar === null) throw new Error("the model is not loaded yet; wait for the event load");
-    const bytes = await fetchFile(url).catch(({ message }) => {
+    const reading = fetchFile(url).then(readRecording);
+    const { names, frames } = await reading.catch(({ message }) => {
       throw new Error(`${url}: ${message}`);
     });
     this.#checkAvatar(avatar);
-    const { names, frames } = readRecording(bytes);
     const set = names === null ? "faps" : chooseSet(names);
     if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);
     await audio?.play();

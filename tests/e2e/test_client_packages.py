@@ -315,6 +315,8 @@ def test_the_web_component_reports_wrong_addresses(faces: Browser) -> None:
     play = "arkit.play().catch(({ message }) => message)"
     faces.evaluate("arkit.setAttribute('recording', 'absent.jsonl')")
     assert "absent.jsonl: cannot be loaded (404" in faces.evaluate(play)
+    faces.evaluate("arkit.setAttribute('recording', 'index.html')")
+    assert "index.html: the recording has no times" in faces.evaluate(play)
     faces.evaluate("arkit.setAttribute('recording', '')")
     assert "add" in faces.evaluate(play)
     for address, text in (
