@@ -47,7 +47,7 @@ def config(
     """Print the value, source, default, allowed values and meaning of every setting."""
     if service and service not in CONFIG_TYPES:
         raise UserError(f"unknown service {service!r}; choose one of {', '.join(CONFIG_TYPES)}")
-    values = parse_assignments(assignments or [])
+    values = parse_assignments(assignments or [], service)
     if service:
         text = _toml_table(service, read_settings(config).describe(CONFIG_TYPES[service], values))
     else:

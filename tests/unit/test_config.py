@@ -246,10 +246,11 @@ def test_the_output_is_a_file_with_the_same_values(
     text = "[driver]\nout = 'a \"b\" 口'\n[gateway]\nport = 0\nsenders = ['vmc://']\n"
     file.write_text(text, encoding="utf-8")
     expected = [read_settings(file).load(config_type) for config_type in CONFIG_TYPES.values()]
-    config("driver", config=file, assignments=["camera=mouth"])
+    config("driver", config=file, assignments=["camera=mouth", "driver.size=64x48"])
     printed = capsys.readouterr().out
     assert "[gateway]" not in printed
     assert 'camera = "mouth"  # --set' in printed
+    assert 'size = "64x48"  # --set' in printed
     config(config=file)
     printed = capsys.readouterr().out
     assert f"port = 0  # {file}" in printed
