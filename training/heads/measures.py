@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.training.heads.makehuman import FEATURE_POINTS, BaseMesh, MakeHuman
+from kouxing.training.heads.makehuman import FEATURE_POINTS, NUM_BASE_VERTICES, BaseMesh, MakeHuman
 from kouxing.training.heads.zones import Skin
 
 Float = NDArray[np.float64]
@@ -71,7 +71,7 @@ def neckline_height(z: Float) -> Float:
 
 def head_weight(source: MakeHuman) -> Float:
     """Return how far each vertex of the base mesh follows the head; it fades down the neck."""
-    weight = np.ones(19158)
+    weight = np.ones(NUM_BASE_VERTICES)
     for bone, fraction in (("neck03", 0.25), ("neck02", 0.55), ("neck01", 0.85)):
         weight -= fraction * source.bone_weights(bone)
     for bone in source.bones():

@@ -93,7 +93,7 @@ _OPEN_MOUTH = {
 
 
 def _open_mouth_vertices(piece: HeadPiece) -> Float:
-    vertices = piece.part.vertices.copy()
+    vertices = piece.geometry.vertices.copy()
     for fap, value in _OPEN_MOUTH.items():
         if fap in piece.fields:
             vertices += piece.fields[fap] * (value / 1024)
@@ -109,13 +109,13 @@ def bake_occlusion(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bo
     that line the mouth.
     """
     solid = [p for p in pieces if p.name not in ("lashes", "brows", "tears")]
-    offsets = np.cumsum([0] + [len(p.part.vertices) for p in solid])
+    offsets = np.cumsum([0] + [len(p.geometry.vertices) for p in solid])
     vertices = np.concatenate([_open_mouth_vertices(p) for p in solid])
     normals = np.concatenate([_outward(p) for p in solid])
 
     def visibility(with_hair: bool) -> Float:
         triangles = [
-            p.part.triangles + first
+            p.geometry.triangles + first
             for p, first in zip(solid, offsets, strict=False)
             if with_hair or p.name != "hair"
         ]
@@ -124,8 +124,8 @@ def bake_occlusion(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bo
     # strands let some light through
     seen = 0.5 * visibility(False) + 0.5 * visibility(True)
     for piece, first in zip(solid, offsets, strict=False):
-        part = piece.part
-        light = np.clip(seen[first : first + len(part.vertices)], 0, 1)[:, None]
+        geometry = piece.geometry
+        light = np.clip(seen[first : first + len(geometry.vertices)], 0, 1)[:, None]
         if piece.name == "skin":
             # the vertices behind the neckband are too sparse
             bare = np.clip((layout[:, 1:2] - neckline_height(layout[:, 2:]) - 0.02) / 0.22, 0, 1)
@@ -137,19 +137,21 @@ def bake_occlusion(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bo
             shaded = 0.6 + 0.4 * light
         elif piece.name.startswith("eye"):
             shaded = np.clip(
-                0.95 - 2.2 * (part.vertices[:, 1:2] - part.vertices[0, 1] - 0.005) / 0.1, 0.45, 1.0
+                0.95 - 2.2 * (geometry.vertices[:, 1:2] - geometry.vertices[0, 1] - 0.005) / 0.1,
+                0.45,
+                1.0,
             )
         elif piece.name == "hair":
             shaded = 0.40 + 0.60 * light
         elif piece.name.startswith("teeth"):
-            shaded = (0.5 + 0.5 * np.clip(2 * light, 0, 1)) * _along_teeth(part)
+            shaded = (0.5 + 0.5 * np.clip(2 * light, 0, 1)) * _along_teeth(geometry)
         else:
-            lit = np.clip(0.5 + 1.5 * light, 0, 1) * _into_mouth(part.vertices[:, 2] + 0.22)
+            lit = np.clip(0.5 + 1.5 * light, 0, 1) * _into_mouth(geometry.vertices[:, 2] + 0.22)
             shaded = lit * np.array([1.0, 0.85, 0.85])
-        part.colors = part.colors * shaded
+        geometry.colors = geometry.colors * shaded
         if piece.name.startswith("teeth"):
-            visible = seen[first : first + len(part.vertices)] > _HIDDEN
-            piece.keep(_visible_triangles(part.triangles, visible))
+            visible = seen[first : first + len(geometry.vertices)] > _HIDDEN
+            piece.keep(_visible_triangles(geometry.triangles, visible))
 
 
 def _visible_triangles(
@@ -168,18 +170,18 @@ def _outward(piece: HeadPiece) -> Float:
     """Return normals (V, 3). Normals of hair point away from the skull."""
     points = _open_mouth_vertices(piece)
     if piece.name != "hair":
-        return subdivision.vertex_normals(points, piece.part.triangles)
+        return subdivision.vertex_normals(points, piece.geometry.triangles)
     away = points - _SKULL
     return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
 
 
-def _along_teeth(part: Geometry) -> Float:
+def _along_teeth(geometry: Geometry) -> Float:
     """Return the fraction (V, 1) of the light on a row of teeth: less at the back and inside."""
-    front = part.vertices[:, 2].max()
-    back = (front - part.vertices[:, 2:]) / 0.45
-    outward = (part.vertices - [0, 0, front - 0.4]) * [1, 0, 1]
+    front = geometry.vertices[:, 2].max()
+    back = (front - geometry.vertices[:, 2:]) / 0.45
+    outward = (geometry.vertices - [0, 0, front - 0.4]) * [1, 0, 1]
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    normals = subdivision.vertex_normals(part.vertices, part.triangles)
+    normals = subdivision.vertex_normals(geometry.vertices, geometry.triangles)
     inside = np.clip(-1.5 * (normals * outward).sum(axis=1, keepdims=True), 0, 1)
     return np.asarray(np.clip(1.15 - 2.2 * back, 0.05, 1.0) * (1 - 0.75 * inside))
 

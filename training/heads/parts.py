@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import FORMAT
+from kouxing.services.driver.head.import_head import MAX_VERTICES
+from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import open_output
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.fitted_mesh import FittedMesh
@@ -26,7 +28,7 @@ Index = NDArray[np.int64]
 
 @dataclass(slots=True)
 class Geometry:
-    """Geometry of one piece of the head."""
+    """Vertices and triangles of a ``HeadPiece``."""
 
     vertices: Float  # (V, 3)
     triangles: Index  # (F, 3)
@@ -67,11 +69,11 @@ def eyeball(center: Float, radius: float) -> Geometry:
     return Geometry(vertices, triangles, uv, np.ones((len(vertices), 3)))
 
 
-def pupil_growth(part: Geometry, center: Float) -> Float:
+def pupil_growth(geometry: Geometry, center: Float) -> Float:
     """Return radial directions (V, 3), of unit length at the pupil's edge, for FAPs 29 and 30."""
     angle = np.repeat(EYE_RINGS, _EYE_SEGMENTS + 1)
     weight = np.interp(angle, [0.0, PUPIL_ANGLE, IRIS_ANGLE], [0.0, 1.0, 0.0])
-    outward = (part.vertices - center) * [1.0, 1.0, 0.0]
+    outward = (geometry.vertices - center) * [1.0, 1.0, 0.0]
     length = np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
     return np.asarray(weight[:, None] * outward / length)
 
@@ -83,10 +85,10 @@ TRANSPARENT = ("brows", "lashes", "hair")
 
 @dataclass(slots=True)
 class HeadPiece:
-    """A part with its material and motion."""
+    """A mesh of the head with its material and motion."""
 
     name: str
-    part: Geometry
+    geometry: Geometry
     texture: str
     roughness: float
     head_weight: Float  # (V,)
@@ -96,17 +98,17 @@ class HeadPiece:
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Remove the other triangles (F,) of a piece without coarse ones, and unused vertices."""
-        part = self.part
-        used, triangles, welds = subdivision.used_vertices(part.triangles[mask], _welds(part))
-        self.part = Geometry(
-            part.vertices[used], triangles, part.uv[used], part.colors[used], welds
+        old = self.geometry
+        used, triangles, welds = subdivision.used_vertices(old.triangles[mask], _welds(old))
+        self.geometry = Geometry(
+            old.vertices[used], triangles, old.uv[used], old.colors[used], welds
         )
         self.head_weight = self.head_weight[used]
         self.fields = {fap: shift[used] for fap, shift in self.fields.items()}
 
 
-def _welds(part: Geometry) -> Index:
-    return np.arange(len(part.vertices)) if part.welds is None else part.welds
+def _welds(geometry: Geometry) -> Index:
+    return np.arange(len(geometry.vertices)) if geometry.welds is None else geometry.welds
 
 
 def write(
@@ -119,20 +121,25 @@ def write(
     *,
     cel: bool,
 ) -> None:
-    """Write a head, converting dm to m; ``cel`` as in ``Head``."""
+    """Write a head, converting dm to m; ``cel`` as in ``Head``.
+
+    Raises ``UserError`` if it has too many vertices.
+    """
 
     def meters(points: Float) -> NDArray[np.float32]:
         return np.asarray((points - PIVOT) * METERS_PER_UNIT, dtype=np.float32)
 
-    first = np.cumsum([0] + [len(p.part.vertices) for p in pieces])
+    first = np.cumsum([0] + [len(p.geometry.vertices) for p in pieces])
+    if first[-1] > MAX_VERTICES:
+        raise UserError(f"{output}: the head has {first[-1]} vertices; use at most {MAX_VERTICES}")
     start = {p.name: int(offset) for p, offset in zip(pieces, first, strict=False)}
     part_vertices, part_triangles, triangles = [], [], []
     count = 0
     for piece in pieces:
-        offset, size = start[piece.name], len(piece.part.vertices)
+        offset, size = start[piece.name], len(piece.geometry.vertices)
         end_coarse = offset + (piece.coarse_vertices or size)
         part_vertices.append((offset, end_coarse, offset + size))
-        triangles.append(piece.part.triangles + offset)
+        triangles.append(piece.geometry.triangles + offset)
         fine = (count, count + len(triangles[-1]))
         count = fine[1]
         coarse = fine
@@ -142,7 +149,7 @@ def write(
             count = coarse[1]
         part_triangles.append((*fine, *coarse))
 
-    eyes = [p.part for p in pieces if p.name.startswith("eye")]
+    eyes = [p.geometry for p in pieces if p.name.startswith("eye")]
     points = {
         name: start[piece] + int(surface.number[vertex])
         for piece, surface in (("skin", skin), ("tongue", tongue))
@@ -151,10 +158,10 @@ def write(
     }
     points |= {"3.5": start["eye_left"], "3.6": start["eye_right"]}
     for name, edge, root in (("teeth_upper", "9.10", "9.8"), ("teeth_lower", "9.11", "9.9")):
-        row = next(piece.part for piece in pieces if piece.name == name)
+        row = next(piece.geometry for piece in pieces if piece.name == name)
         at_edge, at_root = middle_of_teeth(row, is_upper=name == "teeth_upper")
         points |= {edge: start[name] + at_edge, root: start[name] + at_root}
-    vertices = np.concatenate([p.part.vertices for p in pieces])
+    vertices = np.concatenate([p.geometry.vertices for p in pieces])
     fapu = {name: value * METERS_PER_UNIT for name, value in fapu.items()} | {"AU": 1e-5}
 
     faps = sorted({fap for piece in pieces for fap in piece.fields})
@@ -172,9 +179,9 @@ def write(
         "format": np.array(FORMAT),
         "cel": np.array(cel),
         "vertices": meters(vertices),
-        "uv": np.round(np.concatenate([p.part.uv for p in pieces]) * 65535).astype(np.uint16),
+        "uv": np.round(np.concatenate([p.geometry.uv for p in pieces]) * 65535).astype(np.uint16),
         "colors": np.round(
-            np.sqrt(np.clip(np.concatenate([p.part.colors for p in pieces]), 0, 1)) * 255
+            np.sqrt(np.clip(np.concatenate([p.geometry.colors for p in pieces]), 0, 1)) * 255
         ).astype(np.uint8),
         "head_weight": np.round(np.concatenate([p.head_weight for p in pieces]) * 255).astype(
             np.uint8
@@ -185,7 +192,9 @@ def write(
         "part_roughness": np.array([p.roughness for p in pieces]),
         "part_transparent": np.array([p.name in TRANSPARENT for p in pieces]),
         "part_double_sided": np.array([p.name in TRANSPARENT for p in pieces]),
-        "welds": np.concatenate([_welds(p.part) + start[p.name] for p in pieces]).astype(np.uint16),
+        "welds": np.concatenate([_welds(p.geometry) + start[p.name] for p in pieces]).astype(
+            np.uint16
+        ),
         "part_vertices": np.array(part_vertices),
         "part_triangles": np.array(part_triangles),
         "fapu_names": np.array(list(fapu)),
@@ -210,13 +219,13 @@ def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[
     pieces = []
     for row, name in enumerate(("eye_left", "eye_right")):
         center = eye_centers(vertices, mesh)[row]
-        part = eyeball(center, eye_radius(vertices, mesh))
-        count = len(part.vertices)
+        geometry = eyeball(center, eye_radius(vertices, mesh))
+        count = len(geometry.vertices)
         fields = {
             27 + row: np.tile([0.0, 0.0, fapu["ES"]], (count, 1)),
-            29 + row: pupil_growth(part, center) * fapu["IRISD"] / 2,
+            29 + row: pupil_growth(geometry, center) * fapu["IRISD"] / 2,
         }
-        pieces.append(HeadPiece(name, part, "eye", 0.12, np.ones(count), fields))
+        pieces.append(HeadPiece(name, geometry, "eye", 0.12, np.ones(count), fields))
     return pieces
 
 
@@ -234,12 +243,12 @@ def teeth_pieces(teeth: FittedMesh, vertices: Float, fapu: dict[str, float]) -> 
     ):
         row = teeth.keep_triangles(in_row & (depth > depth[in_row].max() - _TEETH_DEPTH))
         points = row.fit(vertices)
-        part = Geometry(points, row.triangles, row.uv, np.ones_like(points), row.welds)
-        middle = points[middle_of_teeth(part, is_upper=name == "teeth_upper")[0]]
-        part.vertices = points - [0, middle[1] - edge, middle[2] - front]
+        geometry = Geometry(points, row.triangles, row.uv, np.ones_like(points), row.welds)
+        middle = points[middle_of_teeth(geometry, is_upper=name == "teeth_upper")[0]]
+        geometry.vertices = points - [0, middle[1] - edge, middle[2] - front]
         still = np.ones(len(points))
-        fields = jaw_fields(part.vertices, still, fapu) if name == "teeth_lower" else {}
-        pieces.append(HeadPiece(name, part, "teeth", 0.3, still, fields))
+        fields = jaw_fields(geometry.vertices, still, fapu) if name == "teeth_lower" else {}
+        pieces.append(HeadPiece(name, geometry, "teeth", 0.3, still, fields))
     return pieces
 
 
@@ -260,10 +269,10 @@ def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> HeadPiece:
     sunk = 0.110 - 0.052 * to_tip**2 + groove + 0.02 * np.abs(x) / 0.19
     points = np.stack([1.28 * x, y - sunk, z - 0.03], axis=1)
     uv = np.clip(points[:, [0, 2]] * [1.8, 1.4] + [0.5, -0.65], 0, 1)
-    part = Geometry(points, subdivision.triangles_of(tongue.quads), uv, np.ones_like(points))
+    geometry = Geometry(points, subdivision.triangles_of(tongue.quads), uv, np.ones_like(points))
     return HeadPiece(
         "tongue",
-        part,
+        geometry,
         "tongue",
         0.4,
         np.ones(len(points)),
