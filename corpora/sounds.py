@@ -43,7 +43,7 @@ def read_sounds(folders: Sequence[Path], *, any_license: bool) -> list[Sound]:
         manifest = folder / "manifest.tsv"
         rows = read_rows(manifest, ("path", "kind", "license"))
         if not rows:
-            raise UserError(f"{manifest} lists no sounds")
+            raise UserError(f"{manifest} has no rows; list one sound per row")
         for row in rows:
             if any_license or may_distribute(row["license"]):
                 sounds += _split_sound(row["kind"], folder / row["path"])

@@ -115,7 +115,7 @@ def parse_delay_s(delay_ms: str | float) -> float:
         number = -1.0
     if number != 0.0 and not 1.0 <= number <= MAX_DELAY_MS:
         raise UserError(
-            f"the delay {delay_ms!r} is not 0 or a number of milliseconds from 1 to"
-            f" {MAX_DELAY_MS:g}"
+            f"the delay must be 0 or 1 to {MAX_DELAY_MS:g} ms, not {delay_ms!r};"
+            " a value in seconds must be multiplied by 1000"
         )
     return number / 1e3

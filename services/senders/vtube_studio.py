@@ -76,7 +76,10 @@ class VTubeStudioProtocol:
             }
             return handlers[kind](data) if kind in handlers else ""
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise UserError("the program at this address is not VTube Studio") from None
+            raise UserError(
+                "the program at this address is not VTube Studio; check the port in its settings"
+                " (8001 by default)"
+            ) from None
 
     def frame_message(self, frame: FaceFrame, *, is_mouth_only: bool) -> str:
         """Return the message that shows a frame."""

@@ -185,7 +185,7 @@ def test_options_do_not_identify_a_target() -> None:
         ("vmc://?shapes=fap", "vrm or arkit"),
         ("vts://?shapes=vrm", "unknown option"),
         ("vmc://?delay=-1", "milliseconds"),
-        ("vmc://?delay=0.12", "'0.12' is not 0 or a number of milliseconds from 1 to"),
+        ("vmc://?delay=0.12", "must be 0 or 1 to 10000 ms, not '0.12'"),
         ("osc://?prefix=kouxing", "start with '/'"),
         (f"osc://?prefix=/{'a' * 64}", "longer than 64"),
         ("osc://?prefix=/%00/", "not printable"),

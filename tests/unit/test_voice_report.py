@@ -102,7 +102,7 @@ def test_music_is_held_out_and_10_db_below_the_speech(sounds: list[Sound]) -> No
 @pytest.mark.parametrize(
     ("rows", "problem"),
     [
-        ([], "lists no sounds"),
+        ([], "has no rows"),
         (["a.flac\t"], "lacks the column license"),
         (["short row"], "this is a folder; expected a file"),
     ],

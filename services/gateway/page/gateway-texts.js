@@ -119,7 +119,8 @@ const CHINESE = {
   "VTube Studio's API is off; turn on 'Start API (allow plugins)' in its settings":
     "VTube Studio 的 API 未打开，请在其设置中打开“Start API (allow plugins)”",
   "access to VTube Studio was denied; to get the prompt again, stop and restart sending": "VTube Studio 拒绝了访问；停止后再开始发送会重新询问",
-  "the program at this address is not VTube Studio": "此地址的程序不是 VTube Studio",
+  "the program at this address is not VTube Studio; check the port in its settings (8001 by default)":
+    "此地址的程序不是 VTube Studio，请核对其设置中的端口（默认 8001）",
   "another plugin sets the same parameters: {text}": "另一个插件在设置同样的参数：{text}",
   "VTube Studio closed the connection; trying again": "VTube Studio 断开了连接，正在重试",
   "VTube Studio is not running at {address}; start it, and turn on 'Start API (allow plugins)' in its settings":
@@ -135,7 +136,8 @@ const CHINESE = {
   "{name} must be {values}": "{name} 必须是 {values}",
   "{name} contains a character that is not printable": "{name} 含有不可打印的字符",
   "{name} is longer than {count} characters": "{name} 超过 {count} 个字符",
-  "the delay {delay} is not 0 or a number of milliseconds from 1 to {most}": "延迟 {delay} 既不是 0，也不是 1 到 {most} 毫秒的数",
+  "the delay must be 0 or 1 to {most} ms, not {delay}; a value in seconds must be multiplied by 1000":
+    "延迟必须是 0 或 1 到 {most} 毫秒，不能是 {delay}；以秒为单位的数请乘以 1000",
 };
 
 // Reasons of control's errors, for texts that are not translated above
