@@ -184,7 +184,7 @@ def test_options_do_not_identify_a_target() -> None:
         ("vmc://?delai=3", "use delay"),
         ("vmc://?shapes=fap", "vrm or arkit"),
         ("vts://?shapes=vrm", "unknown option"),
-        ("vmc://?delay=-1", "milliseconds"),
+        ("vmc://?delay=-1", "0 or 1 to 10000 ms"),
         ("vmc://?delay=0.12", "must be 0 or 1 to 10000 ms, not '0.12'"),
         ("osc://?prefix=kouxing", "start with '/'"),
         (f"osc://?prefix=/{'a' * 64}", "longer than 64"),
