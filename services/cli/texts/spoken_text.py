@@ -100,7 +100,8 @@ def read_spoken_text(text: str, language: str = DEFAULT_LANGUAGE) -> str:
     formats = [name for name in (spoken.format_name, decoded.encoding) if name]
     if formats:
         name = "the text" if path is None else str(path)
-        print_message(f"{name} was read as {' in '.join(formats)}")
+        remedy = "; if its characters are wrong, save it in UTF-8" if decoded.encoding else ""
+        print_message(f"{name} was read as {' in '.join(formats)}{remedy}")
     elif time := _CLOCK_TIME.match(spoken.text):
         print_message(f"{time[0]} is read as a spoken time of day; delete it if it is not spoken")
     if len(labels := _LABEL.findall(spoken.text)) > 1:
