@@ -95,8 +95,8 @@ class Utterance:
         return self.seconds / 60
 
     @property
-    def kind(self) -> str:
-        """The kind of speech: ``sentence``, ``word`` or ``synthetic``."""
+    def speech_kind(self) -> str:
+        """The kind of speech: ``synthetic``, ``word`` (few phones) or ``sentence``."""
         if self.is_synthetic:
             return "synthetic"
         return "word" if len(self.phones) <= _MAX_WORD_PHONES else "sentence"

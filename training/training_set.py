@@ -39,7 +39,7 @@ class Example:
     syllables: tuple[int, ...]  # number of phones in each syllable
     weight: float  # weight of its frames in the estimates
     license: str
-    kind: str  # see ``Utterance.kind``
+    speech_kind: str  # see ``Utterance.speech_kind``
     speaker: str
 
     @property
@@ -89,7 +89,7 @@ def load_examples(
                 syllables=utterance.syllables,
                 weight=weight,
                 license=utterance.license,
-                kind=utterance.kind,
+                speech_kind=utterance.speech_kind,
                 speaker=utterance.speaker,
             )
         )

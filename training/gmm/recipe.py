@@ -155,7 +155,7 @@ def _copies(example: Example, rng: np.random.Generator) -> list[RecordingCopy]:
     Low-weight recordings are sampled less often.
     """
     num_copies, weight = 1, example.weight
-    if example.kind != "synthetic":
+    if example.speech_kind != "synthetic":
         if len(example.syllables) >= _MIN_SENTENCE_SYLLABLES:
             num_copies = _SENTENCE_COPIES
         else:

@@ -79,8 +79,8 @@ def label(
     num_of_kind: Counter[str] = Counter()
     teacher_set = []
     for example, recording in zip(aligned, recordings, strict=True):
-        num_of_kind[example.kind] += 1
-        if num_of_kind[example.kind] <= _TEACHER_SET:
+        num_of_kind[example.speech_kind] += 1
+        if num_of_kind[example.speech_kind] <= _TEACHER_SET:
             teacher_set.append(recording)
     teacher = train_teacher(encoder, teacher_set, STATES_PER_PHONE * len(aligner.inventory))
     sounds = [recording.samples for recording in recordings]
@@ -110,15 +110,15 @@ def _recordings(
     pairs = list(zip(examples, alignments, strict=True))
     frames = dict.fromkeys(kinds, 0.0)
     for example, alignment in pairs:
-        frames[example.kind] += example.weight * len(alignment.states)
+        frames[example.speech_kind] += example.weight * len(alignment.states)
     return [
         LabeledRecording(
             samples=example.samples,
             targets=FrameTargets.hard(alignment.states),
-            weight=kinds[example.kind]
+            weight=kinds[example.speech_kind]
             * example.weight
             * len(alignment.states)
-            / frames[example.kind],
+            / frames[example.speech_kind],
         )
         for example, alignment in pairs
     ]

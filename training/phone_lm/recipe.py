@@ -222,7 +222,7 @@ def train_phone_lm(
         row.phones
         for corpus in corpora
         for row in read_corpus(corpus, errors, inventory, split="train")
-        if row.kind == "sentence"
+        if row.speech_kind == "sentence"
     }
     corpus_stream = join_sentences(sorted(sentences), inventory)
     num_text = sum(map(len, streams))

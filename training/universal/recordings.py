@@ -104,7 +104,7 @@ def _sample_mandarin(corpus: Path, errors: RowErrors, *, any_license: bool) -> l
     random.Random(3).shuffle(rows)  # noqa: S311 - reproducible
     by_kind: dict[str, list[Utterance]] = defaultdict(list)
     for row in rows:
-        by_kind[row.kind].append(row)
+        by_kind[row.speech_kind].append(row)
     drawn = [
         row for kind, recordings in by_kind.items() for row in recordings[: _MANDARIN_LIMITS[kind]]
     ]
