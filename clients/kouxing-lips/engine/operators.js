@@ -52,43 +52,42 @@ const BINARY = {
   },
 };
 
+/** Return the operation that computes a tensor of a shape by a function (values, memory). */
+function computed(shape, compute) {
+  const out = tensorOf(shape);
+  return { outputs: [out], start: (memory) => () => compute(out.values, memory) };
+}
+
 function unary({ type }, [x]) {
-  const out = tensorOf(x.shape);
   const compute = UNARY[type];
-  return { outputs: [out], start: () => () => compute(out.values, x.values) };
+  return computed(x.shape, (out) => compute(out, x.values));
 }
 
 /** Return the operator that computes factor * tanh(factor * x) + offset. */
 function activation(factor, offset) {
-  return (_node, [x]) => {
-    const out = tensorOf(x.shape);
-    const start = (memory) => () => memory.activate(byteOffsetOf(x), byteOffsetOf(out), out.length, factor, offset);
-    return { outputs: [out], start };
-  };
+  return (_node, [x]) =>
+    computed(x.shape, (out, memory) => memory.activate(byteOffsetOf(x), out.byteOffset, out.length, factor, offset));
 }
 
 function binary({ type }, [x, y]) {
-  const out = tensorOf(broadcastShape(x.shape, y.shape));
+  const outShape = broadcastShape(x.shape, y.shape);
   const compute = BINARY[type];
-  const count = out.shape.at(-1) ?? 1;
-  const [xRows, yRows] = [x, y].map(({ shape }) => rowsOf(shape, out.shape));
-  const start = () => () => {
+  const count = outShape.at(-1) ?? 1;
+  const [xRows, yRows] = [x, y].map(({ shape }) => rowsOf(shape, outShape));
+  return computed(outShape, (out) => {
     for (let row = 0; row < xRows.starts.length; row++) {
-      compute(out.values, row * count, count, x.values, xRows.starts[row], xRows.step, y.values, yRows.starts[row], yRows.step);
+      compute(out, row * count, count, x.values, xRows.starts[row], xRows.step, y.values, yRows.starts[row], yRows.step);
     }
-  };
-  return { outputs: [out], start };
+  });
 }
 
 /** Return the operator that computes each row of the last axis by a function (out, x, at, end). */
 function rowwise(compute) {
   return (_node, [x]) => {
-    const out = tensorOf(x.shape);
     const count = x.shape.at(-1);
-    const start = () => () => {
-      for (let at = 0; at < out.length; at += count) compute(out.values, x.values, at, at + count);
-    };
-    return { outputs: [out], start };
+    return computed(x.shape, (out) => {
+      for (let at = 0; at < out.length; at += count) compute(out, x.values, at, at + count);
+    });
   };
 }
 
@@ -111,11 +110,9 @@ export const OPERATORS = {
   }),
   ReduceMax(_node, [x]) {
     const count = x.shape.at(-1);
-    const out = tensorOf(x.shape.slice(0, -1));
-    const start = () => () => {
-      for (let row = 0; row < out.length; row++) out.values[row] = maximum(x.values, row * count, (row + 1) * count);
-    };
-    return { outputs: [out], start };
+    return computed(x.shape.slice(0, -1), (out) => {
+      for (let row = 0; row < out.length; row++) out[row] = maximum(x.values, row * count, (row + 1) * count);
+    });
   },
   LayerNormalization({ attributes: { epsilon } }, [x, weight, bias]) {
     const normalize = rowwise((out, values, at, end) => {
@@ -128,20 +125,14 @@ export const OPERATORS = {
     });
     return normalize(null, [x]);
   },
-  Clip(_node, [x, lowest, highest]) {
-    const out = tensorOf(x.shape);
-    const start = () => () => {
-      for (let i = 0; i < out.length; i++) out.values[i] = Math.min(Math.max(x.values[i], lowest.values[0]), highest.values[0]);
-    };
-    return { outputs: [out], start };
-  },
-  Where(_node, [condition, yes, no]) {
-    const out = tensorOf(condition.shape);
-    const start = () => () => {
-      for (let i = 0; i < out.length; i++) out.values[i] = condition.values[i] ? yes.values[0] : no.values[0];
-    };
-    return { outputs: [out], start };
-  },
+  Clip: (_node, [x, lowest, highest]) =>
+    computed(x.shape, (out) => {
+      for (let i = 0; i < out.length; i++) out[i] = Math.min(Math.max(x.values[i], lowest.values[0]), highest.values[0]);
+    }),
+  Where: (_node, [condition, yes, no]) =>
+    computed(condition.shape, (out) => {
+      for (let i = 0; i < out.length; i++) out[i] = condition.values[i] ? yes.values[0] : no.values[0];
+    }),
   Unsqueeze: (_node, [x, { values: axes }]) => {
     const shape = [...x.shape];
     for (const axis of axes) shape.splice(axis < 0 ? shape.length + 1 + axis : axis, 0, 1);
@@ -153,9 +144,7 @@ export const OPERATORS = {
   },
   // values are stored as 32-bit numbers, rounded to the type
   Cast({ attributes: { to } }, [x]) {
-    if (to !== HALF) return { outputs: [viewOf(x, x.shape)] };
-    const out = tensorOf(x.shape);
-    return { outputs: [out], start: () => () => roundToHalf(out.values, x.values) };
+    return to === HALF ? computed(x.shape, (out) => roundToHalf(out, x.values)) : { outputs: [viewOf(x, x.shape)] };
   },
   Shape: (_node, [x]) => ({ outputs: [constant([x.shape.length], x.shape)] }),
   ConstantOfShape: ({ attributes: { value } }, [{ values: shape }]) => ({
@@ -164,19 +153,18 @@ export const OPERATORS = {
   Concat({ attributes: { axis } }, parts) {
     const at = axis < 0 ? parts[0].shape.length + axis : axis;
     const shape = parts[0].shape.with(at, parts.reduce((sum, part) => sum + part.shape[at], 0));
-    const out = tensorOf(shape);
     const inner = shape.slice(at + 1).reduce((a, b) => a * b, 1);
     const period = shape[at] * inner;
     let begin = 0;
     const places = parts.map((part) => ({ begin: (begin += part.shape[at] * inner) - part.shape[at] * inner, count: part.shape[at] * inner }));
-    const start = () => () =>
+    return computed(shape, (out) =>
       places.forEach(({ begin: first, count }, i) => {
         const { values } = parts[i];
         for (let from = 0, to = first; from < values.length; from += count, to += period) {
-          for (let k = 0; k < count; k++) out.values[to + k] = values[from + k];
+          for (let k = 0; k < count; k++) out[to + k] = values[from + k];
         }
-      });
-    return { outputs: [out], start };
+      }),
+    );
   },
   Split({ attributes: { axis }, outputs }, [x, lengths]) {
     const at = axis === undefined ? 0 : axis < 0 ? x.shape.length + axis : axis;
@@ -406,12 +394,10 @@ function sliceAxis(x, axis, begin, end, step) {
 function gather(x, shape, strides, first) {
   const places = offsets(shape, strides, first);
   if (places.every((place, i) => place === first + i)) return { outputs: [viewOf(x, shape, first)] };
-  const out = tensorOf(shape);
-  const start = () => () => {
+  return computed(shape, (out) => {
     const { values } = x;
-    for (let i = 0; i < places.length; i++) out.values[i] = values[places[i]];
-  };
-  return { outputs: [out], start };
+    for (let i = 0; i < places.length; i++) out[i] = values[places[i]];
+  });
 }
 
 /** Return one operation with the outputs of several. */
