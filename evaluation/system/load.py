@@ -108,16 +108,12 @@ def measure(
     settings = {"KOUXING_CONTROL_MAX_SESSIONS": "2000"}  # so that only load causes rejections
     delay_s = read_settings().load(SynthesizerConfig).delay_ms / 1e3
     steps: list[Step] = []
+    sizes = [max(1, round(num_sessions * n / MAX_STEPS)) for n in range(1, MAX_STEPS + 1)]
     with run_all_services(console, settings) as system:
-        for num in step_sizes(num_sessions):
+        for num in sorted({1, *sizes}):
             steps.append(_step(system.control, speech, num, step_s, delay_s, language))
             time.sleep(PAUSE_S)
     return Load(steps, num_cores(), machine_load, delay_s * 1e3)
-
-
-def step_sizes(maximum: int) -> list[int]:
-    """Return the number of sessions of each step."""
-    return sorted({1, *(max(1, round(maximum * n / MAX_STEPS)) for n in range(1, MAX_STEPS + 1))})
 
 
 def _step(

@@ -33,11 +33,6 @@ class NetworkLink:
     delay_ms: float = 0.0
     loss: float = 0.0  # fraction of lost packets
 
-    @property
-    def jitter_ms(self) -> float:
-        """Largest random change of the delay."""
-        return self.delay_ms / 5
-
 
 class Network:
     """Up to 250 hosts with one address each; their names have up to 15 letters.
@@ -129,9 +124,10 @@ class Network:
     def _start_delay(self) -> None:
         """Send all packets of hosts through a process that returns them later."""
         module = [sys.executable, "-m", "kouxing.evaluation.system.packet_delay", DELAY_DEVICE]
-        delay_ms = str(self._link.delay_ms), str(self._link.jitter_ms)
+        delay_ms = self._link.delay_ms
+        jitter_ms = delay_ms / 5  # largest random change of the delay
         self._delayer = subprocess.Popen(  # noqa: S603 - our own module
-            _command(self._router, *module, *delay_ms)
+            _command(self._router, *module, str(delay_ms), str(jitter_ms))
         )
         show = ("ip", "-brief", "link", "show", "up")
         if not wait_until(lambda: DELAY_DEVICE in self._on_router(*show), _READY_S):

@@ -164,7 +164,8 @@ class Service(MessageLoop):
         gc.freeze()  # a full collection would stop the loop for 100 ms
         gc.enable()  # see services.process
         trim_heap()
-        self.main_loop()
+        while not self.should_exit:
+            self.step(IDLE_HEARTBEAT_S)
         self.shutdown()
 
     def startup(self) -> None:
@@ -185,11 +186,6 @@ class Service(MessageLoop):
             self._log_ready()
         else:
             LOG.info("waiting for control at %s", self.config.control)
-
-    def main_loop(self) -> None:
-        """Handle messages until the service should exit."""
-        while not self.should_exit:
-            self.step(IDLE_HEARTBEAT_S)
 
     def shutdown(self) -> None:
         """Finish the work in progress within the deadline, and close all sockets."""

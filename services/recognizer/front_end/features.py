@@ -53,20 +53,9 @@ _ENERGY_PRIOR_FRAMES = 30.0  # fewer: the level converges faster than the timbre
 _PEAK_DECAY = 0.005  # per frame, natural log of power: 2 dB a second
 _SPEECH_BELOW_PEAK = 6.9  # natural log of power (30 dB): the mean ignores quieter frames
 
-
-def hz_to_mel(hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert frequencies to the mel scale."""
-    return MELS * np.log1p(hz / MEL_KNEE_HZ)
-
-
-def mel_to_hz(mel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert mels to frequencies."""
-    return MEL_KNEE_HZ * np.expm1(mel / MELS)
-
-
-LOWEST_MEL, HIGHEST_MEL = hz_to_mel(np.array([LOWEST_HZ, HIGHEST_HZ]))
+LOWEST_MEL, HIGHEST_MEL = MELS * np.log1p(np.array([LOWEST_HZ, HIGHEST_HZ]) / MEL_KNEE_HZ)
 BAND_MEL = np.linspace(LOWEST_MEL, HIGHEST_MEL, NUM_BANDS + 2)[1:-1]  # centers of the bands
-BAND_HZ = mel_to_hz(BAND_MEL)
+BAND_HZ = MEL_KNEE_HZ * np.expm1(BAND_MEL / MELS)
 
 
 def _filter_bank() -> knf.OnlineFbank:

@@ -36,7 +36,7 @@ from kouxing.services.synthesizer.lips.learned.closure_rule import (
     separate_lips,
 )
 from kouxing.services.synthesizer.lips.learned.lip_track import HOLD_S, MAX_GAP_S, LipTrack
-from kouxing.services.synthesizer.lips.learned.resting_lips import RestingLips, blend_with_ajar
+from kouxing.services.synthesizer.lips.learned.resting_lips import AJAR, RestingLips
 from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
 from kouxing.services.synthesizer.lips.trajectory import (
     NO_TRANSITION,
@@ -247,7 +247,7 @@ class LearnedStream:
     def _frame(self, articulation: Articulation) -> MouthFrame:
         faps = self._mouth.value.copy()
         separate_lips(faps)  # an interrupted closing movement overshoots
-        blend_with_ajar(faps, self._ajar)
+        faps += self._ajar * (AJAR - faps)
         faps[_UNTRACKED] = self._tongue[_UNTRACKED]
         return MouthFrame(faps, articulation)
 

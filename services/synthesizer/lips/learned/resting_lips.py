@@ -31,7 +31,6 @@ import math
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -219,8 +218,3 @@ def _transition_to(goal: float, amount: float, velocity: float, duration_s: floa
     """Return the transition from an amount and its velocity to a goal."""
     difference = FapState(np.array([amount - goal]), np.array([velocity]))
     return Transition(difference, np.array([duration_s]))
-
-
-def blend_with_ajar(faps: NDArray[np.float64], amount: float) -> None:
-    """Move the mouth, FAPs (num_mouth_faps,), toward the ajar mouth, in place."""
-    faps += amount * (AJAR - faps)
