@@ -145,6 +145,7 @@ test("a session continues after an error, unless the gateway closes the connecti
 test("after a failed load, <kouxing-face> loads local lip sync again", async () => {
   class FakeElement {
     style = {};
+    isConnected = true;
     append() {}
     addEventListener() {}
     attachShadow = () => this;
