@@ -28,7 +28,7 @@ class FakeTimeLoop(asyncio.SelectorEventLoop):
 
 
 def with_fake_time(test: Callable[..., Coroutine[None, None, None]]) -> Callable[..., None]:
-    """Run a test that is a coroutine in such a loop."""
+    """Run a coroutine test in a ``FakeTimeLoop``."""
 
     @functools.wraps(test)
     def run(**arguments: object) -> None:

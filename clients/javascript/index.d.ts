@@ -112,7 +112,7 @@ export class Speaker {
 
 /**
  * Read a `.csv` or `.jsonl` file of `kouxing listen -o` or `kouxing render`, or a take (`.csv`) of the
- * app Live Link Face. Bytes are UTF-8, or UTF-16 with a byte order mark. Throws an error if the recording has no times or no frames, a value
+ * Live Link Face app. Bytes are UTF-8, or UTF-16 with a byte order mark. Throws an error if the recording has no times or no frames, a value
  * is not a number, or a time is earlier than the previous one.
  */
 export function readRecording(content: string | ArrayBuffer | Uint8Array): {

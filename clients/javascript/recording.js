@@ -1,5 +1,5 @@
 // Reads the .csv and .jsonl files of `kouxing listen -o` and `kouxing render`, with FAPs or shapes,
-// and takes (.csv) of the app Live Link Face. Frames of a take without a face, with a count of 0, are left out.
+// and takes (.csv) of the Live Link Face app. Frames of a take without a face, with a count of 0, are left out.
 // Tables of spreadsheet programs may be in UTF-16, and have semicolons or tabs with decimal commas.
 // The values of these tables are numbers, times and names, so no CSV package is needed. Quotes are removed.
 

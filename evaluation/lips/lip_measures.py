@@ -61,12 +61,12 @@ class ScoredClip:
         return self.predicted.at("opening", self.real.time_s)[self.in_speech]
 
     @cached_property
-    def closures(self) -> DetectionCounts:
-        """Real and predicted closures."""
+    def closure_counts(self) -> DetectionCounts:
+        """Numbers of real and predicted closures."""
         return closures(self.predicted, self.real)
 
     @cached_property
-    def contacts(self) -> list[Contact]:
+    def predicted_closures(self) -> list[Contact]:
         """Predicted closures."""
         return contacts(self.predicted, self.real)
 
@@ -124,7 +124,7 @@ def misalignment_ms(clips: ScoredClips) -> float | None:
 
 def closure_detections(clips: ScoredClips) -> DetectionCounts:
     """Compare the closures of all clips."""
-    return sum((clip.closures for clip in clips), DetectionCounts())
+    return sum((clip.closure_counts for clip in clips), DetectionCounts())
 
 
 def class_precision(clips: ScoredClips, name: str) -> float | None:
@@ -132,7 +132,7 @@ def class_precision(clips: ScoredClips, name: str) -> float | None:
     return _mean_of_all(
         contact.is_true
         for clip in clips
-        for contact in clip.contacts
+        for contact in clip.predicted_closures
         if closure_class(clip.reference, contact.time_s) == name
     )
 

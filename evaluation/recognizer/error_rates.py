@@ -72,7 +72,7 @@ class LabialCounts:
             self._num_both += is_spoken and is_recognized
 
     def rates(self) -> dict[str, float | None]:
-        """Return recall and precision, any labial counting for any other; None without phones."""
+        """Return recall and precision, or None without phones. Any labial matches any other."""
         return {
             name: self._num_both / total if total else None
             for name, total in (("recall", self._num_spoken), ("precision", self._num_recognized))

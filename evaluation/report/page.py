@@ -19,8 +19,8 @@ from kouxing.evaluation.tables import Figures, Table
 PICTURE = "delay.png"
 _TEMPLATE = Path(__file__).with_name("template.md")
 
-# Each table has the steps whose results it shows, and a function of the result of each step. The
-# result of a step that is not measured is empty.
+# Each table lists the steps whose results it shows, and a function that makes the table from these
+# results. A step that was not measured has an empty result.
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., Table]]] = {
     "recognition": (
         ("read", "conversation", "disturbed", "languages"),

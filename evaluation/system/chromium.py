@@ -53,7 +53,7 @@ class Chromium:
             *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
             *("--no-first-run", "--disable-background-networking", "--disable-sync"),
             "--disable-component-update",
-            # pages of the address bar, which need more time than the rest of the start
+            # the address bar's pages take longer to load than the rest of the browser
             "--disable-features=WebUIOmniboxPopup,WebUIOmniboxAimPopup",
             "--autoplay-policy=document-user-activation-required",
             *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),

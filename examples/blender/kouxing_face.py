@@ -1,7 +1,7 @@
 """Blender add-on: a face with shape keys speaks, live or from a recording. Blender 4.2 to 5.0.
 
 It moves all shape keys of the scene that have one of ARKit's 52 names. Live weights arrive by UDP
-in the format of the app Live Link Face (`kouxing send livelink://127.0.0.1:11111`). A recording is
+in the format of the Live Link Face app (`kouxing send livelink://127.0.0.1:11111`). A recording is
 a file of `kouxing render my.wav my.csv --as arkit`, or a .jsonl file; for a take of the app, run
 `kouxing render take.csv my.csv --as arkit` first. Install this file with "Edit
 > Preferences > Add-ons > Install from Disk". The panel is in the sidebar (N) of the 3-D view.

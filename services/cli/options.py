@@ -88,7 +88,7 @@ class CurveFormat(StrEnum):
     OCULUS = ShapeSetName.OCULUS
     VRM = ShapeSetName.VRM
     RHUBARB = "rhubarb"  # drawn mouths, A to H and X, of Rhubarb Lip Sync
-    LIVELINK = "livelink"  # ARKit and head angles, as the app Live Link Face records them
+    LIVELINK = "livelink"  # ARKit and head angles, as the Live Link Face app records them
 
 
 class ListenFormat(StrEnum):

@@ -183,7 +183,7 @@ def measure_gain(lip_predictor: GruLipPredictor, observations: Observations) -> 
     versions = (held_out.tracked, held_out.predicted, apply_profile(profile, held_out))
     tracked, before, after = (lip_measures(faps[:, delay]) for faps in versions)
     return ProfileGain(
-        speech_s=_tracked_s(held_out),
+        speech_s=_tracked_speech_s(held_out),
         delay_s=delay_s,
         before=correlate_curves([(before, tracked)]),
         after=correlate_curves([(after, tracked)]),
@@ -210,7 +210,7 @@ def _is_known(observations: Observations) -> NDArray[np.bool_]:
     return known
 
 
-def _tracked_s(observations: Observations) -> float:
+def _tracked_speech_s(observations: Observations) -> float:
     """Return the duration of the speech with tracked lips."""
     return int(_is_known(observations).sum()) * ENCODER_FRAME_S
 
@@ -286,7 +286,7 @@ def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     observations = Observations.join([observe(lip_predictor, filmed) for filmed in recordings])
     return LearnedProfile(
         content=fit_profile(observations).to_bytes(lip_predictor.digest),
-        speech_s=_tracked_s(observations),
+        speech_s=_tracked_speech_s(observations),
         gain=measure_gain(lip_predictor, observations),
     )
 

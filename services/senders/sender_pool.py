@@ -255,7 +255,7 @@ class SenderPool:
 
 
 def _show_error(connection: TargetConnection, task: asyncio.Task[None]) -> None:
-    """Show the error that ended a connection, which may be of another distribution."""
+    """Show the error that ended a connection. Its protocol may come from another package."""
     error = None if task.cancelled() else task.exception()
     if error is not None:
         connection.problem = f"the connection ended: {error!r}; stop and restart sending"

@@ -10,18 +10,18 @@ from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 
 Characters = Sequence[tuple[str, Syllable]]  # each character and its phones
-GAP = 0.7  # cost of a missing or inserted syllable; a wrong one costs up to 1
+GAP_COST = 0.7  # cost of a missing or inserted syllable; a wrong one costs at most 1
 
 
 def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> list[int | None]:
     """Return the index in the text of each syllable recognized so far; None: not in the text."""
     # costs[i][j]: of i recognized syllables and j of the text
-    costs = [[GAP * j for j in range(len(text) + 1)]]
+    costs = [[GAP_COST * j for j in range(len(text) + 1)]]
     for i, syllable in enumerate(recognized, start=1):
-        costs.append([GAP * i])
+        costs.append([GAP_COST * i])
         for j, spoken in enumerate(text):
             both = costs[i - 1][j] + _syllable_distance(syllable, spoken)
-            costs[i].append(min(both, GAP + costs[i - 1][j + 1], GAP + costs[i][j]))
+            costs[i].append(min(both, GAP_COST + costs[i - 1][j + 1], GAP_COST + costs[i][j]))
     indices: list[int | None] = [None] * len(recognized)
     i = len(recognized)
     j = min(range(len(text) + 1), key=costs[i].__getitem__)  # the remaining text is not spoken yet
@@ -29,7 +29,7 @@ def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) ->
         if costs[i][j] == costs[i - 1][j - 1] + _syllable_distance(recognized[i - 1], text[j - 1]):
             i, j = i - 1, j - 1
             indices[i] = j
-        elif costs[i][j] == GAP + costs[i - 1][j]:
+        elif costs[i][j] == GAP_COST + costs[i - 1][j]:
             i -= 1
         else:
             j -= 1

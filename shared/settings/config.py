@@ -7,8 +7,8 @@ unknown key, table or variable is an error that names the nearest known one.
 
 Each service declares its keys as a subclass of ``ServiceConfig`` in its ``config.py``. pydantic
 checks types and ranges. pydantic-settings is not used: it has no table of common keys, ignores
-unknown variables, and does not report where a value came from. It would replace only the call of
-tomllib and the selection of variables by their prefix.
+unknown variables, and does not report where a value came from. It would replace only the call to
+tomllib and the selection of variables by prefix.
 """
 
 import difflib

@@ -26,7 +26,7 @@ from tests.heads import neutral_faps
 from tests.system import DEMO, Gateway, wait_until
 
 NUM_PICTURES = 8
-# A busy machine finds a face in too few images; on another one, there is too little speech.
+# On a busy machine, a face is found in too few images. Otherwise, there is too little speech.
 REFUSAL = r"film (it for )?\d+ s or more"
 
 

@@ -26,7 +26,7 @@ from tests.fake_control import FakeControl
 from tests.samples import START, fap_frame
 from tests.system import wait_until
 
-VIDEO_NUMBERS = count()  # a recorder receives no number again
+VIDEO_NUMBERS = count()  # a recorder never receives the same number twice
 
 
 class DriverHarness:
@@ -98,7 +98,7 @@ class DriverHarness:
 
 @pytest.fixture(scope="module")
 def idle_recorders() -> Iterator[list[_RecorderProcess]]:
-    """The recorder of an earlier driver, if it is idle: starting one takes long."""
+    """The idle recorder of an earlier driver, if any, because starting a recorder takes long."""
     recorders: list[_RecorderProcess] = []
     yield recorders
     for recorder in recorders:

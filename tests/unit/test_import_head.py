@@ -142,7 +142,7 @@ GOOD_POINTS = point_lines(ORIGINAL, lambda place: place)
 
 
 def swapped_points(*names: str) -> str:
-    """Return points some of which have the position of another."""
+    """Return feature points; each of the named points has the position of the next one."""
     places = dict(row.split("\t", 1) for row in GOOD_POINTS.splitlines()[1:])
     shifted = {name: places[names[(i + 1) % len(names)]] for i, name in enumerate(names)}
     return "".join(f"{name}\t{place}\n" for name, place in (places | shifted).items())

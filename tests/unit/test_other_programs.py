@@ -1,4 +1,4 @@
-"""Curves of other programs: they are made and scored, and a fault is named."""
+"""Curves of other programs are created and scored, and faults are reported."""
 
 from pathlib import Path
 

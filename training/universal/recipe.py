@@ -158,7 +158,7 @@ def _phones_of(states: NDArray[np.int64]) -> list[PathSegment]:
 def export_extension(
     readout: BlockReadout, model: BlockModel, layers: Sequence[int]
 ) -> NDArray[np.uint8]:
-    """Export a readout of some layers, which must be among those that the model's readout reads.
+    """Export a readout. Its layers must be among those that the model's readout reads.
 
     The result is a part of an ONNX file. Appended to the bytes of the block network, it adds the
     readout's nodes, an input and two outputs, because joined protocol buffers merge their lists.

@@ -86,7 +86,7 @@ export class LipPredictor {
   }
 }
 
-/** Return the columns of one delay, of an array whose last axes are the delays and the columns. */
+/** Return the columns for one delay. The last two axes of the array are delays and columns. */
 function selectDelay({ values, shape }, delay) {
   const [numDelays, numColumns] = shape.slice(-2);
   const selected = values.filter((_, i) => Math.floor(i / numColumns) % numDelays === delay);

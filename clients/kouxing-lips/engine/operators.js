@@ -52,21 +52,21 @@ const BINARY = {
   },
 };
 
-/** Return the operation that computes a tensor of a shape by a function (values, memory). */
-function computed(shape, compute) {
+/** Return an operation whose output has the given shape. compute(values, memory) fills in its values. */
+function createOperation(shape, compute) {
   const out = tensorOf(shape);
   return { outputs: [out], start: (memory) => () => compute(out.values, memory) };
 }
 
 function unary({ type }, [x]) {
   const compute = UNARY[type];
-  return computed(x.shape, (out) => compute(out, x.values));
+  return createOperation(x.shape, (out) => compute(out, x.values));
 }
 
 /** Return the operator that computes factor * tanh(factor * x) + offset. */
 function activation(factor, offset) {
   return (_node, [x]) =>
-    computed(x.shape, (out, memory) => memory.activate(byteOffsetOf(x), out.byteOffset, out.length, factor, offset));
+    createOperation(x.shape, (out, memory) => memory.activate(byteOffsetOf(x), out.byteOffset, out.length, factor, offset));
 }
 
 function binary({ type }, [x, y]) {
@@ -74,7 +74,7 @@ function binary({ type }, [x, y]) {
   const compute = BINARY[type];
   const count = outShape.at(-1) ?? 1;
   const [xRows, yRows] = [x, y].map(({ shape }) => rowsOf(shape, outShape));
-  return computed(outShape, (out) => {
+  return createOperation(outShape, (out) => {
     for (let row = 0; row < xRows.starts.length; row++) {
       compute(out, row * count, count, x.values, xRows.starts[row], xRows.step, y.values, yRows.starts[row], yRows.step);
     }
@@ -85,7 +85,7 @@ function binary({ type }, [x, y]) {
 function rowwise(compute) {
   return (_node, [x]) => {
     const count = x.shape.at(-1);
-    return computed(x.shape, (out) => {
+    return createOperation(x.shape, (out) => {
       for (let at = 0; at < out.length; at += count) compute(out, x.values, at, at + count);
     });
   };
@@ -110,7 +110,7 @@ export const OPERATORS = {
   }),
   ReduceMax(_node, [x]) {
     const count = x.shape.at(-1);
-    return computed(x.shape.slice(0, -1), (out) => {
+    return createOperation(x.shape.slice(0, -1), (out) => {
       for (let row = 0; row < out.length; row++) out[row] = maximum(x.values, row * count, (row + 1) * count);
     });
   },
@@ -126,11 +126,11 @@ export const OPERATORS = {
     return normalize(null, [x]);
   },
   Clip: (_node, [x, lowest, highest]) =>
-    computed(x.shape, (out) => {
+    createOperation(x.shape, (out) => {
       for (let i = 0; i < out.length; i++) out[i] = Math.min(Math.max(x.values[i], lowest.values[0]), highest.values[0]);
     }),
   Where: (_node, [condition, yes, no]) =>
-    computed(condition.shape, (out) => {
+    createOperation(condition.shape, (out) => {
       for (let i = 0; i < out.length; i++) out[i] = condition.values[i] ? yes.values[0] : no.values[0];
     }),
   Unsqueeze: (_node, [x, { values: axes }]) => {
@@ -144,7 +144,7 @@ export const OPERATORS = {
   },
   // values are stored as 32-bit numbers, rounded to the type
   Cast({ attributes: { to } }, [x]) {
-    return to === HALF ? computed(x.shape, (out) => roundToHalf(out, x.values)) : { outputs: [viewOf(x, x.shape)] };
+    return to === HALF ? createOperation(x.shape, (out) => roundToHalf(out, x.values)) : { outputs: [viewOf(x, x.shape)] };
   },
   Shape: (_node, [x]) => ({ outputs: [constant([x.shape.length], x.shape)] }),
   ConstantOfShape: ({ attributes: { value } }, [{ values: shape }]) => ({
@@ -157,7 +157,7 @@ export const OPERATORS = {
     const period = shape[at] * inner;
     let begin = 0;
     const places = parts.map((part) => ({ begin: (begin += part.shape[at] * inner) - part.shape[at] * inner, count: part.shape[at] * inner }));
-    return computed(shape, (out) =>
+    return createOperation(shape, (out) =>
       places.forEach(({ begin: first, count }, i) => {
         const { values } = parts[i];
         for (let from = 0, to = first; from < values.length; from += count, to += period) {
@@ -394,7 +394,7 @@ function sliceAxis(x, axis, begin, end, step) {
 function gather(x, shape, strides, first) {
   const places = offsets(shape, strides, first);
   if (places.every((place, i) => place === first + i)) return { outputs: [viewOf(x, shape, first)] };
-  return computed(shape, (out) => {
+  return createOperation(shape, (out) => {
     const { values } = x;
     for (let i = 0; i < places.length; i++) out[i] = values[places[i]];
   });

@@ -159,7 +159,7 @@ def render(
     pictures (a folder, or a pattern such as face%05d.png). It can also be curves (.fap, .csv,
     .jsonl), an animated head (.glb) or drawn mouths (.tsv, .xml, .json of Rhubarb Lip Sync).
     Without an output, the command writes a video next to the input: my.mp4 for my.wav.
-    The input may also be curves of the app Live Link Face. If --text does not fit the audio, the
+    The input may also be curves of the Live Link Face app. If --text does not fit the audio, the
     mouth follows the text, and the exit status is 1.
     """
     with show_loading():

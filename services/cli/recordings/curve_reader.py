@@ -1,7 +1,7 @@
 """Reads the motion of a face from a table of ``CsvExporter`` or ``JsonLinesExporter``.
 
 Tables of spreadsheet programs may be in UTF-16, and have semicolons or tabs with decimal commas.
-Takes of the app Live Link Face (CSV) are read too. Their frames without a face, with a count of 0,
+Takes of the Live Link Face app (CSV) are also read. Their frames without a face, with a count of 0,
 are left out. Their time code is HH:MM:SS:FF.fff, where FF.fff counts frames. The file does not name
 their rate. It is taken as the lowest standard rate above the largest FF. If a take does not cross a
 full second, it is taken as the app's default.

@@ -48,7 +48,7 @@ def read_markup(text: str) -> str:
     """Extract the text from SSML, TTML, HTML and subtitles with tags.
 
     ``html.parser`` and selectolax 1.0 are not used, because they need quadratic time for damaged or
-    deeply nested text: more than 20 s for 500 kB. lxml 6.1 drops a text after unclosed tags, and
+    deeply nested text: more than 20 s for 500 kB. lxml 6.1 drops text after unclosed tags, and
     needs 12 MB. Entities that a document defines are not expanded, so they cannot exhaust memory.
     """
     first, *others = TIME_TAG.sub("", text).split("<!--")

@@ -1,9 +1,9 @@
 """Extracts the spoken text from subtitles, without times, styles and names of sounds.
 
 pysubs2 1.8 is not used. Of the subtitles in ``tests/unit/test_text_formats.py``, it rejects LRC,
-those without hours, and MicroDVD without a frame rate. It ignores the order of columns in ASS, and
-needs quadratic time for unclosed braces: 3.6 s for 40 kB. srt 3.5 and webvtt-py 0.6 read only one
-of the formats.
+those without hours, and MicroDVD without a frame rate. It ignores the order of columns in ASS. It
+also needs quadratic time for unclosed braces: 3.6 s for 40 kB. srt 3.5 and webvtt-py 0.6 read only
+one of the formats.
 """
 
 import re

@@ -2,7 +2,7 @@
 // throws if the browser forbids it.
 
 const PREFERENCES = "kouxing.choices";
-const MOUTH_PROFILE = "kouxing.voice"; // browsers have used it from the start
+const MOUTH_PROFILE = "kouxing.voice"; // an old name, under which browsers already store profiles
 
 function read(storage, key) {
   try {

@@ -129,11 +129,11 @@ class AudioUploadHandler(UploadHandler):
         """Answer a file."""
         try:
             with tempfile.TemporaryDirectory(prefix="kouxing-") as folder:
-                return await self._answer_in(Path(folder), request)
+                return await self._decode_upload(Path(folder), request)
         except TimeoutError:
             return _upload_error(408, "reading the file took too long; use a shorter file")
 
-    async def _answer_in(self, folder: Path, request: web.Request) -> web.StreamResponse:
+    async def _decode_upload(self, folder: Path, request: web.Request) -> web.StreamResponse:
         name = _NOT_IN_NAMES.sub("_", request.query.get("name", ""))[-_MAX_NAME_CHARACTERS:].lstrip(
             "-. "
         )
@@ -144,8 +144,7 @@ class AudioUploadHandler(UploadHandler):
             return _upload_error(
                 413, f"the file is larger than {MAX_AUDIO_BYTES >> 20} MiB; use a smaller one"
             )
-        # Python imports modules from the working folder, which must therefore not be the file's
-        # folder.
+        # Python imports modules from the working folder, so the file must be in another folder
         command = (sys.executable, "-m", audio_decoder.__name__, str(source))
         with target.open("wb") as output:
             status, _, messages = await self.run(
@@ -204,7 +203,7 @@ class LearnMouthHandler(UploadHandler):
         if status == USER_ERROR:
             raise UserError(messages)
         if status != 0:
-            LOG.error("learning a mouth failed with status %d: %s", status, messages)
+            LOG.error("learning a mouth profile failed with status %d: %s", status, messages)
             raise UserError("learning failed; see the gateway's log")
         return web.Response(body=profile, content_type="application/json")
 

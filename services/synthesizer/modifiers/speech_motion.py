@@ -90,9 +90,9 @@ class SpeechMotionModifier:
         eye_contact: bool | None = None,
         listening: bool | None = None,
     ) -> None:
-        """Set whether head and brows hold still, the eyes stay on the viewer, another speaks.
+        """Set whether head and brows are still, the eyes stay on the viewer, another person speaks.
 
-        None changes nothing.
+        None keeps a setting.
         """
         if still is not None:
             self._is_still = self._idle.is_still = still
