@@ -105,7 +105,7 @@ class SenderPool:
         self._thread.start()
 
     def start(self, target: Target) -> None:
-        """Start sending to a target. If it runs with other options, they are replaced.
+        """Start sending to a target. The new options replace those of a running sender.
 
         Raises ``UserError`` if there are too many targets.
         """

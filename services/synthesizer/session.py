@@ -51,7 +51,7 @@ class LatenessMeter:
         self._sent.clear()
 
     def measure(self, now_s: float) -> Lateness | None:
-        """Return the lateness of the last 10 s, None without frames; keep it as ``newest``."""
+        """Return the lateness of the last 10 s, or None without frames. Store it in ``newest``."""
         self._drop_old(now_s)
         self.newest = None
         differences_s = sorted([difference_s for _, difference_s in self._sent])

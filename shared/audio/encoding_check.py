@@ -50,7 +50,7 @@ _WIDE = {  # FFmpeg's codec of each encoding
     "64-bit float samples": "pcm_f64le",
 }
 _NARROW = {"mu-law": "pcm_mulaw", "A-law": "pcm_alaw", "unsigned 8-bit samples": "pcm_u8"}
-_READINGS = _WIDE | _NARROW
+_CODECS = _WIDE | _NARROW
 
 
 class EncodingCheck:
@@ -114,7 +114,7 @@ class EncodingCheck:
             and len(np.unique(data.view("<i2"))) > _MIN_DISTINCT
         )
         readings = {
-            name: self._measure_loudest(_decode(data, codec)) for name, codec in _READINGS.items()
+            name: self._measure_loudest(_decode(data, codec)) for name, codec in _CODECS.items()
         }
         likely = [
             (reading.flatness, name)

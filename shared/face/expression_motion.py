@@ -65,7 +65,7 @@ class ExpressionMotion:
         self._goal: NDArray[np.float32] = np.zeros(NUM_FAPS, np.float32)
         self._shown = TwoPoleFilter(self._goal)
         self._remaining_s = 0.0  # time until the expressions fade
-        self.lip_weight = 1.0  # the least weight on the lips: 1 without speech, 0 in speech
+        self.lip_weight = 1.0  # lowest weight on the lips: 1 without speech, 0 in speech
         self._is_shown = False
 
     def show(self, strengths: Mapping[str, float], hold_s: float) -> None:

@@ -18,7 +18,7 @@ FILES_PER_CLIENT = 6  # one for the client, one for a service, and four in the t
 RESERVED_FILES = 256  # files for models, pages and outgoing connections
 BUDGET = 5000.0  # work of a connection
 BUDGET_PER_S = 500.0
-MIN_BUDGET = 100.0  # budget of a new connection: enough for a good client whose key is misused
+MIN_BUDGET = 100.0  # of a new connection: enough for a well-behaved client whose key is misused
 
 
 class PeerQuota:

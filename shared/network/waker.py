@@ -34,8 +34,8 @@ class Waker:
 class DescriptorWaiter:
     """Waits until data arrives at one of the added descriptors.
 
-    Only new data ends a wait, whether or not libzmq has read it. The kernel removes closed
-    descriptors.
+    Only new data ends a wait. Older data does not, even if libzmq has not read it yet. The kernel
+    removes closed descriptors.
     """
 
     def __init__(self) -> None:

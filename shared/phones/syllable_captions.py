@@ -14,8 +14,8 @@ GAP_COST = 0.7  # cost of a missing or inserted syllable; a wrong one costs at m
 
 
 def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> list[int | None]:
-    """Return the index in the text of each syllable recognized so far; None: not in the text."""
-    # costs[i][j]: of i recognized syllables and j of the text
+    """Return each recognized syllable's index in the text, or None if the text lacks it."""
+    # costs[i][j]: cost of aligning i recognized syllables with j syllables of the text
     costs = [[GAP_COST * j for j in range(len(text) + 1)]]
     for i, syllable in enumerate(recognized, start=1):
         costs.append([GAP_COST * i])

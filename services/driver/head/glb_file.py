@@ -24,7 +24,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content, parse_json, read_file
 
 MAX_BYTES = 512 << 20  # limit for all files together, unpacked
-MAX_COUNT = 2_000_000  # elements of an accessor
+MAX_COUNT = 2_000_000  # elements of an accessor, or points of a Draco mesh
 MAX_NODES = 20_000
 _COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _NUM_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -56,7 +56,7 @@ _MEMORY_S = 1.5  # phones that ended earlier have no effect
 _MAX_LATE_S = 0.1  # closures recognized later than this after their apex are not shown
 _CATCH_UP_S = 0.04  # time from the last frame to a postponed apex
 _MIN_TRANSITION_S = 0.02  # shortest transition to a closure
-_CLOSED = 10.0  # a lip counts as closed within this distance of its target, FAP units
+_CLOSED_DISTANCE = 10.0  # a lip counts as closed within this distance of its target, FAP units
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +253,7 @@ class ClosureTracker:
             if timeline.apex_start_s[row] - self._frame_s <= time_s:
                 viseme = timeline.viseme[row]
                 error = np.abs(mouth - self._target[viseme])
-                if np.all(error[self._closes[viseme]] < _CLOSED):
+                if np.all(error[self._closes[viseme]] < _CLOSED_DISTANCE):
                     self._shown.add(int(timeline.phone_index[row]))
 
     def forget(self, indices: Iterable[int]) -> None:

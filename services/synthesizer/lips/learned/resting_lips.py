@@ -16,7 +16,7 @@ s       0 for the predicted mouth, 1 for a slightly open mouth   1
                 0  otherwise, and at an onset before the first voice activity
 
 ``s`` follows cubics, so the mouth moves smoothly. A level is a sound if it is at most ``_RANGE_DB``
-below the loudest level, which is the maximum of recent levels and of those known for the next
+below the loudest level: the maximum of recent levels and of the known levels of the next
 ``LEAD_S``. Silence longer than ``_MIN_PAUSE_S`` is a pause, because the closure of a stop is
 shorter. In a pause, lips close for a phone, and for a likely closure shortly before a sound. If the
 lip predictor is nearly certain of a closure, they stay closed until the next sound.
@@ -53,7 +53,7 @@ _ONSET_DB = 8.0  # an onset's minimum level above the background
 _ONSET_LEAD_S, _ONSET_CLOSE_S = 0.065, 0.05  # lips start to close before an onset; closing time
 _ONSET_S = 0.15  # time from the start of this closing for which the goal stays 0
 _MIN_BACKGROUND_DB = -75.0  # quieter audio counts as this level
-_NUM_FIRST_LEVELS = 3  # at first, the background is the loudest of these, and nothing is an onset
+_NUM_FIRST_LEVELS = 3  # until then, the background is their maximum, and nothing is an onset
 # change of the background per level: fraction of the difference, and during an onset
 _BACKGROUND_RATE, _BACKGROUND_RISE_DB = 0.1, 2.0
 
