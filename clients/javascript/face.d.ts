@@ -34,14 +34,17 @@ export class KouxingFace extends HTMLElement {
   readonly set: ShapeSet | "faps" | null;
   /** The shown values: weights by name, or 68 FAPs; null before the first. */
   readonly shown: Record<string, number> | number[] | null;
-  /** The local lip sync; throws an error without the attribute `local`. */
+  /** The local lip sync; throws an error without the attribute `local`, or if the element is not in the page. */
   readonly lips: Promise<LocalLips>;
   /** Turn the session's sound on. Call it from a click handler. */
   turnSoundOn(): Promise<void>;
   turnSoundOff(): void;
   /** Show values of the model's set: 68 FAPs, or weights with their names. */
   show(values: Float32Array, names?: readonly string[]): void;
-  /** Play the recording, with the sound of an audio element. Resolved when it ends. */
+  /**
+   * Play the recording, with the sound of an audio element. Resolved when it ends. Rejects with an AbortError if the
+   * face is removed or gets another model before the recording starts.
+   */
   play(audio?: HTMLAudioElement | null): Promise<void>;
   addEventListener<K extends keyof KouxingFaceEventMap>(
     type: K,

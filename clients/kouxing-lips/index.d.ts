@@ -55,7 +55,7 @@ export class LipSync extends EventTarget {
   express(strengths: Partial<Record<ExpressionName, number>>, holdS?: number): void;
   /** Start suspended sound. Call it from a click handler. */
   resume(): Promise<void>;
-  /** Stop following the sound. The face returns to rest. */
+  /** Stop following the sound. The face returns to rest. A media element is still heard. */
   stop(): void;
   /** Stop, and release all resources. */
   close(): void;
