@@ -163,6 +163,11 @@ test("texts of the gateway are translated with their values", () => {
     "所有 recognizer 都忙：需要 38% 的空闲时间，只剩 5%；请 2 秒后重试",
   );
   assert.equal(toChinese("ARKit shapes of the mouth"), "嘴部的ARKit 形状");
+  assert.equal(
+    toChinese("vmc://: the delay must be 0 or 1 to 10000 ms, not '0.1'; a value in seconds must be multiplied by 1000"),
+    "vmc://：延迟必须是 0 或 1 到 10000 毫秒，不能是 '0.1'；以秒为单位的数请乘以 1000",
+  );
+  assert.equal(toChinese("vmc://: head must be on or off"), "vmc://：head 必须是 on or off");
 });
 
 test("reduced quality and the head's rotation are described", () => {

@@ -133,11 +133,11 @@ const CHINESE = {
   "{url} is not a valid address; write {forms}": "地址 {url} 无效，请写 {forms}",
   "prefix must start with '/'": "prefix 必须以“/”开头",
   "unknown option {name}; use {options}": "没有选项 {name}，可用 {options}",
-  "{name} must be {values}": "{name} 必须是 {values}",
-  "{name} contains a character that is not printable": "{name} 含有不可打印的字符",
-  "{name} is longer than {count} characters": "{name} 超过 {count} 个字符",
   "the delay must be 0 or 1 to {most} ms, not {delay}; a value in seconds must be multiplied by 1000":
     "延迟必须是 0 或 1 到 {most} 毫秒，不能是 {delay}；以秒为单位的数请乘以 1000",
+  "{name} must be {values}": "{name} 必须是 {values}", // the first text that fits is used
+  "{name} contains a character that is not printable": "{name} 含有不可打印的字符",
+  "{name} is longer than {count} characters": "{name} 超过 {count} 个字符",
 };
 
 // Reasons of control's errors, for texts that are not translated above
@@ -165,7 +165,9 @@ const REASONS = {
 const PATTERNS = Object.entries(CHINESE).map(([english, chinese]) => {
   const literals = english.split(/\{\w+\}/).map((part) => part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&"));
   const names = [...english.matchAll(/\{(\w+)\}/g)].map(([, name]) => name);
-  return { pattern: new RegExp(`^${literals.join("(.+?)")}$`), names, chinese };
+  // A value at the start contains no ": ", which follows the name of a file or a sender.
+  const pattern = literals.join("(.+?)").replace(/^\(\.\+\?\)/, "((?:(?!: ).)+?)");
+  return { pattern: new RegExp(`^${pattern}$`), names, chinese };
 });
 
 /** Translate lines of the form "text" or "file: text". Unknown texts stay English. */
