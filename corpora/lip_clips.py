@@ -298,7 +298,7 @@ def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
 
 
 def write_clip_archive(folder: Path, archive: Path) -> tuple[int, set[str]]:
-    """Write the clips of a folder that may be shared to a ZIP file.
+    """Write a ZIP file with the clips of a folder that may be shared.
 
     Returns their number, and the licenses of all other clips.
 

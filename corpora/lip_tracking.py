@@ -113,7 +113,7 @@ def track_video(video: Path, clip: Path, audio_track: int | None) -> tuple[int, 
         "frames": len(has_face),
         "frames_ok": int(has_face.sum()),
     }
-    with (  # older files are replaced at the end, so they never belong to two recordings
+    with (  # older files are replaced together, so all belong to one recording
         open_output(clip.with_suffix(".json")) as json_file,
         open_output(clip.with_suffix(".csv")) as csv_file,
         open_output(clip.with_suffix(".flac")) as audio_file,

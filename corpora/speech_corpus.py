@@ -46,7 +46,7 @@ LANGUAGES = Path(__file__).with_name("languages.tsv")  # held-out recordings in 
 _FREE_LICENSE = re.compile(
     r"apache|\bmit\b|cc0|cc[ -]by(?!-nc|-nd)(?!-sa-nc)|unlicense|public domain|synthetic", re.I
 )
-# Restrictions in a license, and footage from films, exclude it.
+# A restriction, or footage from films, excludes a license that matches the pattern above.
 _CLOSED_LICENSE = re.compile(
     r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube"
     r"|\bnot\b|-style|research only|academic",
