@@ -153,7 +153,10 @@ def agreement_table(faces: Figures) -> Table:
 
 
 def measures_table(faces: Figures, measures: Mapping[str, str]) -> Table:
-    """Return a table of measures: real lips, kouxing's lip models, then other programs."""
+    """Return a table of measures, which are given by title, on all clips.
+
+    The rows are real lips, kouxing's lip models, then other programs.
+    """
     scores = {title_of(face): groups[ALL] for face, groups in _clean_scores(faces).items()}
     if REAL in faces:
         scores = {"real lips": faces[REAL][CLEAN][ALL], **scores}
