@@ -42,7 +42,7 @@ export class KouxingFace extends HTMLElement {
   /** Show values of the model's set: 68 FAPs, or weights with their names. */
   show(values: Float32Array, names?: readonly string[]): void;
   /**
-   * Play the recording, with the sound of an audio element. Resolved when it ends. Rejects with an AbortError if the
+   * Play the recording, with the sound of an audio element. Resolves when it ends. Rejects with an AbortError if the
    * face is removed or gets another model before the recording starts.
    */
   play(audio?: HTMLAudioElement | null): Promise<void>;
