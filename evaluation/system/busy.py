@@ -39,9 +39,8 @@ STEP_S = 0.02  # interval of the lateness values
 _PROC = Path("/proc")
 
 
-UsageRate = dict[
-    str, float
-]  # a service's ``cpu_cores``, and ``wake_ups`` of its threads per second
+# ``cpu_cores`` of a service, and ``wake_ups`` of its threads per second
+UsageRate = dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -192,6 +192,12 @@ def test_audio_after_its_end_is_refused(client: Client) -> None:
             push(CHUNK)
 
 
+def test_refuses_an_array_with_another_number_of_channels(client: Client) -> None:
+    session = client.open_session("s")
+    with pytest.raises(KouxingError, match="num_channels=1"):
+        session.push(np.zeros((1600, 2), np.int16))
+
+
 def test_a_key_may_be_a_path(control: FakeControl, tmp_path: Path) -> None:
     add_key("laptop", ["client"], tmp_path / "laptop.key")
     for path in (tmp_path / "laptop.key", str(tmp_path / "laptop.key")):

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from kouxing_client import KouxingError
+from kouxing_client.keys import read_key
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
@@ -78,6 +80,17 @@ def test_names_an_invalid_key_file_and_an_unusable_folder(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     with pytest.raises(UserError, match=r"file/kouxing: Not a directory\); set XDG_STATE_HOME"):
         load_user_key()
+
+
+def test_a_folder_is_not_a_key_and_is_closed(tmp_path: Path) -> None:
+    def next_descriptor() -> int:
+        with tmp_path.joinpath("file").open("w") as file:
+            return file.fileno()
+
+    free = next_descriptor()
+    with pytest.raises(KouxingError, match="Is a directory"):
+        read_key(tmp_path)
+    assert next_descriptor() == free
 
 
 def test_adds_and_revokes_a_key(tmp_path: Path) -> None:

@@ -42,6 +42,10 @@ def find_key() -> Key:
     return read_key(folder / "kouxing" / _FILE)
 
 
+def _open_nonblocking(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)  # opening a FIFO would block
+
+
 def read_key(path: str | Path) -> Key:
     """Read a key file.
 
@@ -51,8 +55,7 @@ def read_key(path: str | Path) -> Key:
         If it cannot be read, or is not a key file.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # opening a FIFO would block
-        with os.fdopen(descriptor, "rb") as file:
+        with open(path, "rb", opener=_open_nonblocking) as file:  # also closes a folder
             return msgspec.json.decode(file.read(_MAX_BYTES), type=Key)
     except OSError as error:
         raise KouxingError(

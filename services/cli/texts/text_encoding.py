@@ -2,6 +2,7 @@
 
 import codecs
 import contextlib
+import re
 from typing import NamedTuple
 
 import chardet
@@ -66,7 +67,12 @@ def decode_text(content: bytes, language: str) -> DecodedText:
     )
     likely = detected["encoding"] if detected["confidence"] >= _MIN_CONFIDENCE else None
     # chardet does not recognize some short texts, or reads them as rare Chinese characters
+    if encodings is _CHINESE and _has_pinyin(content):
+        likely = "gb18030"
     candidates = [(likely or "utf-8").lower(), *encodings]
+    if b"\0" in content and not content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        is_big_endian = content[::2].count(0) > content[1::2].count(0)
+        candidates.insert(0, "utf-16-be" if is_big_endian else "utf-16-le")
     candidates.sort(key=lambda encoding: _has_rare_characters(content, encoding))
     for encoding in candidates:
         with contextlib.suppress(UnicodeDecodeError):
@@ -78,6 +84,14 @@ def decode_text(content: bytes, language: str) -> DecodedText:
         "this is not a text file, or its encoding is unknown; save the spoken text as plain"
         " text in UTF-8"
     )
+
+
+def _has_pinyin(content: bytes) -> bool:
+    """Return whether GB 2312 gives words with accents, which chardet reads as Chinese in Big5."""
+    try:
+        return re.search("[a-z][à-ǜ]|[à-ǜ][a-z]", content.decode("gb2312")) is not None
+    except UnicodeDecodeError:
+        return False
 
 
 def _has_rare_characters(content: bytes, encoding: str) -> bool:
