@@ -31,5 +31,5 @@ def test_writes_a_model_and_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_rejects_clips_without_a_free_license(tmp_path: Path) -> None:
     write_training_clip(tmp_path, "closed", "dora", "academic use only")
-    with pytest.raises(UserError, match=r"no clip .* may be used"):
+    with pytest.raises(UserError, match=r"no clip .* has a license that allows training"):
         train_lips(tmp_path, tmp_path / "lips.npz", any_license=False)
