@@ -1,4 +1,7 @@
-"""Captions of live speech: combines phones and their revisions into syllables."""
+"""Captions of live speech: combines phones and their revisions into syllables.
+
+If the text is known, the syllables are matched with it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +17,11 @@ GAP_COST = 0.7  # cost of a missing or inserted syllable; a wrong one costs at m
 
 
 def match_syllables(recognized: Sequence[Syllable], text: Sequence[Syllable]) -> list[int | None]:
-    """Return each recognized syllable's index in the text, or None if the text lacks it."""
+    """Return each recognized syllable's index in the text, or None if the text lacks it.
+
+    The recognized syllables contain errors, so they are aligned with the text by edit distance.
+    Common phones lower the cost, syllables may be missing or inserted, and the text may continue.
+    """
     # costs[i][j]: cost of aligning i recognized syllables with j syllables of the text
     costs = [[GAP_COST * j for j in range(len(text) + 1)]]
     for i, syllable in enumerate(recognized, start=1):

@@ -1,4 +1,4 @@
-"""Shows laughter and audible breaths of the voice on the face.
+"""Shows expressions on the face, and laughter and audible breaths of the voice.
 
 Laughter opens the mouth, raises the corners and narrows the eyes; the head leans back (Ruch & Ekman
 2001, "The expressive pattern of laughter"). A laugh is a series of notes ("ha"), about 4.8 per
@@ -22,15 +22,6 @@ from kouxing.shared.face.expression_motion import EXPRESSION_FAPS, ExpressionMot
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
 from kouxing.shared.face.high_level_faps import VISEME_NAMES, VISEMES
-
-
-class ExpressionModifier(ExpressionMotion):
-    """Expressions that leave the lips to speech."""
-
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
-        """Add the expressions to a frame, FAPs (68,), in place."""
-        self.add(faps, context.step_s, is_speaking=context.is_speaking)
-
 
 _HOLD_S = 0.2  # time for which the last frame of laughter or breath is held
 _BREATH_OPENING = 0.3  # fraction of an open vowel's opening
@@ -57,6 +48,14 @@ def _make_breath() -> NDArray[np.float32]:
     for name in ("stretch_l_nose", "stretch_r_nose"):
         faps[FAP_NUMBER[name] - 1] = _NOSTRILS
     return faps
+
+
+class ExpressionModifier(ExpressionMotion):
+    """Expressions that leave the lips to speech."""
+
+    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+        """Add the expressions to a frame, FAPs (68,), in place."""
+        self.add(faps, context.step_s, is_speaking=context.is_speaking)
 
 
 class NonverbalModifier:
