@@ -1,6 +1,6 @@
 """Captions of live speech: combines phones and their revisions into syllables.
 
-If the text is known, the syllables are matched with it.
+The syllables are matched with a known text.
 """
 
 from collections.abc import Sequence
