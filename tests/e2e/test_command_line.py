@@ -125,8 +125,9 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
             return float(messages[f"/kouxing/{shape}"][0])
 
         url = f"osc://127.0.0.1:{program.getsockname()[1]}"
+        urls = f"{url}?shapes=vrm", url  # the last options of a target apply
         sender = start_python(
-            "-m", "kouxing", "send", url, url, "--session", "sent", control=system.control
+            "-m", "kouxing", "send", *urls, "--session", "sent", control=system.control
         )
         assert sender.stderr is not None
         assert f"sending ARKit shapes and head to {url}" in sender.stderr.readline()

@@ -35,7 +35,7 @@ def send_to(targets: Iterable[Target], session: str, control: str, *, idle_motio
         catch_interrupt(),
     ):
         open_sessions = [state.session for state in client.status().sessions]
-        for target in {target.url: target for target in targets}.values():
+        for target in {target.key: target for target in targets}.values():
             senders.start(target)
             print_message(f"sending {target.contents} to {target.url}; press Ctrl-C to stop")
             if target.expression_hint:
