@@ -77,8 +77,8 @@ except KeyboardInterrupt:
 # or starts a program.
 INTERRUPT_EACH_COMMAND = """
 import importlib, json, os, signal, sys
-for name in ("gmm", "encoder", "lips", "heads"):
-    importlib.import_module(f"kouxing.training.{name}.recipe")
+for name in ("gmm.recipe", "encoder.recipe", "lips.recipe", "heads.assemble"):
+    importlib.import_module(f"kouxing.training.{name}")
 import kouxing.evaluation.commands
 import kouxing.services.cli.main
 from kouxing.shared.interrupt import install_interrupt_handler
@@ -158,6 +158,7 @@ def test_ctrl_c_ends_every_kind_of_command_and_leaves_no_output(tmp_path: Path) 
     lines = [line.format(data=data, out=out) for line in COMMANDS]
     process = start_python("-c", INTERRUPT_EACH_COMMAND, *lines)
     printed, log = process.communicate(timeout=4 * LIMIT_S)
+    assert process.returncode == 0, log
     assert json.loads(printed) == dict.fromkeys(lines, 130), log
     assert log == ""
     assert not [*out.iterdir()]
