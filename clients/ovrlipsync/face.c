@@ -110,7 +110,7 @@ static void update_background(Rest *rest, double level) {
   const double level_db = fmax(level, REST_MIN_BACKGROUND_DB);
   rest->num_processed_levels++;
   if (rest->num_processed_levels <= REST_NUM_FIRST_LEVELS) {
-    rest->background_db = fmax(rest->background_db, level_db);
+    rest->background_db += (level_db - rest->background_db) / rest->num_processed_levels;
     return;
   }
   const double difference = level_db - rest->background_db;
@@ -414,7 +414,6 @@ void face_init(Face *face) {
   memset(face, 0, sizeof *face);
   face->rest.loudest_db = face->rest.known_s = face->rest.sound_s = face->rest.onset_until_s = -INFINITY;
   face->rest.time_s = INFINITY;
-  face->rest.background_db = REST_MIN_BACKGROUND_DB;
   face->rest.duration_s = 1.0;
 }
 

@@ -11,7 +11,7 @@ export class RestingLips {
   #hasSpoken = false;
   #hasEnded = false;
   #loudestDb = -Infinity;
-  #backgroundDb;
+  #backgroundDb = 0;
   #numLevels = 0;
   #onsetUntilS = -Infinity;
   #knownS = -Infinity;
@@ -25,7 +25,6 @@ export class RestingLips {
 
   constructor({ constants }) {
     this.#constants = constants.rest;
-    this.#backgroundDb = constants.rest.MIN_BACKGROUND_DB;
   }
 
   addEvent(event) {
@@ -101,7 +100,7 @@ export class RestingLips {
     const levelDb = Math.max(level, c.MIN_BACKGROUND_DB);
     this.#numLevels += 1;
     if (this.#numLevels <= c.NUM_FIRST_LEVELS) {
-      this.#backgroundDb = Math.max(this.#backgroundDb, levelDb);
+      this.#backgroundDb += (levelDb - this.#backgroundDb) / this.#numLevels;
       return;
     }
     const difference = levelDb - this.#backgroundDb;

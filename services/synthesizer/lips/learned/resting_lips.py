@@ -53,7 +53,7 @@ _ONSET_DB = 8.0  # an onset's minimum level above the background
 _ONSET_LEAD_S, _ONSET_CLOSE_S = 0.065, 0.05  # lips start to close before an onset; closing time
 _ONSET_S = 0.15  # time from the start of this closing for which the goal stays 0
 _MIN_BACKGROUND_DB = -75.0  # quieter audio counts as this level
-_NUM_FIRST_LEVELS = 3  # until then, the background is their maximum, and nothing is an onset
+_NUM_FIRST_LEVELS = 3  # until then, the background is their mean, and nothing is an onset
 # change of the background per level: fraction of the difference, and during an onset
 _BACKGROUND_RATE, _BACKGROUND_RISE_DB = 0.1, 2.0
 
@@ -82,7 +82,7 @@ class RestingLips:
         self._is_voice = self._has_spoken = self._has_ended = False
         self._is_sounding = False  # whether the level of the last frame is a sound
         self._loudest_db = -math.inf
-        self._background_db, self._num_levels = _MIN_BACKGROUND_DB, 0
+        self._background_db, self._num_levels = 0.0, 0
         self._onset_until_s = -math.inf  # the last onset closes the lips until this time
         self._known_s = -math.inf  # the levels are known up to here
         self._sound_s = -math.inf  # last sound, start of voice activity or start of the audio
@@ -192,7 +192,7 @@ class RestingLips:
         level_db = max(level_db, _MIN_BACKGROUND_DB)
         self._num_levels += 1
         if self._num_levels <= _NUM_FIRST_LEVELS:
-            self._background_db = max(self._background_db, level_db)
+            self._background_db += (level_db - self._background_db) / self._num_levels
             return
         difference = level_db - self._background_db
         is_onset = difference > _ONSET_DB
