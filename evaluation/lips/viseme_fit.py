@@ -19,29 +19,20 @@ from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import LipClip, label_clip
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import CURVES, real_faps
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.evaluation.lips.references import clips_to_score
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
-    DynamicVisemes,
-    VisemeArticulation,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
-from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
-from kouxing.services.synthesizer.modifiers.modifier import FrameContext
-from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
 _SENTENCE_S = 6.0
-_BLOCK_S = 2.0
-_REACH_S = 1.5  # visemes further away have no visible weight
 
 
 @dataclass(slots=True, kw_only=True)
@@ -171,47 +162,3 @@ def _first_phones(fitted: FittedClip) -> list[Phone]:
     silence = fitted.inventory.silence
     phones = [phone for phone in fitted.phones if phone.symbol != silence]
     return [phone for phone in phones if phone.onset_s < _SENTENCE_S]
-
-
-def synthesize(
-    lips: DynamicVisemes,
-    phones: Sequence[Phone],
-    num_frames: int,
-    frame_rate_hz: float = 50.0,
-    levels: Sequence[tuple[float, float]] = (),
-) -> NDArray[np.float32]:
-    """Return the FAP frames (num_frames, 68) of an utterance: eq. 6 with all its phones.
-
-    The phones have their true times; gaps and silences are pauses. ``levels`` has times in seconds
-    and levels in dB of full scale, if known.
-    """
-    parameters = lips.parameters
-    timeline = build_timeline(phones, lips.inventory)
-    time_s = np.arange(num_frames) / frame_rate_hz
-    faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
-    block = max(int(_BLOCK_S * frame_rate_hz), 1)
-    for first in range(0, num_frames, block):
-        times = time_s[first : first + block]
-        start_s, end_s = times[0] - _REACH_S, times[-1] + _REACH_S
-        near = timeline.select((timeline.apex_end_s >= start_s) & (timeline.apex_start_s <= end_s))
-        silent = (timeline.silence_end_s >= start_s) & (timeline.silence_start_s <= end_s)
-        near = replace(
-            near,
-            silence_start_s=timeline.silence_start_s[silent],
-            silence_end_s=timeline.silence_end_s[silent],
-        )
-        faps[first : first + block, np.array(MOUTH_FAPS) - 1] = blend(parameters, near, times)
-    amplitude = AmplitudeModifier()
-    articulation = VisemeArticulation(timeline, parameters.level_db)
-    for number, (frame_s, faps_now) in enumerate(zip(time_s, faps, strict=True)):
-        context = FrameContext(
-            time_s=float(frame_s),
-            known_s=np.inf,
-            elapsed_s=float(frame_s),
-            step_s=1.0 / frame_rate_hz,
-            is_speaking=True,
-            levels=levels if number == 0 else (),
-            articulation=articulation,
-        )
-        amplitude.apply(faps_now, context)
-    return faps

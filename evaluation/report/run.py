@@ -4,8 +4,6 @@ A result is a JSON file with the commands, machine, date, commit and load. It is
 commands, or the hash of the code and models that its step depends on, have changed.
 """
 
-import ast
-import hashlib
 import json
 import os
 import platform
@@ -14,11 +12,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.steps import FOLDER_OPTIONS, STEPS
 from kouxing.evaluation.source_tree import ROOT
 from kouxing.shared.command.terminal import print_message
@@ -34,9 +33,6 @@ _OMITTED_GROUPS = ("source ", "speaker ")
 _DIGITS = 5
 # The report itself writes these files, so their changes do not make a commit dirty.
 _REPORT_FILES = (":!docs/results", ":!docs/results.md", ":!docs/*.png")
-_PACKAGES = {"kouxing": "", "kouxing_client": "clients/python/kouxing_client"}
-_SOURCES = {".py", ".js", ".mjs", ".ts", ".html", ".json", ".toml", ".tsv", ".npz", ".txt"}
-_INSTALLED = {"node_modules", ".venv"}
 
 
 def run_steps(
@@ -171,62 +167,3 @@ def _trim_figures(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_trim_figures(item) for item in value]
     return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
-
-
-def code_hash(patterns: Iterable[str], root: Path = ROOT) -> str:
-    """Return a hash of files and folders, and of the modules that their Python files import.
-
-    Comments, docstrings and layout of Python files do not affect it.
-    """
-    digest = hashlib.sha256()
-    for name, content in sorted(_read_code(patterns, root).items()):
-        digest.update(name.encode() + content)
-    return digest.hexdigest()[:16]
-
-
-def _read_code(patterns: Iterable[str], root: Path) -> dict[str, bytes]:
-    contents: dict[str, bytes] = {}
-    waiting = [
-        file for pattern in patterns for path in root.glob(pattern) for file in _source_files(path)
-    ]
-    while waiting:
-        file = waiting.pop()
-        name = str(file.relative_to(root))
-        if name in contents or _INSTALLED & {*file.relative_to(root).parts}:
-            continue
-        contents[name] = file.read_bytes()
-        if file.suffix == ".py":
-            tree = ast.parse(contents[name])
-            waiting += _imported_files(tree, root)
-            contents[name] = _without_docstrings(tree).encode()
-    return contents
-
-
-def _source_files(path: Path) -> Iterator[Path]:
-    for file in path.rglob("*") if path.is_dir() else (path,):
-        if file.suffix in _SOURCES and file.is_file():
-            yield file
-
-
-def _imported_files(tree: ast.Module, root: Path) -> Iterator[Path]:
-    modules: list[str] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            modules += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            modules += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    for module in modules:
-        package, _, inner = module.partition(".")
-        if package in _PACKAGES and inner:
-            path = root / _PACKAGES[package] / inner.replace(".", "/")
-            files = (path.with_suffix(".py"), path / "__init__.py")
-            yield from (file for file in files if file.is_file())
-
-
-def _without_docstrings(tree: ast.Module) -> str:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            first = node.body[0] if node.body else None
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                node.body = node.body[1:] or [ast.Pass()]
-    return ast.unparse(tree)

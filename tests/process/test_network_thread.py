@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 
 from kouxing.services.recognizer.live.recognizer import Recognizer
-from kouxing.services.recognizer.sessions.live_batch_decoder import (
+from kouxing.services.recognizer.sessions.network_thread import (
     MAX_SESSIONS,
     MAX_WAIT_S,
     NetworkThread,

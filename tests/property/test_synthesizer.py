@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.viseme_fit import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import CLOSURE_FAPS, VISEME_INDEX

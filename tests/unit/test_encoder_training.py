@@ -15,8 +15,9 @@ from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, recipe, targets
 from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
+from kouxing.training.encoder.export import export_onnx
 from kouxing.training.encoder.network import NUM_FEATURES, AudioEncoder
-from kouxing.training.encoder.recipe import export_onnx, train_encoder
+from kouxing.training.encoder.recipe import train_encoder
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, TargetColumns
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
 from kouxing.training.networks import optimizer

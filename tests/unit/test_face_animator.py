@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
-from kouxing.evaluation.lips.viseme_fit import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.idle_motion import ConversationState, IdleMotion

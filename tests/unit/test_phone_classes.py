@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.viseme_fit import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.shapes import SHAPE_SETS

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kouxing.evaluation.lips.viseme_fit import synthesize
+from kouxing.evaluation.lips.offline_visemes import synthesize
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor

@@ -12,8 +12,9 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import app
 from kouxing.evaluation.report import run
+from kouxing.evaluation.report.code_hash import code_hash
 from kouxing.evaluation.report.page import TABLES
-from kouxing.evaluation.report.run import code_hash, run_steps, write_result
+from kouxing.evaluation.report.run import run_steps, write_result
 from kouxing.evaluation.report.steps import STEPS, Step
 from kouxing.evaluation.report.system_tables import attacks_table, faults_table
 from kouxing.evaluation.source_tree import ROOT

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from kouxing.corpora.feature_cache import read_audio
@@ -30,7 +29,7 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.sounds import read_sounds, training_backgrounds
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, read_corpus
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.encoder import FORMAT, VoiceKind
+from kouxing.services.recognizer.acoustic.encoder import VoiceKind
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.command.terminal import print_message
@@ -38,18 +37,12 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.encoder.batches import BATCH_S, Batch, BatchSource, draw_batch
+from kouxing.training.encoder.export import save_encoder
 from kouxing.training.encoder.lip_teacher import LipTeacher, teacher_features, train_lip_teacher
-from kouxing.training.encoder.network import (
-    MEAN_PITCH,
-    NUM_FEATURES,
-    NUM_INPUTS,
-    AudioEncoder,
-)
+from kouxing.training.encoder.network import AudioEncoder
 from kouxing.training.encoder.targets import Samples, SourceRecording, TargetColumns, TargetStore
 from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.model_card import write_card
-from kouxing.training.model_files import write_archive
-from kouxing.training.networks.onnx_graph import Floats, Graph, floats, module_arrays
 from kouxing.training.networks.optimizer import optimize
 from kouxing.training.seed import SEED
 from kouxing.training.training_set import weights_of
@@ -207,86 +200,3 @@ def _train_network(batch_source: BatchSource, num_steps: int, checkpoint: Path) 
         max_norm=1.0,
         checkpoint=checkpoint,
     ).cpu()
-
-
-def save_encoder(path: Path, encoder: AudioEncoder) -> None:
-    """Write the model as an npz file (arrays only, no pickle)."""
-    write_archive(path, {"format": np.array(FORMAT), "network": export_onnx(encoder)})
-
-
-def export_onnx(encoder: AudioEncoder) -> NDArray[np.uint8]:
-    """Export a network as the bytes of an ONNX file.
-
-    The graph computes one step for any number of sessions.
-
-    =========== ============================================================= =====================
-    symbol      meaning                                                       shape
-    =========== ============================================================= =====================
-    frames      the two newest log-mel frames, the older one first            (sessions, 160)
-    state       states of both recurrent layers                               (sessions, 2 width)
-    features    early and late components of Whisper's encoder, and lips: the (sessions, 307)
-                inputs of a lip model
-    phones      log posteriors                                                (sessions, phones)
-    voice       probabilities of no voice, speech, sung or held voice,        (sessions, 4)
-                laughter
-    scalars     probability of voicing; pitch, log2 of Hz; level; effort      (sessions, 4)
-    new_state   states after the step                                         (sessions, 2 width)
-    =========== ============================================================= =====================
-
-    Products use 8-bit integers (:mod:`kouxing.training.networks.onnx_graph`).
-    """
-    return _EncoderGraph(encoder).build_step_model()
-
-
-class _EncoderGraph(Graph):
-    def __init__(self, encoder: AudioEncoder) -> None:
-        super().__init__()
-        self._parameters = module_arrays(encoder)
-        self._width = len(self._parameters["entry.bias"])
-        self._num_phones = encoder.columns.num_phones
-
-    def build_step_model(self) -> NDArray[np.uint8]:
-        """Add all nodes; return the ONNX file."""
-        width = self._width
-        entered = self.node("Relu", [self.product("frames", self._parameters, "entry")])
-        states = self.split("state", ["first_state", "second_state"])
-        first = self._step(entered, states[0], "first")
-        second = self._step(first, states[1], "second")
-        self.node("Concat", [first, second], "new_state", axis=-1)
-        rows = self.product(self.node("Add", [first, second]), self._parameters, "output")
-        sizes = (NUM_FEATURES, self._num_phones, len(VoiceKind), 1, 3)
-        names = ["features", "phone_logits", "voice_logits", "voicing_logit", "others"]
-        _, phones, voice, voicing, others = self.split(rows, names, *sizes)
-        self.node("LogSoftmax", [phones], "phones", axis=-1)
-        self.node("Softmax", [voice], "voice", axis=-1)
-        offset = self.constant("offset", np.array([MEAN_PITCH, 0, 0], np.float32))
-        parts = [self.node("Sigmoid", [voicing]), self.node("Add", [others, offset])]
-        self.node("Concat", parts, "scalars", axis=-1)
-        inputs = [floats("frames", "sessions", NUM_INPUTS), floats("state", "sessions", 2 * width)]
-        outputs = [
-            floats("features", "sessions", NUM_FEATURES),
-            floats("phones", "sessions", self._num_phones),
-            floats("voice", "sessions", len(VoiceKind)),
-            floats("scalars", "sessions", 4),
-            floats("new_state", "sessions", 2 * width),
-        ]
-        return self.file("encoder", inputs, outputs)
-
-    def _step(self, inputs: str, state: str, name: str) -> str:
-        """Run a recurrent layer for one step: (sessions, width) to its new state."""
-        parts = []
-        for kind, values in (("ih", inputs), ("hh", state)):
-            weights: dict[str, Floats] = {
-                f"{name}.{kind}.{part}": self._parameters[f"{name}.{part}_{kind}_l0"]
-                for part in ("weight", "bias")
-            }
-            gates = self.product(values, weights, f"{name}.{kind}")
-            names = [f"{name}.{kind}.{part}" for part in ("gates", "new")]
-            parts.append(self.split(gates, names, 2 * self._width, self._width))
-        (input_gates, from_input), (state_gates, from_state) = parts
-        gates = self.node("Sigmoid", [self.node("Add", [input_gates, state_gates])])
-        reset, update = self.split(gates, [f"{name}.reset", f"{name}.update"])
-        from_state = self.node("Mul", [reset, from_state])
-        new = self.node("Tanh", [self.node("Add", [from_input, from_state])])
-        retained = self.node("Mul", [update, self.node("Sub", [state, new])])
-        return self.node("Add", [new, retained])
