@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.shared.command.terminal import print_table, write_json
@@ -79,10 +77,3 @@ def percent(rate: float | None, format_spec: str = ".1f") -> str:
 def join_values(values: Iterable[str]) -> str:
     """Join several values in one cell."""
     return " / ".join(values)
-
-
-def percentiles(values: NDArray[np.float64]) -> dict[str, float]:
-    """Return the 50th and the 95th percentile, ``p50`` and ``p95``; empty without values."""
-    if not values.size:
-        return {}
-    return {f"p{percent}": float(np.percentile(values, percent)) for percent in (50, 95)}

@@ -32,7 +32,7 @@ from kouxing.evaluation.lips.four_schemes import (
 )
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth, real_mouth
-from kouxing.evaluation.tables import percentiles
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.offline.alignment import drop_pauses
 from kouxing.services.synthesizer.config import SynthesizerConfig

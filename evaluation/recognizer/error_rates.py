@@ -35,10 +35,10 @@ from kouxing.corpora.scoring import (
     final_hypothesis,
     first_hypothesis,
 )
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.recognizer.aligned_corpus import RATE_NAMES, AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import CLEAN, Disturb
 from kouxing.evaluation.recognizer.synthetic_sounds import Samples
-from kouxing.evaluation.tables import percentiles
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.live.live_decoder import LiveDecoder

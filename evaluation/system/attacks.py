@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import stream
 from kouxing.evaluation.system.systems import LocalSystem, run_all_services
 from kouxing.evaluation.system.wait import wait_until
-from kouxing.evaluation.tables import percentiles
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.audio.audio_file import read_audio

@@ -21,9 +21,9 @@ from kouxing_client import Client, Session
 from numpy.typing import NDArray
 from rich.console import Console
 
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK_S, speak
 from kouxing.evaluation.system.systems import run_all_services
-from kouxing.evaluation.tables import percentiles
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds

@@ -32,10 +32,10 @@ from kouxing.evaluation.lips.agreement import Agreement, agreement_of
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
 from kouxing.evaluation.lips.references import read_parts
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_wav
-from kouxing.evaluation.tables import percentiles
 from kouxing.services.cli.web_model import web_model
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ

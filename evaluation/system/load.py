@@ -20,10 +20,10 @@ from rich.console import Console
 
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.parallel import num_cores
+from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK, CHUNK_S
 from kouxing.evaluation.system.systems import run_all_services
 from kouxing.evaluation.system.wait import wait_until
-from kouxing.evaluation.tables import percentiles
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig

@@ -95,6 +95,12 @@ def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> 
             "kouxing.training kouxing.evaluation numpy zmq kouxing.services.recognizer.service",
         ),
         (
+            "import contextlib, io, kouxing.services.cli.main as main\n"
+            "with contextlib.redirect_stdout(io.StringIO()):\n"
+            "    main.app(['--help'], standalone_mode=False)",
+            "numpy zmq",
+        ),
+        (
             "from kouxing.services.service_kinds import read_settings; read_settings()",
             "numpy zmq aiohttp",
         ),
@@ -109,7 +115,7 @@ def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> 
             "scipy.linalg pycparser aiohttp prometheus_client",
         ),
     ],
-    ids=["command", "settings", "gateway", "driver", "recognizer"],
+    ids=["command", "help", "settings", "gateway", "driver", "recognizer"],
 )
 def test_a_start_imports_nothing_slow_that_it_does_not_need(start: str, slow: str) -> None:
     code = f"import sys\n{start}\nprint(*sorted({{*{slow.split()}}} & {{*sys.modules}}))"
