@@ -25,11 +25,8 @@ from kouxing.services.service_kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, Frame
 from kouxing.services.synthesizer.face_maker import FaceMaker
-from kouxing.services.synthesizer.session import (
-    NO_LATENESS,
-    RECOGNIZER_TIMEOUT_S,
-    SynthesizerSession,
-)
+from kouxing.services.synthesizer.lateness import NO_LATENESS
+from kouxing.services.synthesizer.session import RECOGNIZER_TIMEOUT_S, SynthesizerSession
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS

@@ -6,13 +6,13 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from kouxing_client.messages import FapFrame, Lateness
+from kouxing_client.messages import FapFrame
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
+from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.shapes import SHAPE_SETS
-from kouxing.shared.monitoring.metrics import percentile
 from kouxing.shared.network.reliable import ReliableReceiver
 from kouxing.shared.network.replaying_publisher import ReplayingPublisher
 from kouxing.shared.network.sockets import Socket
@@ -23,49 +23,7 @@ from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.final_time import FinalTimeTracker
 from kouxing.shared.wire.speech import Acknowledge, NewestFrame
 
-NO_LATENESS = Lateness(p50_ms=0.0, p95_ms=0.0, worst_ms=0.0)
-WINDOW_S = 10.0  # as in services/gateway/page/lateness.js
 RECOGNIZER_TIMEOUT_S = 20.0  # longer than the reports for silent clients take
-
-
-class LatenessMeter:
-    """Measures the lateness of one session's newest frames. Times are in seconds.
-
-    A live client sends audio in real time. Therefore, the clock minus the media time is constant
-    for frames that are on time, and greater for late frames. Frames are compared with the earliest
-    one of the last 10 s. Older frames are not comparable, because clocks drift and a client may
-    lose audio.
-    """
-
-    def __init__(self) -> None:
-        self.newest: Lateness | None = None  # the newest measurement
-        self._sent: deque[tuple[float, float]] = deque()  # when sent; clock minus media time
-
-    def add(self, times_s: Iterable[float], now_s: float) -> None:
-        """Record that frames with these media times are sent now."""
-        self._sent.extend((now_s, now_s - time_s) for time_s in times_s)
-        self._drop_old(now_s)
-
-    def pause(self) -> None:
-        """Record that the client sends no audio, so that media time does not advance."""
-        self._sent.clear()
-
-    def measure(self, now_s: float) -> Lateness | None:
-        """Return the lateness of the last 10 s, or None without frames. Store it in ``newest``."""
-        self._drop_old(now_s)
-        self.newest = None
-        differences_s = sorted([difference_s for _, difference_s in self._sent])
-        if differences_s:
-            p50_ms, p95_ms, worst_ms = (
-                1e3 * (percentile(differences_s, percent) - differences_s[0])
-                for percent in (50, 95, 100)
-            )
-            self.newest = Lateness(p50_ms=p50_ms, p95_ms=p95_ms, worst_ms=worst_ms)
-        return self.newest
-
-    def _drop_old(self, now_s: float) -> None:
-        while self._sent and self._sent[0][0] <= now_s - WINDOW_S:
-            self._sent.popleft()
 
 
 class SynthesizerSession:

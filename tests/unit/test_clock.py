@@ -7,7 +7,7 @@ import pytest
 
 from kouxing.services.cli.launch.service_process import POLL_S, HeartbeatGapMeter
 from kouxing.services.control.fault_log import FaultLog
-from kouxing.services.synthesizer.session import LatenessMeter
+from kouxing.services.synthesizer.lateness import LatenessMeter
 from kouxing.shared.clock import ClockOffset, StallDetector
 from kouxing.shared.monitoring.logs import LOG
 

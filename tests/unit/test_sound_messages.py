@@ -3,7 +3,7 @@
 import numpy as np
 from kouxing_client.messages import Sound
 
-from kouxing.services.recognizer.sessions.session import SoundMessages
+from kouxing.services.recognizer.sessions.sound_messages import SoundMessages
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.phones.events import Waveform
 from kouxing.shared.wire.speech import AudioState, Progress

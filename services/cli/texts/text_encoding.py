@@ -73,8 +73,8 @@ def decode_text(content: bytes, language: str) -> DecodedText:
     if b"\0" in content and not content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         is_big_endian = content[::2].count(0) > content[1::2].count(0)
         candidates.insert(0, "utf-16-be" if is_big_endian else "utf-16-le")
-    candidates.sort(key=lambda encoding: _has_rare_characters(content, encoding))
-    for encoding in candidates:
+    unique = dict.fromkeys(candidates)
+    for encoding in sorted(unique, key=lambda name: _has_rare_characters(content, name)):
         with contextlib.suppress(UnicodeDecodeError):
             text = content.decode(encoding)
             if all(ord(letter) >= 32 or letter.isspace() for letter in text):

@@ -3,7 +3,7 @@
 import { SlidingWindow } from "./sliding-window.js";
 import { SAMPLES_PER_MS } from "./playout.js";
 
-const WINDOW_MS = 10000; // as in services/synthesizer/session.py
+const WINDOW_MS = 10000; // as in services/synthesizer/lateness.py
 const LATE_MS = 300; // a face that is later than this is late
 const MIN_SKIP_MS = 100;
 const MAX_SKIP_MS = 10000; // a longer gap is a pause of the client

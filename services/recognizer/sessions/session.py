@@ -5,17 +5,17 @@ import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
-import numpy as np
-from kouxing_client.messages import Message, Phone, Sound, Speech
+from kouxing_client.messages import Message, Phone, Speech
 
 from kouxing.services.recognizer.lips.lip_prediction import LipPredictor
 from kouxing.services.recognizer.live.recognizer import Recognizer
 from kouxing.services.recognizer.sessions.audio_queue import AudioQueue
 from kouxing.services.recognizer.sessions.resumption import Chunk, ReplayWindow, ResumeFilter
+from kouxing.services.recognizer.sessions.sound_messages import SoundMessages
 from kouxing.services.recognizer.sessions.synthesizer_link import SynthesizerLink
 from kouxing.shared.audio.encoding_check import EncodingCheck
-from kouxing.shared.audio.pcm import as_integers, decode_pcm
-from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
+from kouxing.shared.audio.pcm import decode_pcm
+from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.peer import NO_PEER
@@ -42,7 +42,6 @@ ACKNOWLEDGE_EVERY_S = 0.1  # interval between acknowledgements to a client that 
 STALLED_AFTER_S = 0.2  # a live client that sends no audio for this time has stalled
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
 RESEND_WAIT_S = 1.0  # wait for resent audio; then the session continues after the gap
-MESSAGE_S = 0.04  # duration of a message with sound; less if the face has a shorter delay
 M = TypeVar("M", bound=Message)
 
 _CLIENT_CLOCK_RATE = 1.01  # a client's clock may run this much faster
@@ -330,34 +329,3 @@ class _LeadLimiter:
         self._lead_s, self._updated_s = lead_s, now_s
         self._end_s = begin_s + duration_s
         return True
-
-
-class SoundMessages:
-    """Joins audio into longer messages, because every message has a fixed cost.
-
-    A message is delayed by no more than ``face_delay_s``.
-    """
-
-    def __init__(self, face_delay_s: float) -> None:
-        self._num_joined = round(min(MESSAGE_S, face_delay_s) * MEDIA_RATE_HZ)  # samples
-        self._start = 0  # media time, samples
-        self._samples = np.empty(0, np.float32)
-
-    def add(self, result: Waveform | Progress) -> Iterator[Sound]:
-        """Add sound, or the state of the audio; yield the messages that are complete."""
-        if isinstance(result, Waveform):
-            start = to_samples(result.time_s)
-            if start != self._start + len(self._samples):  # after a gap
-                yield from self._take()
-                self._start = start
-            self._samples = np.concatenate([self._samples, result.samples])
-            if len(self._samples) >= self._num_joined:
-                yield from self._take()
-        elif result.state == AudioState.ENDED:
-            yield from self._take()
-
-    def _take(self) -> Iterator[Sound]:
-        if len(self._samples):
-            yield Sound(media_time=self._start, pcm=as_integers(self._samples).tobytes())
-            self._start += len(self._samples)
-            self._samples = self._samples[:0]

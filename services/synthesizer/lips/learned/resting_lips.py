@@ -53,7 +53,7 @@ _ONSET_DB = 8.0  # an onset's minimum level above the background
 _ONSET_LEAD_S, _ONSET_CLOSE_S = 0.065, 0.05  # lips start to close before an onset; closing time
 _ONSET_S = 0.15  # time from the start of this closing for which the goal stays 0
 _MIN_BACKGROUND_DB = -75.0  # quieter audio counts as this level
-_NUM_FIRST_LEVELS = 3  # until then, the background is their mean, and nothing is an onset
+_NUM_FIRST_LEVELS = 3  # their mean is the first background; there is no onset before it
 # change of the background per level: fraction of the difference, and during an onset
 _BACKGROUND_RATE, _BACKGROUND_RISE_DB = 0.1, 2.0
 
