@@ -53,6 +53,8 @@ class AudioSource:
     warnings: list[str] = field(default_factory=list)  # problems; complete after the last block
     is_live: bool = False  # whether the audio arrives in real time
     notices: list[str] = field(default_factory=list)  # messages to print before reading
+    # Whether the audio is longer, in seconds; False if that is not known before decoding.
+    is_longer_than: Callable[[float], bool] = lambda limit_s: False
 
 
 def open_audio(
@@ -221,11 +223,15 @@ def read_audio(path: Path) -> tuple[Samples, int]:
 def limited_blocks(
     source: AudioSource, max_duration_s: float = MAX_DURATION_S
 ) -> Iterator[Samples]:
-    """Yield the blocks of a recording; raises ``UserError`` if it is too long."""
+    """Yield the blocks of a recording; raises ``UserError`` if it is too long.
+
+    If the file states its duration, the error comes before the first block.
+    """
     num_samples = 0
     for block in source.blocks:
+        states_too_much = num_samples == 0 and source.is_longer_than(max_duration_s)
         num_samples += len(block)
-        if num_samples > max_duration_s * source.sample_rate_hz:
+        if states_too_much or num_samples > max_duration_s * source.sample_rate_hz:
             raise UserError(
                 f"{source.name}: the audio is longer than {max_duration_s / 3600:g} h; use a"
                 " shorter file"
@@ -319,6 +325,7 @@ def _make_source(
         blocks=blocks(),
         warnings=media.warnings,
         notices=media.notices,
+        is_longer_than=media.is_longer_than,
     )
 
 

@@ -1,5 +1,6 @@
 """Decodes the audio of files and pipes with FFmpeg, at the timestamps of the container."""
 
+import io
 import re
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -33,6 +34,7 @@ _JITTER_S = 0.05  # timestamps that differ less from the number of samples are i
 _MAX_OVERLAP_S = 1.0  # timestamps that go back further are a restart
 _MAX_GAP_S = 3600.0  # a larger gap is an error in the timestamps
 _MAX_GAP_OF_BROADCAST_S = 10.0  # timestamps of broadcasts may restart at any value
+_PADDING_S = 1.0  # an encoder adds less silence at both ends, which a decoder may remove
 _MIN_MISSING_S = 0.1  # a track that lacks more is reported as cut off
 _MIN_MISSING_OF_FILE_S = 0.5  # the last image of a video may last this long
 # FFmpeg guesses these from the file's name, and also guesses their rate.
@@ -69,15 +71,17 @@ class MediaAudio:
         if is_pipe:
             options = _PACKET_OPTIONS if is_transport_stream(begin) else _PIPE_OPTIONS
         self._file = _GuardedFile(file, can_seek=not is_pipe)
+        self._open = partial(
+            av.open,
+            self._file,
+            mode="r",
+            format=unprobed_format(begin),
+            options=options,
+            buffer_size=4096 if is_pipe else 65536,
+            metadata_errors="replace",
+        )
         try:
-            self._container: Any = av.open(
-                self._file,
-                mode="r",
-                format=unprobed_format(begin),
-                options=options,
-                buffer_size=4096 if is_pipe else 65536,
-                metadata_errors="replace",
-            )
+            self._container: Any = self._open()
         except (av.error.FFmpegError, ValueError) as error:
             self._file.check()
             raise UserError(f"{name}: {why_unreadable(begin, _reason(error))}") from None
@@ -108,6 +112,28 @@ class MediaAudio:
         self._has_times = self._restarts or has_index or kind.name == "flac"
         self.duration_s = None if is_pipe else self._stated_s()
         self.blocks = self._blocks(first)
+
+    def is_longer_than(self, limit_s: float) -> bool:
+        """Return whether the audio is longer; False if that is not known before decoding.
+
+        If the file states a longer duration, this counts its packets, because the file may be cut
+        off, and FFmpeg estimates some durations.
+        """
+        if (self.duration_s or 0.0) <= limit_s:
+            return False
+        place, read_s = self._file.seek(0, io.SEEK_CUR), 0.0
+        self._file.seek(0)
+        try:
+            with self._open() as container:
+                for packet in container.demux(container.streams[self._stream.index]):
+                    read_s += float((packet.duration or 0) * (packet.time_base or 0))
+                    if read_s > limit_s + _PADDING_S:
+                        break
+        except (av.error.FFmpegError, ValueError, IndexError):
+            pass  # `_decode` reports the damage
+        self._file.check()
+        self._file.seek(place)
+        return read_s > limit_s + _PADDING_S
 
     def _choose(self, track: int | None, begin: bytes) -> Any:
         tracks = self._container.streams.audio

@@ -8,7 +8,13 @@ import pytest
 import soundfile
 
 from kouxing.corpora.lip_tracking import read_video
-from kouxing.shared.audio.audio_file import AudioSource, check_video, open_audio, read_audio
+from kouxing.shared.audio.audio_file import (
+    AudioSource,
+    check_video,
+    limited_blocks,
+    open_audio,
+    read_audio,
+)
 from kouxing.shared.errors import UserError
 from tests.unit.media import samples_of, write_audio, write_media, write_tracks
 
@@ -155,6 +161,44 @@ def test_warns_about_a_file_that_is_cut_off(tmp_path: Path, name: str) -> None:
     (warning,) = source.warnings
     assert "cut off after" in warning
     assert "of 3." in warning or name == "a.opus"  # its header states no length
+
+
+@pytest.mark.parametrize(
+    "name", [f"a.{suffix}" for suffix in "wav w64 aiff caf flac mp3 m4a mkv mp4 wma opus".split()]
+)
+def test_a_file_that_states_a_long_duration_is_rejected_before_it_is_decoded(
+    tmp_path: Path, name: str
+) -> None:
+    write_audio(tmp_path / name, np.tile(TONE, 4), RATE_HZ)
+    with pytest.raises(UserError, match="the audio is longer than"):
+        next(limited_blocks(open_audio(tmp_path / name), 2.0))
+
+
+@pytest.mark.parametrize("name", ["a.flac", "a.mp3", "a.mp4", "a.opus"])
+def test_checking_the_duration_does_not_change_the_samples(tmp_path: Path, name: str) -> None:
+    write_audio(tmp_path / name, np.tile(TONE, 4), RATE_HZ)
+    checked = open_audio(tmp_path / name)
+    assert not checked.is_longer_than(3.9)  # a little more may be padding
+    np.testing.assert_array_equal(_read(checked), _read(open_audio(tmp_path / name)))
+
+
+@pytest.mark.parametrize("name", ["a.flac", "a.mkv", "a.mp4", "a.wav"])
+def test_a_file_that_is_cut_off_may_state_a_long_duration(tmp_path: Path, name: str) -> None:
+    data = write_audio(tmp_path / name, np.tile(TONE, 4), RATE_HZ, movflags="faststart")
+    (tmp_path / name).write_bytes(data[: len(data) // 4])
+    source = open_audio(tmp_path / name)
+    assert sum(len(block) for block in limited_blocks(source, 2.0)) < 1.5 * RATE_HZ
+    assert "cut off after" in source.warnings[0]
+
+
+def test_a_header_that_states_too_little_does_not_matter(tmp_path: Path) -> None:
+    data = bytearray(write_audio(tmp_path / "a.flac", np.tile(TONE, 4), RATE_HZ))
+    data[22:26] = (RATE_HZ).to_bytes(4, "big")  # of 4 * RATE_HZ samples
+    (tmp_path / "a.flac").write_bytes(data)
+    source = open_audio(tmp_path / "a.flac")
+    assert source.duration_s == pytest.approx(1.0)
+    with pytest.raises(UserError, match="the audio is longer than"):
+        list(limited_blocks(source, 2.0))
 
 
 @pytest.mark.parametrize(
