@@ -6,10 +6,11 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from kouxing_client import Client, FapFrame, KouxingError, Results, Session
+from kouxing_client.core import newest_session
+from kouxing_client.messages import Fields
 
 from kouxing.services.senders.sender_pool import SenderPool
 from kouxing.services.senders.target import Target
@@ -19,7 +20,6 @@ from kouxing.shared.interrupt import catch_interrupt, install_interrupt_handler
 
 SEARCH_PERIOD_S = 0.2
 STEP_S = 0.05
-_TOLERANCE_S = 0.05  # two opening times that differ less are equal
 
 
 def send_to(targets: Iterable[Target], session: str, control: str, *, idle_motion: bool) -> None:
@@ -47,19 +47,6 @@ def send_to(targets: Iterable[Target], session: str, control: str, *, idle_motio
             _send_frames(search, client, senders)
 
 
-@dataclass(frozen=True, slots=True)
-class _OpenedSession:
-    """The name of a session, and when it was opened at the earliest and at the latest."""
-
-    session: str
-    earliest_s: float
-    latest_s: float
-
-    def is_after(self, other: _OpenedSession) -> bool:
-        """Return whether this is another session, also if it has the same name."""
-        return self.session != other.session or self.earliest_s > other.latest_s + _TOLERANCE_S
-
-
 class _SessionFinder:
     """Asks control for the session to follow, in a thread because answers may take long.
 
@@ -67,7 +54,7 @@ class _SessionFinder:
     """
 
     def __init__(self, session: str, client: Client, senders: SenderPool) -> None:
-        self.newest: _OpenedSession | None = None
+        self.newest: Fields | None = None  # name and id of the session that was found last
         self._session = session
         self._client = client
         self._senders = senders
@@ -84,41 +71,30 @@ class _SessionFinder:
 
     def _run(self) -> None:
         while not self._ended.wait(SEARCH_PERIOD_S):
-            with contextlib.suppress(KouxingError):  # control restarts
-                asked_s = time.monotonic()
+            with contextlib.suppress(KouxingError):  # control restarts, or no session is open
                 status = self._client.status()
-                answered_s = time.monotonic()
-                published = [
-                    state
-                    for state in status.sessions
-                    if "faps" in state.endpoints and self._session in ("", state.session)
-                ]
-                if published:
-                    newest = min(published, key=lambda state: state.age_s)
-                    self.newest = _OpenedSession(
-                        newest.session, asked_s - newest.age_s, answered_s - newest.age_s
-                    )
                 face = status.resting_face
                 if face.get("expressions") is not None:
                     self._senders.express(face["expressions"], face["hold_s"])
+                self.newest = newest_session(status, self._session)
 
 
 def _send_frames(search: _SessionFinder, client: Client, senders: SenderPool) -> None:
     """Send the frames of the session that was found last. Does not return."""
-    followed: _OpenedSession | None = None
+    followed = ""  # id of the followed session
     session: Session | None = None
     frames: Results[FapFrame] | None = None
     while True:
         newest = search.newest
-        if newest is not None and (followed is None or newest.is_after(followed)):
+        if newest is not None and newest["session_id"] != followed:
             if session is not None:
                 session.close()
-            followed = None
+            followed = ""
             with contextlib.suppress(KouxingError):  # already closed, or control restarts
-                session = client.follow(newest.session)
+                session = client.follow(newest["session"])
                 frames = session.frames()
-                print_message(f"following session {newest.session}")
-                followed = newest
+                print_message(f"following session {newest['session']}")
+                followed = newest["session_id"]
         frame: FapFrame | None = None
         with contextlib.suppress(KouxingError):  # the session was closed before its last frame
             frame = None if frames is None else frames.get(STEP_S)
