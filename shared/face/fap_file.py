@@ -57,11 +57,6 @@ class FapAnimation:
     expressions: NDArray[np.int64] | None = None  # (num_frames, 6), the numbers of FAP 2
 
 
-class _BadFileError(Exception):
-    def __init__(self, line_number: int, reason: str) -> None:
-        super().__init__(f"line {line_number}: {reason}")
-
-
 def read_fap(path: Path) -> FapAnimation:
     """Read a ``.fap`` file.
 
@@ -69,10 +64,48 @@ def read_fap(path: Path) -> FapAnimation:
     the line.
     """
     text = read_file(path, MAX_BYTES).decode("utf-8-sig", "replace")
+    number = 1  # of the line that is parsed
     try:
-        return _parse(path, text)
-    except _BadFileError as error:
-        raise UserError(f"{path}, {error}; use a .fap file of version {_VERSION}") from error
+        lines = _lines(path, text)
+        number, line = next(lines, (1, ""))
+        name, frame_rate_hz, num_frames = _parse_header(line.split())
+        num_lines = 0
+        for number, _ in lines:  # noqa: B007 - an error names it
+            num_lines += 1
+            if num_lines > 2 * num_frames:
+                raise ValueError(f"more frames than the header states: {num_frames}")
+        if num_lines < 2 * num_frames:
+            raise ValueError(f"the file ends after {num_lines // 2} of {num_frames} frames")
+        lines = itertools.islice(_lines(path, text), 1, None)
+        faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
+        visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)
+        expressions = np.zeros((num_frames, len(_EXPRESSION_LIMITS)), dtype=np.int64)
+        used = np.zeros(NUM_FAPS, dtype=bool)
+        first: int | None = None  # number of the first frame
+        for frame in range(num_frames):
+            number, line = next(lines)
+            mask = _parse_mask(line)
+            number, line = next(lines)
+            words = line.split()
+            visemes[frame], expressions[frame], values = _parse_values(words, mask)
+            faps[frame, 2:][mask[2:]] = values
+            written = _parse_int(words[0], "a frame number")
+            first = written if first is None else first
+            if written != first + frame:
+                raise ValueError(f"found frame {written}, expected frame {first + frame}")
+            used |= mask
+    except ValueError as error:
+        raise UserError(
+            f"{path}, line {number}: {error}; use a .fap file of version {_VERSION}"
+        ) from error
+    faps[:, 0], faps[:, 1] = visemes[:, 0], expressions[:, 0]
+    for inner, outer in _LIP_PAIRS.items():
+        if used[inner - 1] and not used[outer - 1]:
+            faps[:, outer - 1] = faps[:, inner - 1]
+        elif used[outer - 1] and not used[inner - 1]:
+            faps[:, inner - 1] = faps[:, outer - 1]
+    used_visemes, used_expressions = visemes if used[0] else None, expressions if used[1] else None
+    return FapAnimation(name, frame_rate_hz, faps, used_visemes, used_expressions)
 
 
 def write_fap(path: Path, animation: FapAnimation) -> None:
@@ -97,48 +130,6 @@ def write_fap(path: Path, animation: FapAnimation) -> None:
         file.write(("\n".join(lines) + "\n").encode())
 
 
-def _parse(path: Path, text: str) -> FapAnimation:
-    lines = _lines(path, text)
-    number, line = next(lines, (1, ""))
-    name, frame_rate_hz, num_frames = _parse_header(number, line.split())
-    if num_frames > MAX_FRAMES:
-        raise _BadFileError(number, f"more than {MAX_FRAMES} frames; split the file")
-    num_lines = 0
-    for number, _ in lines:
-        num_lines += 1
-        if num_lines > 2 * num_frames:
-            raise _BadFileError(number, f"more frames than the header states: {num_frames}")
-    if num_lines < 2 * num_frames:
-        raise _BadFileError(number, f"the file ends after {num_lines // 2} of {num_frames} frames")
-    lines = itertools.islice(_lines(path, text), 1, None)
-    faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
-    visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)
-    expressions = np.zeros((num_frames, len(_EXPRESSION_LIMITS)), dtype=np.int64)
-    used = np.zeros(NUM_FAPS, dtype=bool)
-    first_number: int | None = None
-    for frame in range(num_frames):
-        mask = _parse_mask(*next(lines))
-        line_number, line = next(lines)
-        words = line.split()
-        visemes[frame], expressions[frame], values = _parse_values(line_number, words, mask)
-        faps[frame, 2:][mask[2:]] = values
-        number = _parse_int(line_number, words[0], "a frame number")
-        first_number = number if first_number is None else first_number
-        if number != first_number + frame:
-            raise _BadFileError(
-                line_number, f"found frame {number}, expected frame {first_number + frame}"
-            )
-        used |= mask
-    faps[:, 0], faps[:, 1] = visemes[:, 0], expressions[:, 0]
-    for inner, outer in _LIP_PAIRS.items():
-        if used[inner - 1] and not used[outer - 1]:
-            faps[:, outer - 1] = faps[:, inner - 1]
-        elif used[outer - 1] and not used[inner - 1]:
-            faps[:, inner - 1] = faps[:, outer - 1]
-    used_visemes, used_expressions = visemes if used[0] else None, expressions if used[1] else None
-    return FapAnimation(name, frame_rate_hz, faps, used_visemes, used_expressions)
-
-
 def _lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
     """Yield line numbers and lines, without empty lines and comments."""
     for number, line in enumerate(split_lines(path, text), start=1):
@@ -146,51 +137,55 @@ def _lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:
+def _parse_header(words: list[str]) -> tuple[str, float, int]:
     if not words or words[0] != _VERSION:
         actual = f"version '{words[0]}'" if words else "nothing"
-        raise _BadFileError(line_number, f"expected '{_VERSION} NAME FPS NFRAMES', found {actual}")
+        raise ValueError(f"expected '{_VERSION} NAME FPS NFRAMES', found {actual}")
     if len(words) < 4:
-        raise _BadFileError(line_number, f"expected '{_VERSION} NAME FPS NFRAMES'")
+        raise ValueError(f"expected '{_VERSION} NAME FPS NFRAMES'")
     try:
         frame_rate_hz = float(words[-2])
     except ValueError:
         frame_rate_hz = math.nan
     if not 1.0 <= frame_rate_hz <= 1000.0:
-        raise _BadFileError(line_number, f"frame rate '{words[-2]}' is not between 1 and 1000")
-    num_frames = _parse_int(line_number, words[-1], "a number of frames")
+        raise ValueError(f"frame rate '{words[-2]}' is not between 1 and 1000")
+    num_frames = _parse_int(words[-1], "a number of frames")
     if num_frames < 0:
-        raise _BadFileError(line_number, f"the number of frames is {num_frames}")
+        raise ValueError(f"the number of frames is {num_frames}")
+    if num_frames > MAX_FRAMES:
+        raise ValueError(f"more than {MAX_FRAMES} frames; split the file")
     return " ".join(words[1:-2]), frame_rate_hz, num_frames
 
 
-def _parse_int(line_number: int, word: str, description: str) -> int:
+def _parse_int(word: str, description: str) -> int:
     try:
         return int(word)
     except ValueError:
-        raise _BadFileError(line_number, f"'{word}' is not {description}") from None
+        raise ValueError(f"'{word}' is not {description}") from None
 
 
-def _parse_mask(line_number: int, line: str) -> NDArray[np.bool_]:
+def _parse_mask(line: str) -> NDArray[np.bool_]:
     digits = "".join(line.split())
     if len(digits) not in (NUM_FAPS, _GRETA_MASK_DIGITS) or set(digits) - {"0", "1"}:
-        raise _BadFileError(
-            line_number,
-            f"expected a mask of {NUM_FAPS} (Greta: {_GRETA_MASK_DIGITS}) digits 0 or 1",
+        raise ValueError(
+            f"expected a mask of {NUM_FAPS} (Greta: {_GRETA_MASK_DIGITS}) digits 0 or 1"
         )
     if digits[NUM_FAPS:] == "1":
-        raise _BadFileError(line_number, "the mask sets a 69th FAP; the standard has only 68")
+        raise ValueError("the mask sets a 69th FAP; the standard has only 68")
     return np.array([digit == "1" for digit in digits[:NUM_FAPS]])
 
 
 def _parse_values(
-    line_number: int, words: list[str], mask: NDArray[np.bool_]
+    words: list[str], mask: NDArray[np.bool_]
 ) -> tuple[list[int], list[int], NDArray[np.float32]]:
-    """Return the numbers of FAP 1 (4) and FAP 2 (6), and the other values in the mask."""
+    """Return the numbers of FAP 1 (4) and FAP 2 (6), and the other values in the mask.
+
+    The first word is the number of the frame.
+    """
     try:
         values = [float(word) for word in words[1:]]
     except ValueError:
-        raise _BadFileError(line_number, "a value is not a number") from None
+        raise ValueError("a value is not a number") from None
     # the length of the line shows how many numbers FAP 1 and 2 have
     for num_viseme in (len(_VISEME_LIMITS), 1) if mask[0] else (0,):
         for num_expression in (len(_EXPRESSION_LIMITS), 1) if mask[1] else (0,):
@@ -199,25 +194,19 @@ def _parse_values(
                 low = np.array(values[high:], dtype=np.float64)
                 sane = np.where(np.abs(low) <= np.finfo(np.float32).max, low, 0.0)
                 return (
-                    _parse_high(line_number, 1, values[:num_viseme], _VISEME_LIMITS),
-                    _parse_high(line_number, 2, values[num_viseme:high], _EXPRESSION_LIMITS),
+                    _parse_high(1, values[:num_viseme], _VISEME_LIMITS),
+                    _parse_high(2, values[num_viseme:high], _EXPRESSION_LIMITS),
                     sane.astype(np.float32),
                 )
-    raise _BadFileError(
-        line_number, f"found {len(values)} values, the mask sets {int(mask.sum())} FAPs"
-    )
+    raise ValueError(f"found {len(values)} values, the mask sets {int(mask.sum())} FAPs")
 
 
-def _parse_high(
-    line_number: int, fap: int, numbers: list[float], limits: tuple[int, ...]
-) -> list[int]:
+def _parse_high(fap: int, numbers: list[float], limits: tuple[int, ...]) -> list[int]:
     if not numbers:
         return [0] * len(limits)
     if len(numbers) == 1:
         numbers = [*numbers, *(_VISEME_ALONE if fap == 1 else _EXPRESSION_ALONE)]
     for value, limit in zip(numbers, limits, strict=True):
         if not (0 <= value <= limit and value == int(value)):
-            raise _BadFileError(
-                line_number, f"FAP {fap} is {value:g}; it must be an integer from 0 to {limit}"
-            )
+            raise ValueError(f"FAP {fap} is {value:g}; it must be an integer from 0 to {limit}")
     return [int(value) for value in numbers]
