@@ -34,7 +34,7 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
     kind = KINDS[name]
     if kind.role != "observer":  # observers draw pictures or start other programs
         raise_priority()
-    config = read_settings(file).load(kind.config_type, parse_assignments(assignments, name))
+    config = read_settings(file, parse_assignments(assignments, name)).load(kind.config_type)
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # a closed connection is not fatal
     return run_service(lambda: kind.service_type(config), name, config.log_level)
 

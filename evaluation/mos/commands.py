@@ -83,8 +83,8 @@ def serve(
     from kouxing.services.service_kinds import read_settings
     from kouxing.shared.settings.config import parse_assignments
 
-    overrides = parse_assignments(assignments or [], "gateway")
-    gateway = read_settings(config).load(GatewayConfig, overrides)
+    settings = read_settings(config, parse_assignments(assignments or [], "gateway"))
+    gateway = settings.load(GatewayConfig)
     study, store = load_study(folder), AnswerStore(folder)
     try:
         asyncio.run(

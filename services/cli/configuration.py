@@ -47,12 +47,13 @@ def config(
     """Print the value, source, default, allowed values and meaning of every setting."""
     if service and service not in CONFIG_TYPES:
         raise UserError(f"unknown service {service!r}; choose one of {', '.join(CONFIG_TYPES)}")
-    values = parse_assignments(assignments or [], service)
-    if service:
-        text = _toml_table(service, read_settings(config).describe(CONFIG_TYPES[service], values))
-    else:
-        tables = _all_settings(read_settings(config, values))
-        text = "\n".join(_toml_table(name, settings) for name, settings in tables)
+    settings = read_settings(config, parse_assignments(assignments or [], service))
+    tables = (
+        [(service, settings.describe(CONFIG_TYPES[service]))]
+        if service
+        else _all_settings(settings)
+    )
+    text = "\n".join(_toml_table(name, keys) for name, keys in tables)
     sys.stdout.write(text)
 
 

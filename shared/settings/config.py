@@ -61,11 +61,6 @@ class BindAddress(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Unique:
-    """Marks a key that is not in ``[common]``, because each service needs its own value."""
-
-
-@dataclass(frozen=True, slots=True)
 class ValueHint:
     """Describes the values of a key whose type is not specific enough."""
 
@@ -150,7 +145,7 @@ Host = Annotated[
 ]
 BoundHost = Annotated[Host, BindAddress.HOST]
 BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
-InstanceName = Annotated[str, Field(max_length=128), ValueHint("up to 128 characters"), Unique()]
+InstanceName = Annotated[str, Field(max_length=128), ValueHint("up to 128 characters")]
 LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_to_lower)]
 TextList = Annotated[tuple[str, ...], BeforeValidator(_split_text)]
 """A list in a TOML file; elsewhere a text with spaces between the items."""
@@ -267,22 +262,20 @@ class Settings:
             _make_layer(
                 {n: text for n, text in environment.items() if n.startswith(PREFIX)}, variables
             ),
-            self._command_line_layer(assignments or {}),
+            _make_layer(assignments or {}, self._names, "--set"),
         )
 
-    def load(self, config_type: type[Config], overrides: Mapping[str, str] | None = None) -> Config:
+    def load(self, config_type: type[Config]) -> Config:
         """Return the checked configuration of a service, or of a client (``ServiceConfig``).
 
-        ``overrides`` are values from the command line, by key. Raises ``UserError`` if a value is
-        not allowed; the text names the key, the value and its origin.
+        Raises ``UserError`` if a value is not allowed; the text names the key, the value and its
+        origin.
         """
-        return self._resolve(config_type, overrides or {})[0]
+        return self._resolve(config_type)[0]
 
-    def describe(
-        self, config_type: type[ServiceConfig], overrides: Mapping[str, str] | None = None
-    ) -> list[Setting]:
+    def describe(self, config_type: type[ServiceConfig]) -> list[Setting]:
         """Return all keys of a service with their current values; raises as ``load``."""
-        config, values = self._resolve(config_type, overrides or {})
+        config, values = self._resolve(config_type)
         defaults = config_type()
         return [
             Setting(
@@ -296,16 +289,11 @@ class Settings:
             for key, field in _fields(self._table(config_type), config_type).items()
         ]
 
-    def _resolve(
-        self, config_type: type[Config], overrides: Mapping[str, str]
-    ) -> tuple[Config, dict[str, _RawValue]]:
+    def _resolve(self, config_type: type[Config]) -> tuple[Config, dict[str, _RawValue]]:
         table = self._table(config_type)
-        assigned = self._command_line_layer(
-            {f"{table}.{key}": text for key, text in overrides.items()}
-        )
         values = {
             key: layer[name, key]
-            for layer in (*self._layers, assigned)
+            for layer in self._layers
             for name in (COMMON, table)
             for key in config_type.model_fields
             if (name, key) in layer
@@ -323,9 +311,6 @@ class Settings:
 
     def _keys(self, table: str) -> Mapping[str, FieldInfo]:
         return _fields(table, self._tables[table])
-
-    def _command_line_layer(self, values: Mapping[str, str]) -> Layer:
-        return _make_layer(values, self._names, "--set")
 
     def _read_file(self, file: Path) -> Layer:
         text = read_text(file, _MAX_FILE_BYTES)
@@ -364,19 +349,13 @@ class Settings:
 
 
 def _fields(table: str, config_type: type[ServiceConfig]) -> Mapping[str, FieldInfo]:
-    """Return the keys of a table."""
+    """Return the keys of a table. ``[common]`` has no ``instance``: names must differ."""
     fields = config_type.model_fields
-    return {
-        key: field for key, field in fields.items() if table != COMMON or not _has(field, Unique)
-    }
+    return {key: fields[key] for key in fields if (table, key) != (COMMON, "instance")}
 
 
 def _is_list(field: FieldInfo) -> bool:
     return typing.get_origin(field.annotation) is tuple
-
-
-def _has(field: FieldInfo, mark: type) -> bool:
-    return any(isinstance(known, mark) for known in field.metadata)
 
 
 def variable_name(table: str, key: str) -> str:
@@ -424,10 +403,10 @@ def bound_keys(config_type: type[ServiceConfig]) -> dict[str, BindAddress]:
 
 
 def parse_assignments(assignments: Iterable[str], service: str = "") -> dict[str, str]:
-    """Split the values of ``--set`` into keys and values.
+    """Return the values of ``--set`` by ``service.key``.
 
-    The name of ``service`` before a key is removed. Raises ``UserError`` if an assignment is not
-    ``KEY=VALUE``, or sets a key of another service than ``service``.
+    If ``service`` is set, its name may be omitted before a key. Raises ``UserError`` if an
+    assignment is not ``KEY=VALUE``, or sets a key of another service than ``service``.
     """
     values = {}
     for assignment in assignments:
@@ -440,7 +419,7 @@ def parse_assignments(assignments: Iterable[str], service: str = "") -> dict[str
                 f"--set {assignment}: this command has only the keys of {service}, and not the key"
                 f" {key}"
             )
-        values[key] = value
+        values[f"{service}.{key}" if service else key] = value
     return values
 
 

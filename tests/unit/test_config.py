@@ -31,6 +31,10 @@ def settings(
     return Settings(CONFIG_TYPES, file=file, environment=environment or {}, assignments=assignments)
 
 
+def assign(assignments: dict[str, str]) -> Settings:
+    return Settings(CONFIG_TYPES, environment={}, assignments=assignments)
+
+
 def write(folder: Path, text: str) -> Path:
     path = folder / "kouxing.toml"
     path.write_text(text, encoding="utf-8")
@@ -42,8 +46,9 @@ def test_every_default_is_allowed_and_every_key_is_described(
     config_type: type[ServiceConfig],
 ) -> None:
     described = settings().describe(config_type)
-    texts = {item.key: item.text for item in described}
-    assert settings().load(config_type, texts) == settings().load(config_type) == config_type()
+    table = next((name for name, known in CONFIG_TYPES.items() if known is config_type), "common")
+    given = assign({f"{table}.{item.key}": item.text for item in described})
+    assert given.load(config_type) == settings().load(config_type) == config_type()
     assert all(item.meaning.endswith(".") and item.allowed for item in described)
 
 
@@ -57,7 +62,6 @@ def test_sources_override_each_other_in_order(tmp_path: Path) -> None:
     assert settings(file, environment).load(RecognizerConfig).num_stable_frames == 4
     given = settings(file, environment, recognizer__num_stable_frames="5")
     assert given.load(RecognizerConfig).num_stable_frames == 5
-    assert given.load(RecognizerConfig, {"num_stable_frames": "6"}).num_stable_frames == 6
     levels = {"KOUXING_RECOGNIZER_LOG_LEVEL": "DEBUG", "KOUXING_LOG_LEVEL": "error"}
     for given in (settings(file), settings(environment=levels)):
         assert given.load(RecognizerConfig).log_level == "debug"
@@ -122,9 +126,8 @@ def test_a_default_may_depend_on_another_key() -> None:
 def test_an_error_names_key_value_origin_and_what_is_allowed(
     key: str, text: str, allowed: str
 ) -> None:
-    section, _, name = key.partition(".")
     with pytest.raises(UserError) as error:
-        settings().load(CONFIG_TYPES[section], {name: text})
+        assign({key: text}).load(CONFIG_TYPES[key.partition(".")[0]])
     assert str(error.value).startswith(f"{key}: {text!r} (from --set) is not ")
     assert str(error.value).endswith(allowed)
 
@@ -135,9 +138,9 @@ def test_names_may_have_capitals() -> None:
         "MyLips",
         "ferguson",
     ]
-    assert settings().load(DriverConfig, {"background": "Green"}).background == "green"
-    assert settings().load(DriverConfig, {"background": "grey"}).background == "grey"
-    assert settings().load(GatewayConfig, {"https": "Proxy"}).is_behind_proxy
+    assert settings(driver__background="Green").load(DriverConfig).background == "green"
+    assert settings(driver__background="grey").load(DriverConfig).background == "grey"
+    assert settings(gateway__https="Proxy").load(GatewayConfig).is_behind_proxy
 
 
 @pytest.mark.parametrize(
@@ -191,9 +194,10 @@ def test_the_variables_in_documents_are_known(name: str) -> None:
 
 def test_a_host_that_others_can_reach_must_be_encrypted() -> None:
     with pytest.raises(UserError, match=r"gateway.host: other machines can reach 0\.0\.0\.0"):
-        settings().load(GatewayConfig, {"host": ANYWHERE})
+        assign({"gateway.host": ANYWHERE}).load(GatewayConfig)
     for key, text in (("https", "proxy"), ("https", "face.pem"), ("insecure", "true")):
-        assert settings().load(GatewayConfig, {"host": ANYWHERE, key: text}).host == ANYWHERE
+        given = assign({"gateway.host": ANYWHERE, f"gateway.{key}": text})
+        assert given.load(GatewayConfig).host == ANYWHERE
 
 
 def test_the_file_for_all_hosts_in_the_docs_is_valid(tmp_path: Path) -> None:

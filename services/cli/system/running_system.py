@@ -136,11 +136,11 @@ def choose_system(address: str) -> ChosenSystem:
     """Choose the system whose control is ``address``, is in the settings, or was started last."""
     if address:
         split_endpoint(address, "--control")
-    settings, overrides = read_settings(), {"control": address} if address else {}
-    keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
+    settings = read_settings(assignments={"common.control": address} if address else {})
+    keys = {setting.key: setting for setting in settings.describe(ServiceConfig)}
     is_given = not keys["control"].is_default
     running = "" if is_given else newest_control_endpoint()
-    config = settings.load(ServiceConfig, overrides)
+    config = settings.load(ServiceConfig)
     if "*" in config.control:
         key = "--control" if address else "common.control"
         raise UserError(f"{key}: {config.control!r} is not a host and port; write tcp://HOST:PORT")
