@@ -20,27 +20,27 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import open_output, write_error
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, ProgressColumn
 
 CONSOLE = Console(stderr=True)
 Force = Annotated[bool, typer.Option("--force", help="Overwrite output files that exist.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file for the results.")]
 
 
-def print_message(text: str) -> None:
+def print_message(text: str, style: str | None = None) -> None:
     """Print a message to standard error, because standard output is for results.
 
     A full disk is ignored.
     """
     with contextlib.suppress(OSError):
-        CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+        CONSOLE.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
-def open_progress() -> Progress:
+def open_progress(*columns: ProgressColumn) -> Progress:
     """Return progress bars for a terminal, which disappear when they are done."""
     from rich.progress import Progress  # noqa: PLC0415 (few commands need it)
 
-    return Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive)
+    return Progress(*columns, console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive)
 
 
 @contextlib.contextmanager

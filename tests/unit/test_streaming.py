@@ -11,6 +11,7 @@ from rich.console import Console
 
 from kouxing.services.cli.system import streaming
 from kouxing.shared.audio.audio_file import AudioSource
+from kouxing.shared.command import terminal
 
 SHORT = Event(session="s", name="error", detail="short-video: too many frames")
 FAILED = Event(session="s", name="error", detail="no-video: no encoder")
@@ -50,12 +51,12 @@ def test_waits_for_a_video_that_ends_early(
     monkeypatch.setattr(streaming, "_drawn_s", lambda *_: 0.0)
     source = AudioSource("silence", 16_000, 1, 0.0, iter(()))
     output = io.StringIO()
+    monkeypatch.setattr(terminal, "CONSOLE", Console(file=output, width=200))
     problems = [event.detail for read in reads for event in read if event.name == "error"]
     streamer = streaming._Streamer(
         mock.Mock(),
         make_session(reads[:]),
         source,
-        Console(file=output, width=200),
         is_recorded=True,
     )
     streamer.run(paced=False)

@@ -248,7 +248,7 @@ def _open_sample(path: Path, track: int | None, video: Path) -> AudioSource:
 def _play_sample(sample: AudioSource, control: str) -> None:
     from kouxing.services.cli.system.streaming import stream
 
-    summary = stream(sample, control, CONSOLE, session=_SAMPLE_SESSION, record=True)
+    summary = stream(sample, control, session=_SAMPLE_SESSION, record=True)
     print_message(
         f"spoke {sample.name}: {plural(summary.num_phones, 'phone')} in {summary.duration_s:.1f} s"
     )

@@ -20,7 +20,6 @@ from kouxing.services.cli.options import (
 from kouxing.services.cli.system.running_system import open_control_address
 from kouxing.services.service_kinds import read_settings
 from kouxing.shared.command.terminal import (
-    CONSOLE,
     Force,
     JsonFile,
     check_output,
@@ -122,7 +121,6 @@ def speak(
         summary = stream(
             audio,
             endpoint,
-            CONSOLE,
             session=_session_name(session),
             record=record,
             paced=not fast,

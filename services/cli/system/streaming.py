@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from kouxing_client import Client, KouxingError, Phone, Refused, Session
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from kouxing.shared.audio.audio_file import AudioSource
 from kouxing.shared.audio.level_check import LevelCheck
 from kouxing.shared.command.client_connection import connect_client
-from kouxing.shared.command.terminal import plural
+from kouxing.shared.command.terminal import open_progress, plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt
 
@@ -37,7 +36,6 @@ class StreamSummary:
 def stream(
     source: AudioSource,
     control: str,
-    console: Console,
     *,
     session: str = "",
     record: bool = False,
@@ -52,7 +50,7 @@ def stream(
     """
     with connect_client(control) as client:
         for notice in source.notices:
-            _warn(console, notice)
+            _warn(notice)
         drawn_before_s = _drawn_s(client) if record else 0.0
         opened = client.open_session(
             session,
@@ -65,7 +63,7 @@ def stream(
             language=language,
         )
         try:
-            streamer = _Streamer(client, opened, source, console, is_recorded=record)
+            streamer = _Streamer(client, opened, source, is_recorded=record)
             streamer.run(paced=paced)
         finally:
             with contextlib.suppress(KouxingError):  # closed already, or control is gone
@@ -85,18 +83,11 @@ class _Streamer:
     """Streams one source into a session."""
 
     def __init__(
-        self,
-        client: Client,
-        session: Session,
-        source: AudioSource,
-        console: Console,
-        *,
-        is_recorded: bool,
+        self, client: Client, session: Session, source: AudioSource, *, is_recorded: bool
     ) -> None:
         self._client = client
         self._session = session
         self._source = source
-        self._console = console
         self._awaits_video = is_recorded
         self._video = ""  # path of the written video
         self._duration_s = self._peak = 0.0  # of the sent audio
@@ -105,7 +96,7 @@ class _Streamer:
         self._events = session.events()
         self._frames = session.frames()
         self._phones = session.results(Phone, keep_all=True)
-        self._progress = _new_progress(console)
+        self._progress = _new_progress()
         self._task = self._progress.add_task(f"speaking {source.name}", total=source.duration_s)
 
     def run(self, *, paced: bool) -> None:
@@ -121,11 +112,11 @@ class _Streamer:
         self._wait_for_video(drawn_before_s)
         if not self._num_phones:
             reason = "; it is silent" if self._peak < QUIET_PEAK else ""
-            self._warn(f"{source.name}: no speech was found{reason}")
+            _warn(f"{source.name}: no speech was found{reason}")
         if self._phones.num_missed:
-            self._warn(missed_warning(self._phones.num_missed, "phone"))
+            _warn(missed_warning(self._phones.num_missed, "phone"))
         for warning in (*source.warnings, *self._level.warnings(source.name)):
-            self._warn(warning)
+            _warn(warning)
         return StreamSummary(self._session.name, self._duration_s, self._num_phones, self._video)
 
     def _update(self, timeout_s: float) -> None:
@@ -157,7 +148,7 @@ class _Streamer:
             if not source.is_live:
                 raise
             clear_interrupt()
-            self._console.print("stopping; press Ctrl-C again to drop the last words")
+            print_message("stopping; press Ctrl-C again to drop the last words")
         self._duration_s = num_sent / source.sample_rate_hz
 
     def _wait_for_end(self) -> None:
@@ -178,7 +169,7 @@ class _Streamer:
         except Refused as refusal:
             errors = [refusal]
         for error in errors:
-            self._warn(str(error))
+            _warn(str(error))
             if error.code in ("unknown-session", "bad-token", "finished"):
                 raise UserError("the session was lost; run the command again")
         self._read_events(0.0)
@@ -189,12 +180,12 @@ class _Streamer:
             if event.name == "recorded":
                 self._video, self._awaits_video = event.detail, False
             elif event.name == "error":
-                self._warn(event.detail)
+                _warn(event.detail)
                 self._awaits_video &= not event.detail.startswith("no-video")
 
     def _wait_for_video(self, drawn_before_s: float) -> None:
         """Wait for the driver's video, unless it is written or has failed."""
-        with _new_progress(self._console) as progress:
+        with _new_progress() as progress:
             task = progress.add_task("writing the video", total=self._duration_s)
             newest_s = drawn_before_s
             while self._awaits_video:
@@ -205,13 +196,9 @@ class _Streamer:
                 progress.update(task, completed=drawn_s - drawn_before_s)
                 self._read_events(STATUS_S)
 
-    def _warn(self, text: str) -> None:
-        _warn(self._console, text)
 
-
-def _new_progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, transient=True, disable=not console.is_interactive)
+def _new_progress() -> Progress:
+    return open_progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
 
 
 def _drawn_s(client: Client, timeout_s: float = 0.0) -> float:
@@ -226,5 +213,5 @@ def _drawn_s(client: Client, timeout_s: float = 0.0) -> float:
         time.sleep(STATUS_S)
 
 
-def _warn(console: Console, text: str) -> None:
-    console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
+def _warn(text: str) -> None:
+    print_message(text, style="yellow")
