@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.cli.recordings.captions import spell_syllables
+from kouxing.services.cli.recordings.curve_exporters import phone_at
 from kouxing.services.cli.texts.spoken_text import print_mismatch, read_transcript, report_mismatch
 from kouxing.services.driver.video.video_writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
@@ -93,13 +94,6 @@ class _MouthMotion:
         times_s = np.arange(num_frames) / FRAME_RATE_HZ
         openings = self.key_frames.openings_at(times_s)
         return times_s, openings, self.widths_at(times_s)
-
-    @property
-    def phone_labels(self) -> list[LabelSpan]:
-        """The phones as labels."""
-        return [
-            (phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in self.phones
-        ]
 
 
 def draw_mouth(
@@ -265,7 +259,8 @@ def _write_video(output: Path, mouth: _MouthMotion) -> str:
     labels = _syllable_labels(mouth)
     write = mouth.inventory.write
     phone_labels = [
-        (start_s, end_s, write(symbol)) for start_s, end_s, symbol in mouth.phone_labels
+        (phone.onset_s, phone.onset_s + phone.duration_s, write(phone.symbol))
+        for phone in mouth.phones
     ]
     frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))
     with (
@@ -292,7 +287,6 @@ def _label_at(time_s: float, spans: Sequence[LabelSpan]) -> str:
 
 def _write_csv(output: Path, mouth: _MouthMotion) -> str:
     times_s, openings, widths = mouth.sample()
-    phone_labels = mouth.phone_labels
     with open_output(output) as file, open_progress() as progress:
         table = csv.writer(codecs.getwriter("utf-8")(file), lineterminator="\n")
         table.writerow(CSV_COLUMNS)
@@ -303,7 +297,7 @@ def _write_csv(output: Path, mouth: _MouthMotion) -> str:
             for time_s, opening, lines in zip(
                 times_s[block], openings[block], contours, strict=True
             ):
-                time, phone = f"{time_s:.3f}", _label_at(time_s, phone_labels)
+                time, phone = f"{time_s:.3f}", phone_at(mouth.phones, time_s)
                 table.writerows(
                     (time, f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}", phone)
                     for name, line in zip(LINES, lines, strict=True)
