@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 from collections.abc import Sequence
+from itertools import chain
 
 from kouxing.shared.errors import UserError
 
@@ -22,21 +23,15 @@ def transcribe_phrases(phrases: Sequence[Sequence[str]], voice: str) -> list[lis
     Raises ``UserError`` if espeak-ng is missing or fails.
     """
     together = _lines_of([" ".join(phrase) for phrase in phrases], voice)
-    spoken = [line.split() for line in together]
-    single_words = [
-        [line] if len(phrase) == 1 else words if len(words) == len(phrase) else None
-        for line, words, phrase in zip(together, spoken, phrases, strict=True)
+    spoken = [
+        (phrase, [line] if len(phrase) == 1 else line.split())
+        for phrase, line in zip(phrases, together, strict=True)
     ]
-    missing = [
-        word
-        for words, phrase in zip(single_words, phrases, strict=True)
-        if words is None
-        for word in phrase
-    ]
-    rest = iter(_lines_of(missing, voice))
+    joined = [phrase for phrase, words in spoken if len(words) != len(phrase)]
+    alone = iter(_lines_of([*chain(*joined)], voice))
     return [
-        [next(rest) for _ in phrase] if words is None else words
-        for words, phrase in zip(single_words, phrases, strict=True)
+        words if len(words) == len(phrase) else [next(alone) for _ in phrase]
+        for phrase, words in spoken
     ]
 
 
