@@ -50,14 +50,10 @@ def announce_system(control: str) -> Iterator[None]:
 
     If the folder cannot be used or written, nothing is announced.
     """
-    folder = _own_folder()
-    if folder is None:
-        yield
-        return
-    path = folder / str(os.getpid())
     with contextlib.ExitStack() as stack:
-        stack.callback(path.unlink, missing_ok=True)
         with contextlib.suppress(OSError):  # such as a full disk
+            path = _own_folder() / str(os.getpid())
+            stack.callback(path.unlink, missing_ok=True)
             file = stack.enter_context(path.open("wb", buffering=0))
             fcntl.flock(file, fcntl.LOCK_EX)
             file.write(os.fsencode(f"{control}\n{_key_folder()}"))
@@ -71,20 +67,16 @@ def lock_startup(on_wait: Callable[[], None]) -> Iterator[None]:
     ``on_wait`` is called if another system is starting. If the folder cannot be used, nothing
     waits.
     """
-    folder = _own_folder()
-    if folder is None:
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            descriptor = os.open(_own_folder(), os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, descriptor)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                on_wait()
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            on_wait()
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -160,8 +152,9 @@ def other_systems() -> list[RunningSystem]:
 
 def running_systems() -> list[RunningSystem]:
     """Return all running systems of this user, the newest first."""
-    folder = _own_folder()
-    paths = [] if folder is None else folder.iterdir()
+    paths: list[Path] = []
+    with contextlib.suppress(OSError):
+        paths = [*_own_folder().iterdir()]
     systems = []
     for path in paths:
         # another system may end, and remove its file, at any time
@@ -197,14 +190,12 @@ def _key_folder() -> str:
     return ""
 
 
-def _own_folder() -> Path | None:
-    """Return a folder that only this user can write to, or None if there is no such folder."""
+def _own_folder() -> Path:
+    """Return a folder that only this user can write to; raise ``OSError`` if that is impossible."""
     root = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     folder = Path(root) / f"kouxing-{os.getuid()}"
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        about = folder.lstat()
-    except OSError:
-        return None
-    is_own = about.st_uid == os.getuid() and about.st_mode & 0o77 == 0
-    return folder if is_own else None
+    folder.mkdir(mode=0o700, exist_ok=True)
+    about = folder.lstat()
+    if about.st_uid != os.getuid() or about.st_mode & 0o77:
+        raise PermissionError
+    return folder
