@@ -36,7 +36,6 @@ class MicrophoneHandler:
         async with self._web_sockets.open(
             request, self._quota, max_message_bytes=MAX_MESSAGE_BYTES, ping_s=None
         ) as browser:
-            self._session_names[browser] = ""
             try:
                 await self._stream(browser)
                 await browser.close(message=b"all audio was passed on")
@@ -45,8 +44,6 @@ class MicrophoneHandler:
                     await browser.send_str(error_text(error))
                 reason = str(error).encode()
                 await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=reason)
-            finally:
-                del self._session_names[browser]
         return browser
 
     async def close_session(self, session: str) -> None:
@@ -85,7 +82,7 @@ class MicrophoneHandler:
                 async with audio_input.running():
                     await _forward_audio(browser, audio_input)
             finally:
-                self._session_names[browser] = ""
+                del self._session_names[browser]
 
 
 async def _forward_audio(browser: web.WebSocketResponse, audio_input: AudioInput) -> None:
