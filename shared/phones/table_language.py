@@ -32,7 +32,6 @@ from functools import cache, cached_property
 from importlib import resources
 from itertools import chain
 
-from kouxing.shared.errors import UserError
 from kouxing.shared.files.tsv_tables import read_table
 from kouxing.shared.phones.espeak import transcribe_phrases
 from kouxing.shared.phones.mecab import has_mecab, read_numbers, split_words
@@ -76,13 +75,9 @@ class TableLanguage:
 
     def pronounce(self, text: str) -> list[tuple[str, ...]]:
         """Return the phones of each word of a text; raises ``UserError`` if one cannot be read."""
-        transcript = self.transcribe(text)
-        if transcript.dropped:
-            raise UserError(
-                f"cannot read {transcript.dropped[0]!r} as language {self.code}; leave it out, or"
-                " write it as it is spoken"
-            )
-        return transcript.phones
+        return self.transcribe(text).all_phones(
+            f" as language {self.code}; leave it out, or write it as it is spoken"
+        )
 
     def transcribe(self, text: str) -> Transcript:
         """Return the words of a text with their IPA; a number or a sign such as % is a word.

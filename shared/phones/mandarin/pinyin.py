@@ -132,12 +132,7 @@ def pronounce(text: str) -> list[tuple[str, ...]]:
 
     Raises ``UserError`` if a part of the text cannot be read.
     """
-    transcript = transcribe(text)
-    if transcript.dropped:
-        raise UserError(
-            f"cannot read {transcript.dropped[0]!r} as Mandarin; use Chinese characters instead"
-        )
-    return transcript.phones
+    return transcribe(text).all_phones(" as Mandarin; use Chinese characters instead")
 
 
 @lru_cache(maxsize=8192)

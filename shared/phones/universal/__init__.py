@@ -14,19 +14,17 @@ diphthong is two phones. Length, stress and tone are not part of a phone. Second
 is left out, except for ɲ and ʎ. Texts may mix languages (``mixed_text``).
 """
 
-from kouxing.shared.errors import UserError
 from kouxing.shared.phones.transcript import Transcript
 from kouxing.shared.phones.universal.segments import read_ipa, symbol_to_ipa
 
 __all__ = ["pronounce", "read_ipa", "spell", "transcribe", "write"]
 
+write = symbol_to_ipa  # of a phone; a spelling stays as it is
+
 
 def pronounce(text: str) -> list[tuple[str, ...]]:
     """Return the phones of each word or character; raises ``UserError`` if one cannot be read."""
-    transcript = transcribe(text)
-    if transcript.dropped:
-        raise UserError(f"cannot read {transcript.dropped[0]!r}; choose its language")
-    return transcript.phones
+    return transcribe(text).all_phones("; choose its language")
 
 
 def transcribe(text: str) -> Transcript:
@@ -41,8 +39,3 @@ def transcribe(text: str) -> Transcript:
 def spell(phones: tuple[str, ...]) -> str:
     """Return the phones in IPA."""
     return "".join(map(symbol_to_ipa, phones))
-
-
-def write(spelling: str) -> str:
-    """Return the IPA letter of a phone; a spelling stays as it is."""
-    return symbol_to_ipa(spelling)
