@@ -5,7 +5,6 @@ source tree and the container image have the GLB files in the page's folder. Oth
 ``kouxing run`` exports them once, to the user's cache folder.
 """
 
-import os
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
@@ -80,13 +79,10 @@ def export_page_heads(folder: Path) -> None:
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in HEAD_NAMES:
-            file = folder / page_file(name)
-            unfinished = file.with_name(f".{os.getpid()}-{file.name}")  # another may export, too
-            export_glb(load_head(name), unfinished)
-            unfinished.replace(file)
     except OSError as error:
         raise UserError(f"cannot write {folder}: {error.strerror}") from None
+    for name in HEAD_NAMES:
+        export_glb(load_head(name), folder / page_file(name))
 
 
 def ensure_page_heads() -> None:
