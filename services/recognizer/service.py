@@ -351,10 +351,7 @@ class RecognizerService(SessionService):
         """
         now_s = time.monotonic()
         results = session.new_results()
-        acoustic = session.acoustic_message(results)
         published = [*session.published_messages(results)]
-        if acoustic is not None:
-            session.replay.send(acoustic, now_s)
         for message in published:
             session.replay.send(message, now_s)
         for result in results:

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from kouxing_client.messages import Message, Speech
 
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
@@ -19,6 +20,7 @@ from kouxing.services.recognizer.sessions.session import (
     STALLED_AFTER_S,
     RecognizerSession,
 )
+from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import Rejected
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.sockets import Socket
@@ -27,6 +29,7 @@ from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import AudioChunk, ErrorCode
 from kouxing.shared.wire.speech import (
     Acknowledge,
+    Acoustic,
     AcousticModelName,
     AudioState,
     LipPositions,
@@ -146,11 +149,32 @@ def test_reports_the_acoustic_model_in_use() -> None:
         session.audio.append((start, samples[start : start + 1600]), start / 16_000)
         session.accept_waveform(1.0, start / 16_000, hop=1)
         recognizer().decode_streams([session.stream])
-        message = session.acoustic_message(session.new_results())
-        models.append(message.model if message else None)
+        published = session.published_messages(session.new_results())
+        models.append(next((m.model for m in published if isinstance(m, Acoustic)), None))
     reported = [(number, model) for number, model in enumerate(models) if model]
     assert [model for _, model in reported][:2] == ["full", "light"]
     assert reported[1][0] == 8
+
+
+@pytest.mark.parametrize("acoustic", AcousticModelName)
+def test_the_first_message_after_a_lost_recognizer_is_speech(acoustic: AcousticModelName) -> None:
+    start = replace(with_opening(START, sample_rate_hz=16_000), epoch=2, final_until=16_000)
+    session = RecognizerSession(
+        start, recognizer(), load_lip_predictor(), SOCKET, SOCKET, 0.0, math.inf
+    )
+    session.face.change(FaceSettings(acoustic=acoustic), 0.0)
+    published: list[Message] = []
+    for number, samples in enumerate(samples_of_file(VOWELS_FILE)[:35_200].reshape(-1, 1600), 1):
+        message = chunk(number, pcm=as_integers(samples).tobytes(), time_s=(number - 1) / 10)
+        if (audio := session.read_chunk(message, number / 10)) is not None:
+            session.audio.append(audio, number / 10)
+        session.accept_waveform(1.0, number / 10, hop=1)
+        recognizer().decode_streams([session.stream])
+        published += session.published_messages(session.new_results())
+    first, *others = published
+    assert isinstance(first, Speech)
+    assert (first.sequence, first.active, first.media_time) == (1, True, 16_000)
+    assert any(isinstance(message, Acoustic) for message in others)
 
 
 def test_keeps_the_start_of_the_current_speech() -> None:

@@ -2,7 +2,7 @@
 
 import math
 import secrets
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 from kouxing_client.messages import Message, Phone, Speech
@@ -282,22 +282,23 @@ class RecognizerSession:
                 self.speech_time = message.media_time
         return messages
 
-    def published_messages(self, results: Iterable[SpeechMessage | Waveform]) -> Iterator[Message]:
-        """Yield the messages for subscribers."""
+    def published_messages(self, results: Sequence[SpeechMessage | Waveform]) -> Iterator[Message]:
+        """Yield the messages for subscribers; ``speech`` is first if a recognizer was lost."""
         for result in results:
             if isinstance(result, Phone | LipPositions | Speech):
                 yield self._number(result)
             else:
                 yield from map(self._number, self._sound_messages.add(result))
+        if results:
+            yield from self._acoustic_messages(results)
 
-    def acoustic_message(self, results: Sequence[SpeechMessage | Waveform]) -> Acoustic | None:
-        """Return a message about the acoustic model if it has changed or speech starts."""
+    def _acoustic_messages(self, results: Sequence[SpeechMessage | Waveform]) -> Iterator[Acoustic]:
+        """Yield a message about the acoustic model if it has changed or speech starts."""
         model = AcousticModelName.LIGHT if self.stream.uses_light_model else AcousticModelName.FULL
         starts = any(isinstance(result, Speech) and result.active for result in results)
-        if model == self._published_acoustic and not starts:
-            return None
-        self._published_acoustic = model
-        return self._number(Acoustic(model=model, media_time=self.stream.media_time))
+        if model != self._published_acoustic or starts:
+            self._published_acoustic = model
+            yield self._number(Acoustic(model=model, media_time=self.stream.media_time))
 
     def _number(self, message: M) -> M:
         self.output_sequence += 1
