@@ -51,7 +51,7 @@ def stream(
     with connect_client(control) as client:
         for notice in source.notices:
             _warn(notice)
-        drawn_before_s = _drawn_s(client) if record else 0.0
+        drawn_before_s = _drawn_s(client) if record else None
         opened = client.open_session(
             session,
             encoding="f32le",
@@ -63,12 +63,12 @@ def stream(
             language=language,
         )
         try:
-            streamer = _Streamer(client, opened, source, is_recorded=record)
+            streamer = _Streamer(client, opened, source, drawn_before_s)
             streamer.run(paced=paced)
         finally:
             with contextlib.suppress(KouxingError):  # closed already, or control is gone
                 opened.close()
-        return streamer.summarize(drawn_before_s)
+        return streamer.summarize()
 
 
 def missed_warning(count: int, noun: str) -> str:
@@ -80,15 +80,20 @@ def missed_warning(count: int, noun: str) -> str:
 
 
 class _Streamer:
-    """Streams one source into a session."""
+    """Streams one source into a session.
+
+    ``drawn_before_s`` is the duration of the video that the driver had drawn before the session,
+    seconds; None if the session is not recorded.
+    """
 
     def __init__(
-        self, client: Client, session: Session, source: AudioSource, *, is_recorded: bool
+        self, client: Client, session: Session, source: AudioSource, drawn_before_s: float | None
     ) -> None:
         self._client = client
         self._session = session
         self._source = source
-        self._awaits_video = is_recorded
+        self._drawn_before_s = drawn_before_s
+        self._awaits_video = drawn_before_s is not None
         self._video = ""  # path of the written video
         self._duration_s = self._peak = 0.0  # of the sent audio
         self._level = LevelCheck()
@@ -101,15 +106,29 @@ class _Streamer:
 
     def run(self, *, paced: bool) -> None:
         """Stream the source and wait for the last frame."""
-        with self._progress:
-            self._send_all(paced=paced)
-            self._session.finish()
-            self._wait_for_end()
+        try:
+            with self._progress:
+                self._send_all(paced=paced)
+                self._session.finish()
+                self._wait_for_end()
+        except KeyboardInterrupt:
+            if self._drawn_before_s is not None:
+                self._end_video()
+            raise
 
-    def summarize(self, drawn_before_s: float) -> StreamSummary:
+    def _end_video(self) -> None:
+        """Close the session after Ctrl-C, and print the path of its video."""
+        clear_interrupt()
+        print_message("stopping; press Ctrl-C again to end before the video is complete")
+        with contextlib.suppress(KouxingError):  # closed already, or control is gone
+            self._session.close()
+        self._wait_for_video()
+        print_message(f"wrote {self._video}" if self._video else "no video was written")
+
+    def summarize(self) -> StreamSummary:
         """Wait for the video, if any; print warnings, and return the summary."""
         source = self._source
-        self._wait_for_video(drawn_before_s)
+        self._wait_for_video()
         if not self._num_phones:
             reason = "; it is silent" if self._peak < QUIET_PEAK else ""
             _warn(f"{source.name}: no speech was found{reason}")
@@ -183,18 +202,26 @@ class _Streamer:
                 _warn(event.detail)
                 self._awaits_video &= not event.detail.startswith("no-video")
 
-    def _wait_for_video(self, drawn_before_s: float) -> None:
+    def _wait_for_video(self) -> None:
         """Wait for the driver's video, unless it is written or has failed."""
-        with _new_progress() as progress:
-            task = progress.add_task("writing the video", total=self._duration_s)
-            newest_s = drawn_before_s
-            while self._awaits_video:
-                drawn_s = _drawn_s(self._client, DRIVER_TIMEOUT_S)
-                if drawn_s < newest_s:
-                    raise UserError("the driver restarted, so the video is incomplete; try again")
-                newest_s = drawn_s
-                progress.update(task, completed=drawn_s - drawn_before_s)
-                self._read_events(STATUS_S)
+        try:
+            with _new_progress() as progress:
+                task = progress.add_task("writing the video", total=self._duration_s or None)
+                drawn_before_s = newest_s = self._drawn_before_s or 0.0
+                while self._awaits_video:
+                    drawn_s = _drawn_s(self._client, DRIVER_TIMEOUT_S)
+                    if drawn_s < newest_s:
+                        raise UserError(
+                            "the driver restarted, so the video is incomplete; try again"
+                        )
+                    newest_s = drawn_s
+                    progress.update(task, completed=drawn_s - drawn_before_s)
+                    self._read_events(STATUS_S)
+        except KeyboardInterrupt:
+            print_message(
+                f"the driver continues to write the video of session {self._session.name}"
+            )
+            raise
 
 
 def _new_progress() -> Progress:
