@@ -7,6 +7,7 @@ has the name of the protocol. Its value is the ``package:Class`` of a ``TargetCo
 import ipaddress
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pkgutil import resolve_name
 from urllib.parse import SplitResult, parse_qsl, quote, urlsplit, urlunsplit
@@ -89,6 +90,14 @@ def parse_target(url: str) -> Target:
     except UserError as error:
         raise UserError(f"{url}: {error}") from None
     return target
+
+
+def change_delay(target: Target, delay_s: float) -> Target:
+    """Return a target with another delay, also in its address."""
+    options = {**target.options, "delay": f"{1e3 * delay_s:g}"}
+    protocol = protocols()[target.protocol]
+    url = _normalize(urlsplit(target.url), target.host, options, protocol)
+    return replace(target, url=url, options=options, delay_s=delay_s)
 
 
 def _normalize_host(host: str) -> str:

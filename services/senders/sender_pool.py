@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.face_frame import FaceFrame
-from kouxing.services.senders.protocols import make_connection
+from kouxing.services.senders.protocols import change_delay, make_connection
 from kouxing.services.senders.target import Target
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
@@ -46,7 +46,6 @@ class SenderState:
 class _Sender:
     connection: TargetConnection
     task: asyncio.Task[None]
-    delay_s: float
     queue: deque[tuple[float, FaceFrame]] = field(default_factory=deque)  # with earliest times
     timer: asyncio.TimerHandle | None = None
     sent_s: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_COUNTED))
@@ -173,7 +172,7 @@ class SenderPool:
         connection = make_connection(target)
         task = self._loop.create_task(connection.run())
         task.add_done_callback(lambda ended: _show_error(connection, ended))
-        self._senders[target.key] = _Sender(connection, task, target.delay_s)
+        self._senders[target.key] = _Sender(connection, task)
         if self._timer is None:
             self._tick()
 
@@ -186,7 +185,7 @@ class SenderPool:
 
     def _set_delay(self, delay_s: float) -> None:
         for sender in self._senders.values():
-            sender.delay_s = delay_s
+            sender.connection.target = change_delay(sender.connection.target, delay_s)
             if sender.timer is not None:
                 sender.timer.cancel()
             self._send_due(sender)
@@ -200,7 +199,7 @@ class SenderPool:
             states.append(
                 SenderState(
                     target=sender.connection.target.url,
-                    delay_ms=round(1e3 * sender.delay_s, 3),
+                    delay_ms=round(1e3 * sender.connection.target.delay_s, 3),
                     contents=sender.connection.target.contents,
                     rate_hz=len(sender.sent_s) / RATE_WINDOW_S,
                     problem=sender.connection.problem,
@@ -241,7 +240,7 @@ class SenderPool:
         sender.timer = None
         while sender.queue:
             earliest_s, frame = sender.queue[0]
-            due_s = earliest_s + sender.delay_s
+            due_s = earliest_s + sender.connection.target.delay_s
             if due_s > time.monotonic():
                 sender.timer = self._loop.call_at(due_s, self._send_due, sender)
                 return

@@ -194,6 +194,22 @@ def test_a_page_starts_senders_on_this_machine_only(url: str, reason: str) -> No
     assert reason in (answer.text or "")
 
 
+def test_a_new_delay_is_part_of_the_addresses(senders: SenderPool) -> None:
+    url = "osc://127.0.0.1:9?delay=120&only=mouth&prefix=/a"
+
+    def shown() -> tuple[str, float]:
+        (state,) = senders.states()
+        return state.target, state.delay_ms
+
+    senders.start(parse_target(url))
+    senders.set_delay(0.09)
+    assert shown() == (url.replace("120", "90"), 90.0)
+    senders.set_delay(0.0)
+    assert shown() == (url.replace("delay=120&", ""), 0.0)
+    senders.start(parse_target(url))
+    assert shown() == (url, 120.0)
+
+
 def test_media_time_continues_at_rest(senders: SenderPool, receiver: socket.socket) -> None:
     def next_time_s() -> float:
         while (first := next(iter(OscBundle(receiver.recv(2000))))).address != "/kouxing/time":
