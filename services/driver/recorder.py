@@ -107,8 +107,16 @@ class Recorder:
     def _close(self, number: int) -> None:
         video = self._videos[number]
         video.close()
-        del self._videos[number]
+        self._forget(number)
         self._report("written", number, video.path)
+
+    def _forget(self, number: int) -> None:
+        """Drop all data of a video, and of its key if the key has no other video."""
+        self._videos.pop(number, None)
+        self._ended.discard(number)
+        key = self._keys.pop(number)
+        if key not in self._keys.values():
+            self._newest_turn.pop(key, None)
 
     @contextmanager
     def _reports_failure(self, number: int) -> Iterator[None]:
@@ -118,8 +126,9 @@ class Recorder:
         except Exception as error:
             if not isinstance(error, UserError):
                 LOG.exception("recording a video failed")
-            if video := self._videos.pop(number, None):
+            if video := self._videos.get(number):
                 video.discard()
+            self._forget(number)
             self._report("failed", number, str(error))
 
 

@@ -1,5 +1,6 @@
 """The order in which the driver draws its videos, and how they end."""
 
+from collections.abc import Sized
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,17 @@ def test_an_error_ends_one_video_only(harness: RecorderHarness) -> None:
         ("failed", 0, "the encoder failed"),
     ]
     assert harness.recordings[0].is_discarded
+
+
+def test_keeps_nothing_of_finished_videos(harness: RecorderHarness) -> None:
+    for number, path in enumerate(("video", "bad", "unwritable", "video")):
+        harness.begin(number, f"key {number // 2}", 1, path)
+        harness.recorder.end(number)
+    harness.draw()
+    assert len(harness.reports) == 6
+    kept = [value for value in vars(harness.recorder).values() if isinstance(value, Sized)]
+    assert kept
+    assert not any(kept)
 
 
 def test_ends_a_video_early_when_drawing_is_too_far_behind(
