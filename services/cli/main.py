@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -26,6 +27,7 @@ from kouxing.services.cli.system import commands as system
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import USER_ERROR, UserError
+from kouxing.shared.files.output_file import write_error
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
 from kouxing.shared.service.service_kind import ServiceKind
 
@@ -191,9 +193,9 @@ def _run_command() -> None:
         CONSOLE.print("kouxing: aborted; nothing was written")
         sys.exit(1)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
-        text = f"cannot write {error.filename or 'the output'}: {error.strerror}"
+        text = str(write_error(Path(error.filename or "the output"), error))
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes the rest at exit
     else:
         sys.exit(status or 0)

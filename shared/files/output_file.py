@@ -129,5 +129,10 @@ def write_error(path: Path, error: Any) -> UserError:
         return UserError(f"cannot write {path}: the folder does not exist; run: mkdir -p {folder}")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return UserError(f"cannot write {path}: the disk is full; free some space")
+    if error.errno == errno.EFBIG:
+        return UserError(
+            f"cannot write {path}: the file is larger than 'ulimit -f' or the file system allows;"
+            " raise the limit, or choose another disk"
+        )
     remedy = "; choose another folder" if isinstance(error, PermissionError) else ""
     return UserError(f"cannot write {path}: {error.strerror or error}{remedy}")

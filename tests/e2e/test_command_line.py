@@ -289,18 +289,21 @@ def test_an_empty_argument_is_refused() -> None:
     assert (refused.returncode, "an argument is empty" in refused.stderr) == (2, True)
 
 
-def test_a_full_disk_gives_one_line() -> None:
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "kouxing", "--version"],
-            cwd=ROOT,
-            stdout=full,
-            stderr=subprocess.PIPE,
-            check=False,
-            text=True,
-        )
-    text = "kouxing: cannot write the output: No space left on device\n"
-    assert (done.returncode, done.stderr) == (2, text)
+@pytest.mark.parametrize(
+    ("output", "problem"),
+    [("/dev/full", "the disk is full; free some space"), ("out", "'ulimit -f' or the file system")],
+)
+def test_an_output_that_cannot_be_written_gives_one_line(
+    tmp_path: Path, output: str, problem: str
+) -> None:
+    command = f"ulimit -f 0; exec {sys.executable} -m kouxing --version > {tmp_path / output}"
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=ROOT, stderr=subprocess.PIPE, check=False, text=True
+    )
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("kouxing: cannot write the output: ")
+    assert problem in line
+    assert done.returncode == 2
 
 
 def test_a_refused_overwrite_gives_one_line(tmp_path: Path) -> None:
