@@ -168,7 +168,7 @@ def test_a_limit_of_the_file_size_leaves_no_file(tmp_path: Path) -> None:
     images = np.random.default_rng(0).integers(0, 256, (60, 48, 64, 3), np.uint8)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    with pytest.raises(UserError, match="'ulimit -f' .*; raise the limit"):  # noqa: PT012
+    with pytest.raises(UserError, match=r"'ulimit -f' .*; raise the limit"):  # noqa: PT012
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
         try:
             with VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, None) as writer:
