@@ -97,9 +97,9 @@ async def test_the_session_can_end_before_the_connection(
 ) -> None:
     viewers.add_session("s", 1, FaceSettings(), "zh")
     session = cast("Any", FakeSession(Refused("unknown-session", "it has ended")))
-    client = _Client(None, session=session)
+    client = _Client(cast("Any", FakePeer()), None, session)
     with viewers.connect_viewer("s", None) as viewer:
-        await handler._stream(client, cast("Any", FakePeer()), session, contextlib.AsyncExitStack())
+        await handler._stream(client, session, contextlib.AsyncExitStack())
         messages = [str(await viewer.queue.get()) for _ in range(len(viewer.queue))]
     assert json.loads(messages[-1])["text"] == "it has ended"
     assert client.is_ending
@@ -108,16 +108,17 @@ async def test_the_session_can_end_before_the_connection(
 @with_fake_time
 async def test_audio_faster_than_real_time_is_dropped_after_a_burst(handler: WhipHandler) -> None:
     session = cast("Any", FakeSession())
-    peer = cast("Any", FakePeer(1000))
-    await handler._stream(_Client(None), peer, session, contextlib.AsyncExitStack())
+    client = _Client(cast("Any", FakePeer(1000)), None)
+    await handler._stream(client, session, contextlib.AsyncExitStack())
     assert session.num_packets == BURST_S
 
 
 @with_fake_time
 async def test_a_data_channel_rejects_what_it_does_not_execute(handler: WhipHandler) -> None:
     session, channel = FakeSession(), FakeChannel()
-    client = _Client(None, session=cast("Any", session))
-    handler._on_channel(client, cast("Any", channel))
+    client = _Client(UNUSED, None, cast("Any", session))
+    handler._clients["c"] = client
+    handler._on_channel("c", cast("Any", channel))
     channel.on_message('{"skip": 960, "flush": true}')
     channel.on_message('{"last": true}')
     await asyncio.sleep(1.0)

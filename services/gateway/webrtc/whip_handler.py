@@ -49,8 +49,8 @@ NO_WEBRTC_TEXT = (
 
 @dataclass(slots=True, eq=False)
 class _Client:
+    peer: WebRtcPeer
     shape_encoder: ShapeEncoder | None  # encodes frames as blendshapes, in addition to FAPs
-    peer: WebRtcPeer | None = None
     session: AudioSession | None = None
     is_ending: bool = False  # the gateway itself closes the session
     tasks: set[asyncio.Task[None]] = field(default_factory=set)  # tasks of the data channel
@@ -86,14 +86,14 @@ class WhipHandler:
             raise web.HTTPUnsupportedMediaType(text=f"expected an SDP offer ({SDP})\n")
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway is stopping\n")
-        name, client = secrets.token_urlsafe(12), _Client(parse_shape_query(request.query))
+        name, shape_encoder = secrets.token_urlsafe(12), parse_shape_query(request.query)
         async with contextlib.AsyncExitStack() as stack:
             stack.enter_context(self._quota.hold(request))
             offer = (await request.read()).decode(errors="replace")
-            self._clients[name] = client
+            peer = await self._make_peer(name)
+            client = self._clients[name] = _Client(peer, shape_encoder)
             stack.push_async_callback(self._remove, name)
             try:
-                client.peer = peer = await self._make_peer(client)
                 answer = await peer.answer(offer)
                 opening = self._audio_client.open(
                     encoding="s16le", sample_rate_hz=peer.rate_hz, num_channels=peer.num_channels
@@ -105,7 +105,7 @@ class WhipHandler:
                 wait_s = error.retry_after_s if isinstance(error, Refused) else 0.0
                 headers = {"Retry-After": str(math.ceil(wait_s))} if wait_s else {}
                 raise web.HTTPServiceUnavailable(text=f"{error}\n", headers=headers) from None
-            task = asyncio.create_task(self._stream(client, peer, session, stack.pop_all()))
+            task = asyncio.create_task(self._stream(client, session, stack.pop_all()))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
         headers = {"Location": f"{request.path}/{name}"}
@@ -114,7 +114,7 @@ class WhipHandler:
     async def serve_delete(self, request: web.Request) -> web.StreamResponse:
         """End a client's connection."""
         client = self._clients.get(request.match_info["name"])
-        if client is None or client.peer is None:
+        if client is None:
             raise web.HTTPNotFound
         await client.peer.close()
         return web.Response()
@@ -123,40 +123,36 @@ class WhipHandler:
         """End the connection whose session was closed by control."""
         for client in [*self._clients.values()]:
             has_session = client.session is not None and client.session.name == session
-            if has_session and not client.is_ending and client.peer is not None:
+            if has_session and not client.is_ending:
                 await client.peer.close()
 
     async def close_all(self) -> None:
         """End every connection and reject new ones."""
         self._is_closing = True
-        peers = [client.peer for client in self._clients.values() if client.peer is not None]
-        await asyncio.gather(*(peer.close() for peer in peers), return_exceptions=True)
+        closing = [client.peer.close() for client in self._clients.values()]
+        await asyncio.gather(*closing, return_exceptions=True)
 
-    async def _make_peer(self, client: _Client) -> WebRtcPeer:
-        name = "kouxing.services.gateway.webrtc.connection"
+    async def _make_peer(self, name: str) -> WebRtcPeer:
+        module = "kouxing.services.gateway.webrtc.connection"
         try:
-            webrtc = await asyncio.to_thread(importlib.import_module, name)
+            webrtc = await asyncio.to_thread(importlib.import_module, module)
         except ModuleNotFoundError:
             raise web.HTTPNotImplemented(text=NO_WEBRTC_TEXT) from None
         if self._addresses:
             webrtc.use_addresses(self._addresses)
-        peer: WebRtcPeer = webrtc.WebRtcPeer(lambda channel: self._on_channel(client, channel))
+        peer: WebRtcPeer = webrtc.WebRtcPeer(lambda channel: self._on_channel(name, channel))
         return peer
 
     async def _stream(
-        self,
-        client: _Client,
-        peer: WebRtcPeer,
-        session: AudioSession,
-        stack: contextlib.AsyncExitStack,
+        self, client: _Client, session: AudioSession, stack: contextlib.AsyncExitStack
     ) -> None:
         """Stream a client's sound into its session until it disconnects, then close the stack."""
         rate_limit = RealTimeLimit()
         async with stack:
             LOG.info("a WebRTC client is streaming", extra={"session": session.name})
             try:
-                async for num_lost, pcm, num_samples in peer.receive_audio():
-                    if not rate_limit.admit(num_samples / peer.rate_hz):
+                async for num_lost, pcm, num_samples in client.peer.receive_audio():
+                    if not rate_limit.admit(num_samples / client.peer.rate_hz):
                         continue  # a client cannot be slowed down
                     session.skip(num_lost)
                     session.send(pcm, num_samples)
@@ -170,11 +166,11 @@ class WhipHandler:
         client = self._clients.pop(name)
         for task in client.tasks:
             task.cancel()
-        if client.peer is not None:
-            await client.peer.close()
+        await client.peer.close()
 
-    def _on_channel(self, client: _Client, channel: RTCDataChannel) -> None:
-        if client.session is None or client.tasks:
+    def _on_channel(self, name: str, channel: RTCDataChannel) -> None:
+        client = self._clients.get(name)
+        if client is None or client.session is None or client.tasks:
             channel.close()  # a client has at most one
             return
         commands: asyncio.Queue[str | bytes] = asyncio.Queue(MAX_COMMANDS)
