@@ -8,16 +8,16 @@ from pydantic import AfterValidator
 
 from kouxing.services.heads import HeadConfig
 from kouxing.shared.errors import UserError
-from kouxing.shared.settings.config import BoundHost, BoundPort, HostNames, TextList, ValueHint
+from kouxing.shared.settings.config import SPLIT_TEXT, BoundHost, BoundPort, HostNames, ValueHint
 
 ADDRESS_SHARE = 0.75  # maximum fraction of each quota for one address, which may be a proxy
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
 
 
-def _check_origins(values: tuple[str, ...]) -> tuple[str, ...]:
-    if not all(_ORIGIN.fullmatch(origin) for origin in values):
+def _check_origin(origin: str) -> str:
+    if not _ORIGIN.fullmatch(origin):
         raise ValueError
-    return tuple(origin.lower() for origin in values)  # as browsers send them
+    return origin.lower()  # as browsers send it
 
 
 def _check_https(value: str) -> str:
@@ -27,28 +27,25 @@ def _check_https(value: str) -> str:
     return "proxy" if text == "proxy" else value
 
 
-def _check_targets(values: tuple[str, ...]) -> tuple[str, ...]:
-    if not values:
-        return values
+def _check_target(url: str) -> str:
     # every command loads this module, and senders import NumPy
     from kouxing.services.senders.protocols import parse_target  # noqa: PLC0415
 
     try:
-        for url in values:
-            parse_target(url)
+        parse_target(url)
     except UserError as error:
         raise ValueError(str(error)) from None
-    return values
+    return url
 
 
 Origins = Annotated[
-    TextList,
-    AfterValidator(_check_origins),
+    tuple[Annotated[str, AfterValidator(_check_origin)], ...],
+    SPLIT_TEXT,
     ValueHint("a list of origins such as https://example.org"),
 ]
 Targets = Annotated[
-    TextList,
-    AfterValidator(_check_targets),
+    tuple[Annotated[str, AfterValidator(_check_target)], ...],
+    SPLIT_TEXT,
     ValueHint("a list of addresses such as vmc://127.0.0.1:39540"),
 ]
 

@@ -106,10 +106,6 @@ def _check_host(value: str) -> str:
     return value
 
 
-def _check_hosts_of(values: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(map(_check_host, values))
-
-
 def _check_metrics(value: str) -> str:
     if value:
         host, port = split_endpoint(_check_endpoint(f"tcp://{value}"), "metrics")
@@ -123,10 +119,6 @@ def _check_boolean(value: object) -> object:
     if isinstance(value, str) and value.lower() not in {"true", "false", "1", "0"}:
         raise ValueError
     return value
-
-
-def _to_lower(value: object) -> object:
-    return value.lower() if isinstance(value, str) else value
 
 
 def _split_text(value: object) -> object:
@@ -146,10 +138,10 @@ Host = Annotated[
 BoundHost = Annotated[Host, BindAddress.HOST]
 BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
 InstanceName = Annotated[str, Field(max_length=128), ValueHint("up to 128 characters")]
-LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_to_lower)]
-TextList = Annotated[tuple[str, ...], BeforeValidator(_split_text)]
-"""A list in a TOML file; elsewhere a text with spaces between the items."""
-HostNames = Annotated[TextList, AfterValidator(_check_hosts_of), ValueHint("a list of host names")]
+LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(str.lower)]
+SPLIT_TEXT = BeforeValidator(_split_text)
+"""Marks a list: an array in a TOML file; elsewhere a text with spaces between the items."""
+HostNames = Annotated[tuple[Host, ...], SPLIT_TEXT, ValueHint("a list of host names")]
 
 
 class ServiceConfig(BaseModel):

@@ -111,7 +111,7 @@ def _create_control_key(folder: Path, path: Path, roles: Collection[str], contro
             f" machine. Run there: {_add_key_hint(roles)} and try again"
         )
     (folder / _ALLOWED).unlink(missing_ok=True)  # keys of another control
-    _write(folder / "control.key", _new_key())
+    _write(folder / "control.key", format_key(_new_key()))
 
 
 def check_keys(kinds: Mapping[str, Collection[str]]) -> None:
@@ -257,12 +257,12 @@ def may_subscribe(grant: Grant, topic: bytes) -> bool:
     return len(rest) == 2 and f"{_SUBSCRIBER}{rest[0]}" in grant.roles
 
 
-def _new_key(control: str = "") -> str:
+def _new_key(control: str = "") -> Key:
     import zmq  # noqa: PLC0415 (slow to import)
     from kouxing_client.keys import Key  # noqa: PLC0415
 
     public, secret = (part.decode() for part in zmq.curve_keypair())
-    return format_key(Key(public, secret, control or public))
+    return Key(public, secret, control or public)
 
 
 def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> None:
@@ -279,10 +279,10 @@ def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> Non
         raise UserError(
             f"{path}: another key has the name {name!r}; run 'kouxing keys revoke {name}' first"
         )
-    text = _new_key(read_key(folder / "control.key").public)
-    grants[json.loads(text)["public"]] = Grant(name, tuple(roles))
+    key = _new_key(read_key(folder / "control.key").public)
+    grants[key.public] = Grant(name, tuple(roles))
     _check_number(grants)
-    _write(path, text)
+    _write(path, format_key(key))
     _write(folder / _ALLOWED, _format_grants(grants))
 
 
