@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from kouxing.services.cli.options import AudioTrack, Panel
 from kouxing.shared.command.terminal import (
@@ -52,7 +51,7 @@ def adapt(
         (measure, *("-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures))
         for measure, *figures in zip(MEASURES, learned.gain.before, learned.gain.after, strict=True)
     ]
-    print_table(Console(), columns, rows)
+    print_table(columns, rows)
     write_json(json_file, learned.figures())
     print_message(
         f"wrote {output}, learned from {learned.speech_s:.0f} s of speech; the table compares the "

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from kouxing.shared.command.terminal import print_table, write_json
 
 Figures = Mapping[str, Any]  # results as in a JSON file
@@ -23,9 +21,8 @@ class Table:
 
 def show_results(json_file: Path | None, results: object, *tables: Table) -> None:
     """Print the tables of a command, and write its results to a JSON file (None: no file)."""
-    console = Console()
     for table in tables:
-        print_table(console, table.columns, table.rows, title=table.title)
+        print_table(table.columns, table.rows, title=table.title)
     write_json(json_file, results)
 
 

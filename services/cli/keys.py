@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.terminal import Force, check_output, print_message, print_table
@@ -67,7 +66,7 @@ def list_keys() -> None:
     """List the allowed keys with their roles."""
     grants = sorted(read_grants().items(), key=lambda item: item[1].name)
     rows = ((grant.name, ", ".join(grant.roles), public) for public, grant in grants)
-    print_table(Console(), ("name", "roles", "public key"), rows)
+    print_table(("name", "roles", "public key"), rows)
 
 
 @app.command()

@@ -56,10 +56,8 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def print_table(
-    console: Console, columns: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = ""
-) -> None:
-    """Print a table; a row may lack its last cells.
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "") -> None:
+    """Print a table to standard output; a row may lack its last cells.
 
     Cells wrap between words. If the longest words do not fit side by side, each row is printed as
     a list of its cells.
@@ -68,6 +66,7 @@ def print_table(
     from rich.table import Table  # noqa: PLC0415
     from rich.text import Text  # noqa: PLC0415
 
+    console = Console()
     wrap = partial(fill, width=console.width - 2, break_long_words=False, break_on_hyphens=False)
     cells = [[*row, *[""] * (len(columns) - len(row))] for row in rows]
     available = console.width - 2 * (len(columns) - 1)

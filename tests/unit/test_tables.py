@@ -2,10 +2,8 @@
 
 import itertools
 import re
-from io import StringIO
 
 import pytest
-from rich.console import Console
 
 from kouxing.evaluation.tables import figures_table
 from kouxing.shared.command.terminal import print_table
@@ -18,10 +16,12 @@ ROWS = [
 
 
 @pytest.mark.parametrize("width", [120, 80, 40])
-def test_a_table_fits_and_keeps_words_whole(width: int) -> None:
-    text = StringIO()
-    print_table(Console(file=text, width=width), COLUMNS, ROWS, title="mean opinion scores")
-    printed = text.getvalue()
+def test_a_table_fits_and_keeps_words_whole(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    print_table(COLUMNS, ROWS, title="mean opinion scores")
+    printed = capsys.readouterr().out
     words = {word for cell in itertools.chain(COLUMNS, *ROWS) for word in cell.split()}
     assert words <= set(re.split(r"[\s:]+", printed))
     assert max(map(len, printed.splitlines())) <= width

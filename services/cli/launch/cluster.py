@@ -3,7 +3,6 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.service_kinds import KINDS, read_settings
@@ -39,4 +38,4 @@ def cluster(
     if not hosts:
         typer.echo("no workers are running on this cluster")
         return
-    print_table(Console(), ("worker", "host"), hosts.items())
+    print_table(("worker", "host"), hosts.items())

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from kouxing.services.cli.options import (
     SPEECH_FORMATS,
@@ -293,7 +292,6 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
         connect_client(endpoint, timeout_s=3.0) as client,
     ):
         report = client.status()
-    out = Console()
     services = []
     for service in report.services:
         metrics = ", ".join(
@@ -304,9 +302,9 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
             or (name.startswith("dropped_") and not name.endswith("_per_s"))
         )
         services.append((service.instance, service.state, f"{service.age_s:.1f} s ago", metrics))
-    print_table(out, ("service", "state", "last seen", "metrics"), services)
+    print_table(("service", "state", "last seen", "metrics"), services)
     if not report.sessions:
-        out.print("no session is open")
+        typer.echo("no session is open")
     else:
         sessions = [
             (
@@ -321,7 +319,7 @@ def status(control: Control = "", json_file: JsonFile = None, force: Force = Fal
         ]
         lateness = "late: p50, p95, worst"
         columns = ("session", "state", "open for", lateness, "skipped", "workers")
-        print_table(out, columns, sessions)
+        print_table(columns, sessions)
     write_json(json_file, msgspec.to_builtins(report))
 
 
