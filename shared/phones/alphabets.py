@@ -70,13 +70,13 @@ def _in_arpabet(phones: Iterable[Phone]) -> Iterator[Phone]:
     for phone in phones:
         symbol = nearest_phone(phone.symbol, known)
         if before is not None:
-            gap_s = phone.onset_s - before.onset_s - before.duration_s
+            gap_s = phone.onset_s - before.end_s
             pair = (before.symbol, symbol)
             if pair in table and gap_s < _TOUCHING_S:
                 yield replace(
                     before,
                     symbol=table[pair],
-                    duration_s=phone.onset_s + phone.duration_s - before.onset_s,
+                    duration_s=phone.end_s - before.onset_s,
                     confidence=min(before.confidence, phone.confidence),
                 )
                 before = None

@@ -51,6 +51,11 @@ class Phone(Record, frozen=True, kw_only=True):
         )
 
     @property
+    def end_s(self) -> float:
+        """Seconds from the session's first sample."""
+        return self.onset_s + self.duration_s
+
+    @property
     def is_withdrawn(self) -> bool:
         """Whether the phone was emitted by mistake."""
         return self.final and self.duration_s == 0.0

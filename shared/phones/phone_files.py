@@ -81,15 +81,11 @@ _Interval: TypeAlias = tuple[float, float, str]  # start and end in seconds, tex
 def _format_textgrid(
     phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]
 ) -> str:
-    tiers = {"phones": [(p.onset_s, p.onset_s + p.duration_s, p.symbol) for p in phones]}
+    tiers = {"phones": [(p.onset_s, p.end_s, p.symbol) for p in phones]}
     if syllables:
-        ends_s = [syllable.onset_s + syllable.duration_s for syllable in syllables]
         tiers = {
-            name: [
-                (syllable.onset_s, end_s, getattr(syllable, of))
-                for syllable, end_s in zip(syllables, ends_s, strict=True)
-            ]
-            for name, of in (("characters", "text"), ("syllables", "spelling"))
+            "characters": [(s.onset_s, s.end_s, s.text) for s in syllables],
+            "syllables": [(s.onset_s, s.end_s, s.spelling) for s in syllables],
         } | tiers
     lines = [
         'File type = "ooTextFile"',

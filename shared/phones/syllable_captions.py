@@ -157,7 +157,7 @@ class SyllableCaptions:
             index=first.index,
             text=spelling if place is None else self._characters[place][0],
             onset_s=first.onset_s,
-            duration_s=max(0.0, last.onset_s + last.duration_s - first.onset_s),
+            duration_s=max(0.0, last.end_s - first.onset_s),
             final=is_complete and all(phone.final for phone in phones),
         )
 

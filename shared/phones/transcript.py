@@ -41,3 +41,8 @@ class TimedSyllable(Record, frozen=True):
     spelling: str
     onset_s: float
     duration_s: float
+
+    @property
+    def end_s(self) -> float:
+        """Seconds from the start of the recording."""
+        return self.onset_s + self.duration_s

@@ -61,8 +61,8 @@ def _write(syllable: SpokenSyllable | TimedSyllable, inventory: PhoneInventory) 
 
 def _join_phones(group: Sequence[Phone], inventory: PhoneInventory) -> TimedSyllable:
     spelling = inventory.spell(tuple(phone.symbol for phone in group))
-    onset_s, end_s = group[0].onset_s, group[-1].onset_s + group[-1].duration_s
-    return TimedSyllable(spelling, spelling, onset_s, end_s - onset_s)
+    onset_s = group[0].onset_s
+    return TimedSyllable(spelling, spelling, onset_s, group[-1].end_s - onset_s)
 
 
 def make_captions(
@@ -77,12 +77,8 @@ def make_captions(
     else:
         is_text = kind is CaptionKind.CHARACTERS
         captions = [
-            Caption(
-                syllable.onset_s,
-                syllable.onset_s + syllable.duration_s,
-                syllable.text if is_text else syllable.spelling,
-            )
-            for syllable in motion.syllables
+            Caption(item.onset_s, item.end_s, item.text if is_text else item.spelling)
+            for item in motion.syllables
         ]
     return CaptionDrawer(captions, size_px)
 
@@ -96,7 +92,7 @@ def _phone_captions(phones: Sequence[Phone], inventory: PhoneInventory) -> list[
     return [
         Caption(
             phone.onset_s,
-            phone.onset_s + phone.duration_s,
+            phone.end_s,
             inventory.write(phone.symbol),
             is_joined=phone.index in joined,
         )

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +31,12 @@ from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.files.output_file import open_output, write_error
 from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.transcript import TimedSyllable
 
 if TYPE_CHECKING:
     from kouxing.services.cli.recordings.animation import FaceMotion
 
+T = TypeVar("T", Phone, TimedSyllable)
 Values = NDArray[np.float32]
 FrameRow = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
 _SHAPE_FORMATS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
@@ -205,11 +207,15 @@ def json_line(
 
 
 def phone_at(phones: Sequence[Phone], time_s: float) -> str:
-    """Return the symbol of the phone at a time, or "" outside all phones, ordered by onset."""
-    index = bisect_right(phones, time_s, key=lambda phone: phone.onset_s) - 1
-    if index < 0 or time_s >= phones[index].onset_s + phones[index].duration_s:
-        return ""
-    return phones[index].symbol
+    """Return the symbol of the phone at a time, or "" outside all phones."""
+    phone = item_at(phones, time_s)
+    return phone.symbol if phone else ""
+
+
+def item_at(items: Sequence[T], time_s: float) -> T | None:
+    """Return the phone or syllable at a time, or None. They are in order and may have gaps."""
+    index = bisect_right(items, time_s, key=lambda item: item.onset_s) - 1
+    return items[index] if index >= 0 and time_s < items[index].end_s else None
 
 
 def _cells(row: FrameRow, curve_format: CurveFormat, phones: Sequence[Phone] | None) -> list[str]:

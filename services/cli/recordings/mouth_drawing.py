@@ -7,7 +7,6 @@ lip model gives the width, so that the mouth is round for u, ü and o.
 
 import codecs
 import csv
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.cli.recordings.captions import spell_syllables
-from kouxing.services.cli.recordings.curve_exporters import phone_at
+from kouxing.services.cli.recordings.curve_exporters import item_at, phone_at
 from kouxing.services.cli.texts.spoken_text import print_mismatch, read_transcript, report_mismatch
 from kouxing.services.driver.video.video_writer import VideoWriter, write_picture
 from kouxing.services.mono_audio import read_mono_16k
@@ -60,7 +59,6 @@ from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, lo
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 
 Array = NDArray[np.float64]
-LabelSpan = tuple[float, float, str]  # start and end in seconds, and the label
 
 NUM_POINTS = 21  # on each line of the contour, in a table
 FRAME_RATE_HZ = 25.0
@@ -94,6 +92,12 @@ class _MouthMotion:
         times_s = np.arange(num_frames) / FRAME_RATE_HZ
         openings = self.key_frames.openings_at(times_s)
         return times_s, openings, self.widths_at(times_s)
+
+    def label(self, syllable: TimedSyllable) -> str:
+        """Return the spelling of a syllable, after its characters if they can be drawn."""
+        if self.shows_text and syllable.text != syllable.spelling:
+            return f"{syllable.text} {syllable.spelling}"
+        return syllable.spelling
 
 
 def draw_mouth(
@@ -201,25 +205,9 @@ def _find_widths(
     return np.array([time_s for time_s, _ in frames]), 1.0 + np.array(stretch)
 
 
-def _syllable_labels(mouth: _MouthMotion) -> list[LabelSpan]:
-    """Return the label of each syllable: its characters, if they can be drawn, and its spelling."""
-    return [
-        (
-            item.onset_s,
-            item.onset_s + item.duration_s,
-            f"{item.text} {item.spelling}"
-            if mouth.shows_text and item.text != item.spelling
-            else item.spelling,
-        )
-        for item in mouth.syllables
-    ]
-
-
-def _key_frame_mouths(
-    mouth: _MouthMotion, labels: Sequence[LabelSpan]
-) -> list[drawing.LabeledMouth]:
+def _key_frame_mouths(mouth: _MouthMotion) -> list[drawing.LabeledMouth]:
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
-    syllables = {onset_s: label for onset_s, _, label in labels}
+    syllables = {syllable.onset_s: mouth.label(syllable) for syllable in mouth.syllables}
     anchors = build_anchors(mouth.phones) or [(0.0, mouth.inventory.silence)]
     write = mouth.inventory.write
     middles_s = {phone.onset_s: phone.onset_s + phone.duration_s / 2 for phone in mouth.phones}
@@ -241,7 +229,7 @@ def _key_frame_mouths(
 
 def _write_picture(output: Path, mouth: _MouthMotion) -> str:
     is_svg = output.suffix.lower() == ".svg"
-    mouths = _key_frame_mouths(mouth, _syllable_labels(mouth))
+    mouths = _key_frame_mouths(mouth)
     if len(mouths) > _MAX_MOUTHS:
         raise UserError(
             f"{output}: a picture can show {_MAX_MOUTHS} mouths, but this recording has"
@@ -256,12 +244,6 @@ def _write_picture(output: Path, mouth: _MouthMotion) -> str:
 
 
 def _write_video(output: Path, mouth: _MouthMotion) -> str:
-    labels = _syllable_labels(mouth)
-    write = mouth.inventory.write
-    phone_labels = [
-        (phone.onset_s, phone.onset_s + phone.duration_s, write(phone.symbol))
-        for phone in mouth.phones
-    ]
     frames = list(zip(*(values.tolist() for values in mouth.sample()), strict=True))
     with (
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,
@@ -272,17 +254,16 @@ def _write_video(output: Path, mouth: _MouthMotion) -> str:
             end = round((time_s + 1.0 / FRAME_RATE_HZ) * MEDIA_RATE_HZ)
             writer.write_audio(mouth.samples[num_sent:end])
             num_sent = end
+            phone, syllable = item_at(mouth.phones, time_s), item_at(mouth.syllables, time_s)
             moment = drawing.LabeledMouth(
-                time_s, opening, _label_at(time_s, phone_labels), _label_at(time_s, labels), width
+                time_s,
+                opening,
+                mouth.inventory.write(phone.symbol) if phone else "",
+                mouth.label(syllable) if syllable else "",
+                width,
             )
             writer.write_image(drawing.rasterize(drawing.draw_image(moment, *_VIDEO_SIZE_PX)))
     return f"{plural(len(frames), 'image')}, {plural(len(mouth.phones), 'phone')}"
-
-
-def _label_at(time_s: float, spans: Sequence[LabelSpan]) -> str:
-    """Return the label at a time; the spans are in order."""
-    index = bisect_right(spans, time_s, key=lambda span: span[0]) - 1
-    return spans[index][2] if index >= 0 and time_s < spans[index][1] else ""
 
 
 def _write_csv(output: Path, mouth: _MouthMotion) -> str:
