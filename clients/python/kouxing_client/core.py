@@ -70,7 +70,6 @@ class ClientCore:
         self._refused_s = math.inf  # when control started to reject this key
         self._is_diagnosing = False  # searching for the reason why control does not answer
         self._inboxes: dict[SessionCore, list[Inbox]] = {}
-        self._located_s: dict[str, float] = {}  # when a silent session was last located
         self._events: Connection | None = None
         self._closed: KouxingError | None = None  # reason why this client is closed
         self._commands = self._connect()
@@ -239,7 +238,6 @@ class ClientCore:
 
     def _remove(self, session: SessionCore) -> None:
         self.sessions.remove(session)
-        self._located_s.pop(session.name, None)
         self._watch(session.name, on=False)
 
     def _watch(self, session: str, *, on: bool) -> None:
@@ -250,9 +248,9 @@ class ClientCore:
     def _locate(self, session: SessionCore) -> None:
         """Ask control where a silent session is: its ``session-moved`` may be lost."""
         now_s = self._sockets.now_s
-        if now_s < self._located_s.get(session.name, 0.0) + SILENT_S:
+        if now_s < session.located_s + SILENT_S:
             return
-        self._located_s[session.name] = now_s
+        session.located_s = now_s
 
         def on_status(answer: Future[Status]) -> None:
             try:
