@@ -7,6 +7,8 @@ Chinese characters are Japanese.
 
 import re
 import unicodedata
+from itertools import groupby
+from operator import itemgetter
 
 from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
@@ -45,19 +47,13 @@ def read_mixed_text(text: str) -> Transcript:
 
 def _split_languages(text: str) -> list[tuple[str, str]]:
     """Split a text where its language changes. Returns the language and the text of each part."""
-    parts: list[tuple[str, str]] = []
     scripts = [unicodedata.name(c, "").split(" ")[0] if c.isalpha() else "" for c in text]
     for unit in _UNIT.finditer(text):
         scripts[unit.start() : unit.end()] = [""] * len(unit[0])
     character_language = "japanese" if {"HIRAGANA", "KATAKANA"} & {*scripts} else "mandarin"
     languages = _LANGUAGES | dict.fromkeys(("CJK", "IDEOGRAPHIC"), character_language)
-    for letter, script in zip(text, scripts, strict=True):
-        language = languages.get(script)
-        if not parts or language not in (None, parts[-1][0]):
-            before = ""
-            if len(parts) == 1 and not parts[0][0]:
-                before = parts.pop()[1]  # numbers before the first word
-            parts.append((language or "", before + letter))
-        else:
-            parts[-1] = parts[-1][0], parts[-1][1] + letter
-    return [(language or "english", part) for language, part in parts]
+    known = [languages.get(script) for script in scripts]
+    current = next(filter(None, known), "english")  # also of numbers before the first word
+    spoken = [(current := language or current) for language in known]
+    parts = groupby(zip(spoken, text, strict=True), key=itemgetter(0))
+    return [(language, "".join(letter for _, letter in part)) for language, part in parts]
