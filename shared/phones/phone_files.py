@@ -9,6 +9,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import TypeAlias
 
 from kouxing.shared.fast_record import replace
@@ -126,8 +127,7 @@ def _fill_gaps(unfilled: Sequence[_Interval], total_s: float) -> list[_Interval]
     """Fill gaps with empty intervals and cut overlaps, so that intervals cover the whole time."""
     intervals: list[_Interval] = []
     now_s = 0.0
-    for number, (onset_s, offset_s, text) in enumerate(unfilled):
-        next_s = unfilled[number + 1][0] if number + 1 < len(unfilled) else total_s
+    for (onset_s, offset_s, text), (next_s, *_) in pairwise([*unfilled, (total_s, total_s, "")]):
         start_s = max(now_s, onset_s)
         end_s = min(offset_s, next_s, total_s)
         if round(end_s, 4) <= round(start_s, 4):

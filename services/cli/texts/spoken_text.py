@@ -88,7 +88,7 @@ def read_spoken_text(text: str, language: str = DEFAULT_LANGUAGE) -> str:
     """
     path = _find_file(text)
     if path is None:
-        is_unicode = _is_unicode(text)
+        is_unicode = not re.search("[\ud800-\udfff]", text)  # it has the terminal's encoding
         decoded = DecodedText(text) if is_unicode else decode_text(os.fsencode(text), language)
         spoken = extract_text(decoded.text)
     else:
@@ -109,11 +109,6 @@ def read_spoken_text(text: str, language: str = DEFAULT_LANGUAGE) -> str:
             f"{labels[0]!r} is read as spoken text; delete such labels if they are not spoken"
         )
     return spoken.text
-
-
-def _is_unicode(text: str) -> bool:
-    """Return whether an argument has the encoding of the terminal."""
-    return not re.search("[\ud800-\udfff]", text)
 
 
 def _find_file(text: str) -> Path | None:
