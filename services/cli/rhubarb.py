@@ -94,12 +94,9 @@ def _animate(options: argparse.Namespace) -> FaceMotion:
             Path(options.input),
             [DEFAULT_LIP_MODEL],
             progress,
-            live=False,
+            language=language,
             text=text.strip() or None,
             text_may_differ=True,
-            mouth=None,
-            expressiveness=None,
-            language=language,
         )
     for message in messages.getvalue().splitlines():
         _report(options, "log", message)

@@ -97,14 +97,14 @@ def animate(
     lip_models: Sequence[str],
     progress: Progress,
     *,
-    live: bool,
-    text: str | None,
+    language: str,
+    live: bool = False,
+    text: str | None = None,
     text_may_differ: bool = False,
-    mouth: Path | None,
-    expressiveness: float | None,
+    mouth: Path | None = None,
+    expressiveness: float | None = None,
     track: int | None = None,
     captions: CaptionKind | None = None,
-    language: str,
 ) -> FaceMotion:
     """Animate a face from an audio file.
 
