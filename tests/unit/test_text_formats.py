@@ -421,3 +421,10 @@ def test_reads_pinyin_with_any_punctuation(text: str) -> None:
 def test_reads_damaged_text_in_linear_time(text: str, spoken: str) -> None:
     """The test would need hours otherwise."""
     assert extract_text(text).text.strip() == spoken.strip()
+
+
+def test_rejects_a_short_text_that_repeats_a_long_line() -> None:
+    refrain = "[00:01.00]" * 5000
+    with pytest.raises(UserError, match="the repeated lines have more than 8388608 characters"):
+        extract_text(refrain + "a" * 5000)
+    assert extract_text(refrain + "a").text.count("a") == 5000

@@ -10,6 +10,7 @@ import re
 from itertools import groupby, pairwise
 
 from kouxing.services.cli.texts.markup import TIME_TAG, read_markup
+from kouxing.shared.errors import UserError
 
 CLOCK = r"(?:\d{1,3}[:：])?\d{1,2}[:：]\d{2}(?:[.,:]\d{1,3})?"  # 0:05, 00:00:05.200
 _CUE = rf"[ \t]*{CLOCK}[ \t]*-->[ \t]*{CLOCK}"
@@ -20,6 +21,7 @@ _SOUND_NAME = re.compile(r"\[[^][\n]*\]|【[^【】\n]*】|[♪♫]")
 _BRACES = re.compile(r"\{[^{}]*\}")
 SBV_TIMES = re.compile(r"^\d+:\d{2}:\d{2}\.\d{3},\d+:\d{2}:\d{2}\.\d{3}[ \t]*$", re.MULTILINE)
 LRC_TIME = r"\[(\d{1,3}):(\d{1,2}(?:[.:]\d{1,3})?)\]"
+_MAX_LRC_CHARACTERS = 8 << 20  # a short text may repeat a long line thousands of times
 _LRC_FIELD = re.compile(r"\[[A-Za-z#]+:[^\]]*\]")
 LYRICS_TIME = r"\[\d+,\d+\]"
 FRAME_NUMBERS = r"(?:\{\d+\}\{\d*\}|\[\d+\]\[\d*\])"
@@ -61,8 +63,12 @@ def read_sbv(text: str) -> str:
 
 
 def read_lrc(text: str) -> str:
-    """Extract the lines in the order of their times. A line with several times is repeated."""
+    """Extract the lines in the order of their times. A line with several times is repeated.
+
+    Raises ``UserError`` if the repeated lines are too long.
+    """
     timed: list[tuple[float, str]] = []
+    num_characters = 0
     for line in text.split("\n"):
         if _LRC_FIELD.fullmatch(line.strip()):
             continue
@@ -72,6 +78,12 @@ def read_lrc(text: str) -> str:
             for minutes, seconds in re.findall(LRC_TIME, first[0] if first else "")
         ]
         words = TIME_TAG.sub("", re.sub(LRC_TIME, "", line))
+        num_characters += len(words) * len(times_s)
+        if num_characters > _MAX_LRC_CHARACTERS:
+            raise UserError(
+                f"the repeated lines have more than {_MAX_LRC_CHARACTERS} characters; keep only the"
+                " spoken text"
+            )
         timed += [(time_s, words) for time_s in times_s or [timed[-1][0] if timed else 0.0]]
     return "\n".join(words for _, words in sorted(timed, key=lambda item: item[0]))
 
