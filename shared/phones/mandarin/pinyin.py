@@ -31,18 +31,25 @@ from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 # Longest first, so that zh is not read as z + h.
 _INITIALS_BY_LENGTH = tuple("zh ch sh b p m f d t n l g k h j q x r z c s".split())
 
-# Rows of finals: spelling after an initial -> phone, and the initials that the row follows.
-_OPEN_ROW = {phone: phone for phone in "a e ai ei ao ou an en ang eng ong".split()}
-_OPEN_INITIALS = set("b p m f d t n l g k h zh ch sh r z c s".split())
-_O_INITIALS = set("b p m f l".split())
-_I_ROW = {phone: phone for phone in "i ia ie iao ian in iang ing iong".split()} | {"iu": "iou"}
-_I_INITIALS = set("b p m f d t n l j q x".split())
-_U_ROW = {phone: phone for phone in "ua uo uai uan uang".split()} | {"ui": "uei", "un": "uen"}
-_U_INITIALS = _OPEN_INITIALS - set("b p m f".split())
-_V_ROW = {"v": "v", "ve": "ve", "van": "van", "vn": "vn", "ue": "ve"}
-_V_INITIALS = set("n l j q x".split())
-_J_ROW = {"u": "v", "uan": "van", "un": "vn"}  # after j q x a written u is ü
-_J_INITIALS = set("j q x".split())
+# Rows of finals: the initials before them, and their spellings. A spelling is also the phone,
+# except in SPELLING=PHONE. After j q x, a written u is ü.
+_ROWS = (
+    ("b p m f d t n l g k h zh ch sh r z c s", "u a e ai ei ao ou an en ang eng ong"),
+    ("b p m f l", "o"),
+    ("b p m f d t n l j q x", "i ia ie iao ian in iang ing iong iu=iou"),
+    ("d t n l g k h zh ch sh r z c s", "ua uo uai uan uang ui=uei un=uen"),
+    ("n l j q x", "v ve van vn ue=ve"),
+    ("j q x", "u=v uan=van un=vn"),
+    ("zh ch sh r", "i=iii"),
+    ("z c s", "i=ii"),
+)
+_FINALS = {
+    (initial, spelling): phone or spelling
+    for initials, finals in _ROWS
+    for initial in initials.split()
+    for spelling, _, phone in (final.partition("=") for final in finals.split())
+}
+_V_PHONES = ("v", "ve", "van", "vn")
 
 _WITHOUT_INITIAL = {
     **{phone: (phone,) for phone in "a o e er ai ei ao ou an en ang eng".split()},
@@ -63,8 +70,8 @@ _SPELLED_ALONE = {
     if len(phones) == 1 and phones[0] not in _INITIALS_BY_LENGTH
 }
 _SPELLED_AFTER = {"ii": "i", "iii": "i", "iou": "iu", "uei": "ui", "uen": "un"}
-_SPELLED_AFTER |= {phone: "ü" + phone[1:] for phone in _V_ROW.values()}
-_SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
+_SPELLED_AFTER |= {phone: "ü" + phone[1:] for phone in _V_PHONES}
+_SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_PHONES}
 
 _CHINESE = re.compile("[〇\u3400-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]")
 _PINYIN_WORD = re.compile(r"(?:[^\W_]|[\u0300-\u036f]|(?<=[uU]):)+")
@@ -149,7 +156,7 @@ def spell(phones: tuple[str, ...]) -> str:
     *initial, final = phones
     if not initial:
         return _SPELLED_ALONE.get(final) or _SPELLED_AFTER.get(final, final)
-    if initial[0] in _J_INITIALS:
+    if initial[0] in "jqx":
         final = _SPELLED_AFTER_J.get(final, final)
     return initial[0] + _SPELLED_AFTER.get(final, final)
 
@@ -432,25 +439,5 @@ def _syllable_phones(plain: str) -> tuple[str, ...] | None:
     initial = next((phone for phone in _INITIALS_BY_LENGTH if plain.startswith(phone)), None)
     if initial is None:
         return None
-    final = _parse_final(initial, plain.removeprefix(initial))
+    final = _FINALS.get((initial, plain.removeprefix(initial)))
     return (initial, final) if final else None
-
-
-def _parse_final(initial: str, spelling: str) -> str | None:
-    if spelling == "i" and initial in ("z", "c", "s"):
-        return "ii"
-    if spelling == "i" and initial in ("zh", "ch", "sh", "r"):
-        return "iii"
-    if spelling == "u" and initial in _OPEN_INITIALS:
-        return "u"
-    rows = (
-        (_J_INITIALS, _J_ROW),  # before the u row, which j q x do not take
-        (_V_INITIALS, _V_ROW),
-        (_OPEN_INITIALS, _OPEN_ROW),
-        (_O_INITIALS, {"o": "o"}),
-        (_I_INITIALS, _I_ROW),
-        (_U_INITIALS, _U_ROW),
-    )
-    return next(
-        (row[spelling] for takers, row in rows if initial in takers and spelling in row), None
-    )
