@@ -1,5 +1,6 @@
 """Reads the audio of files and pipes as blocks of samples."""
 
+import contextlib
 import io
 import sys
 import tempfile
@@ -77,30 +78,21 @@ def open_audio(
     file = sys.stdin.buffer if path == _PIPE else open_file(path, MAX_FILE_BYTES, pipe=True)
     is_pipe = path == _PIPE or path.is_fifo()
     name = "standard input" if path == _PIPE else path.name
-
-    def open_source() -> AudioSource:
+    with check_content(path, "audio"), contextlib.ExitStack() as files:
+        files.enter_context(file)
         if raw is not None:
-            return _open_raw(file, raw, name)
-        if is_pipe:
-            return _open_pipe(file, name, block_s, track)
-        return _open_file(file, str(path), name, block_s, track)
-
-    with check_content(path, "audio"):
-        return _with_file(file, open_source)
-
-
-def _with_file(file: BinaryIO, open_source: Callable[[], AudioSource]) -> AudioSource:
-    """Open the source of a file. The file is closed after the last block, or on an error."""
-    try:
-        source = open_source()
-    except BaseException:
-        file.close()
-        raise
-    return replace(source, blocks=_close_after(source.blocks, file))
+            source = _open_raw(file, raw, name)
+        elif is_pipe:
+            source = _open_pipe(file, name, block_s, track, files)
+        else:
+            source = _open_file(file, str(path), name, block_s, track)
+        return replace(source, blocks=_close_after(source.blocks, files.pop_all()))
 
 
-def _close_after(blocks: Iterator[Samples], file: BinaryIO) -> Iterator[Samples]:
-    with file:
+def _close_after(
+    blocks: Iterator[Samples], files: contextlib.AbstractContextManager[object]
+) -> Iterator[Samples]:
+    with files:
         yield from blocks
 
 
@@ -120,7 +112,10 @@ def _open_file(
     return _make_source(media, path, name, block_s, begin, lambda: num_bytes)
 
 
-def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -> AudioSource:
+def _open_pipe(
+    stream: BinaryIO, name: str, block_s: float, track: int | None, files: contextlib.ExitStack
+) -> AudioSource:
+    """Open a pipe. A temporary file with its content is added to ``files``."""
     if stream.isatty():
         raise UserError(f"{name}: this is a terminal; pipe audio into the command")
     pipe = _PeekablePipe(stream)
@@ -140,9 +135,9 @@ def _open_pipe(stream: BinaryIO, name: str, block_s: float, track: int | None) -
         return source
     begin = pipe.skip(start)
     if stream.seekable() or needs_whole_file(begin):
-        file = stream if stream.seekable() else pipe.read_all()
+        file = stream if stream.seekable() else files.enter_context(pipe.read_all())
         file.seek(0)
-        return _with_file(file, lambda: _open_file(file, name, name, block_s, track))
+        return _open_file(file, name, name, block_s, track)
     if wav := pcm_of_wav(begin):  # without FFmpeg's delay of 64 KiB
         return _wav_audio(pipe, begin, wav, name)
     media = MediaAudio(pipe, name, begin, track, is_pipe=True)  # type: ignore[arg-type]
