@@ -140,7 +140,7 @@ def class_precision(clips: ScoredClips, name: str) -> float | None:
 def closure_class(reference: Reference, time_s: float) -> str:
     """Return the class of the phones at a closure. A b, p or m within 40 ms takes precedence."""
     for phone in reference.labials():
-        if phone.onset_s - WINDOW_S <= time_s <= phone.onset_s + phone.duration_s + WINDOW_S:
+        if phone.onset_s - WINDOW_S <= time_s <= phone.end_s + WINDOW_S:
             return "bpm"
     viseme = reference.viseme_at(time_s)
     return next((name for name, members in CLOSURE_CLASSES.items() if viseme in members), "other")

@@ -99,7 +99,7 @@ class Reference:
         moments = []
         for phone in phones:
             first = round(phone.onset_s / _POWER_STEP_S)
-            last = max(round((phone.onset_s + phone.duration_s) / _POWER_STEP_S), first + 1)
+            last = max(round(phone.end_s / _POWER_STEP_S), first + 1)
             if first < len(level):
                 moments.append((first + int(np.argmin(level[first:last])) + 0.5) * _POWER_STEP_S)
         return np.array(moments)

@@ -84,7 +84,7 @@ def _voiced_slices(phones: Sequence[Phone], num_samples: int) -> Mask:
     ) / SAMPLE_RATE_HZ
     mask = np.zeros(len(middle_s), np.bool_)
     for phone in phones:
-        mask |= (phone.onset_s <= middle_s) & (middle_s < phone.onset_s + phone.duration_s)
+        mask |= (phone.onset_s <= middle_s) & (middle_s < phone.end_s)
     return mask
 
 

@@ -98,7 +98,7 @@ def final_until(event: SoundEvent) -> float:
     """Return the media time before which nothing is repeated after an event."""
     match event:
         case Phone(final=True):
-            return event.onset_s + event.duration_s
+            return event.end_s
         case SpeechChange():
             return event.time_s
     return 0.0

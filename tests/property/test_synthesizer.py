@@ -121,7 +121,7 @@ def revised_utterances(draw: st.DrawFn) -> list[tuple[float, Phone | SpeechChang
                 final=False,
             )
             emitted.append((phone.onset_s + delay_s + draw(st.floats(0.0, 0.1)), guess))
-        emitted.append((phone.onset_s + phone.duration_s + delay_s, phone))
+        emitted.append((phone.end_s + delay_s, phone))
     if draw(st.booleans()):
         end_s = draw(st.floats(0.3, phones[-1].onset_s + 0.5))
         emitted.append((end_s + 0.2, SpeechChange(active=False, time_s=end_s)))

@@ -46,7 +46,7 @@ def test_lips_close_and_open_for_the_phones_of_a_known_text() -> None:
         assert opening[np.abs(times_s - phone.onset_s - 0.04) < 0.021].min() < 10, phone
     for phone in analyzed.phones:
         if phone.symbol in ("a", "ai", "ao", "an", "ing"):
-            during = (times_s >= phone.onset_s) & (times_s < phone.onset_s + phone.duration_s)
+            during = (times_s >= phone.onset_s) & (times_s < phone.end_s)
             assert opening[during].max() > 100, phone
 
 

@@ -126,7 +126,7 @@ def test_the_light_model_does_not_change_the_lips(cuts: list[int]) -> None:
     for phone in phones:
         if not phone.is_withdrawn:
             assert end_s == 0.0 or phone.onset_s == pytest.approx(end_s, abs=1e-4)
-            end_s = phone.onset_s + phone.duration_s
+            end_s = phone.end_s
 
 
 def test_jitter_is_not_a_gap() -> None:

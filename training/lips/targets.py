@@ -63,6 +63,6 @@ def targets_at(
     lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)
     for phone in phones or ():
         if phone.symbol == _LIP_TO_TEETH:
-            end_s = phone.onset_s + phone.duration_s
+            end_s = phone.end_s
             lip_to_teeth[(time_s >= phone.onset_s) & (time_s < end_s)] = 1.0
     return np.stack([*faps, closure, lip_to_teeth], axis=-1).astype(np.float32)

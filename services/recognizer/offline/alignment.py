@@ -180,6 +180,6 @@ def find_syllable_times(
     timed = []
     for syllable in transcript.syllables:
         aligned = list(islice(rest, len(syllable.phones)))
-        onset_s, end_s = aligned[0].onset_s, aligned[-1].onset_s + aligned[-1].duration_s
+        onset_s, end_s = aligned[0].onset_s, aligned[-1].end_s
         timed.append(TimedSyllable(syllable.text, syllable.spelling, onset_s, end_s - onset_s))
     return timed

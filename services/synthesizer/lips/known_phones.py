@@ -64,7 +64,7 @@ class KnownPhones:
         """Drop phones that ended before a time, except the last two; return their indices."""
         forgotten = []
         for index, phone in list(self._phones.items()):
-            if phone.onset_s + phone.duration_s < time_s and len(self._phones) > 2:
+            if phone.end_s < time_s and len(self._phones) > 2:
                 del self._phones[index]
                 forgotten.append(index)
         self.speech_ends_s = [end_s for end_s in self.speech_ends_s if end_s >= time_s]

@@ -50,7 +50,7 @@ def build_anchors(phones: Sequence[Phone]) -> list[tuple[float, str]]:
                 anchors.append((end_s, SILENCE))
             anchors.append((phone.onset_s - OPENING_TIME_S, SILENCE))
         anchors.append((phone.onset_s, phone.symbol))
-        end_s = phone.onset_s + phone.duration_s
+        end_s = phone.end_s
     if spoken:
         anchors.append((end_s, SILENCE))
     rising: list[tuple[float, str]] = []

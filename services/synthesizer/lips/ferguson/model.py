@@ -197,7 +197,7 @@ class FergusonStream:
                     onset_s = nearest_s
             if snapped:
                 onset_s = max(onset_s, snapped[-1].onset_s)
-            end_s = max(phone.onset_s + phone.duration_s, onset_s)
+            end_s = max(phone.end_s, onset_s)
             if number == len(phones) - 1 and not phone.final:
                 end_s = max(end_s, self._sound_end_s)
             snapped.append(replace(phone, onset_s=onset_s, duration_s=end_s - onset_s))

@@ -92,15 +92,13 @@ class ClosingPhones:
             phone.symbol in self._symbols
             or (self._rule.other > 0.0 and phone.symbol != self._silence)
         )
-        if counts and math.isfinite(phone.onset_s + phone.duration_s):
+        if counts and math.isfinite(phone.end_s):
             self._phones[phone.index] = phone
 
     def forget_before(self, time_s: float) -> None:
         """Forget phones that ended before a time."""
         self._phones = {
-            index: phone
-            for index, phone in self._phones.items()
-            if phone.onset_s + phone.duration_s >= time_s
+            index: phone for index, phone in self._phones.items() if phone.end_s >= time_s
         }
 
     def clear(self) -> None:
@@ -117,8 +115,7 @@ class ClosingPhones:
             (
                 self._open_phone_log_odds(phone, time_s)
                 for phone in self._phones.values()
-                if phone.symbol not in self._symbols
-                and phone.onset_s <= time_s < phone.onset_s + phone.duration_s
+                if phone.symbol not in self._symbols and phone.onset_s <= time_s < phone.end_s
             ),
             default=0.0,
         )
