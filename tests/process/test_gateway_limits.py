@@ -326,16 +326,18 @@ async def test_one_address_gets_only_its_share_of_webrtc_clients(
 ) -> None:
     monkeypatch.setattr(whip_handler, "MAX_CLIENTS", 4)
     clients = WhipHandler(0.75, UNUSED, UNUSED, [])
-    may_end = asyncio.Event()
+    may_end, num_offers = asyncio.Event(), 0
 
-    async def make_peer(_client: object) -> None:
+    async def make_peer(_name: str) -> None:
+        nonlocal num_offers
+        num_offers += 1
         await may_end.wait()
         raise web.HTTPNotImplemented
 
     monkeypatch.setattr(clients, "_make_peer", make_peer)
     async with whip_offer(clients) as offer, asyncio.timeout(LIMIT_S):
         waiting = [asyncio.create_task(offer()) for _ in range(3)]
-        while len(clients) < 3:
+        while num_offers < 3:
             await asyncio.sleep(0.01)
         assert (await offer())[0] == 503
         may_end.set()
