@@ -4,8 +4,8 @@ import os
 import re
 from pathlib import Path
 
-from kouxing.services.cli.texts.text_encoding import DecodedText, decode_text
-from kouxing.services.cli.texts.text_formats import SpokenText, extract_text
+from kouxing.services.cli.texts.text_encoding import decode_text
+from kouxing.services.cli.texts.text_formats import extract_text
 from kouxing.services.recognizer.offline.alignment import MIN_FIT, Alignment
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
@@ -86,29 +86,29 @@ def read_spoken_text(text: str, language: str = DEFAULT_LANGUAGE) -> str:
     Prints the format if it is not plain text. Raises ``UserError`` if the file cannot be read, or
     its format is not supported.
     """
-    path = _find_file(text)
+    path, encoding = _find_file(text), ""
     if path is None:
-        is_unicode = not re.search("[\ud800-\udfff]", text)  # it has the terminal's encoding
-        decoded = DecodedText(text) if is_unicode else decode_text(os.fsencode(text), language)
-        spoken = extract_text(decoded.text)
+        if re.search("[\ud800-\udfff]", text):  # it does not have the terminal's encoding
+            text, encoding = decode_text(os.fsencode(text), language)
+        spoken, format_name = extract_text(text)
     else:
         content = read_file(path, MAX_TEXT_BYTES)
         try:
-            decoded, spoken = _extract_from(content, path.suffix.lower(), language)
+            spoken, format_name, encoding = _extract_from(content, path.suffix.lower(), language)
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
-    formats = [name for name in (spoken.format_name, decoded.encoding) if name]
+    formats = [name for name in (format_name, encoding) if name]
     if formats:
         name = "the text" if path is None else str(path)
-        remedy = "; if its characters are wrong, save it in UTF-8" if decoded.encoding else ""
+        remedy = "; if its characters are wrong, save it in UTF-8" if encoding else ""
         print_message(f"{name} was read as {' in '.join(formats)}{remedy}")
-    elif time := _CLOCK_TIME.match(spoken.text):
+    elif time := _CLOCK_TIME.match(spoken):
         print_message(f"{time[0]} is read as a spoken time of day; delete it if it is not spoken")
-    if len(labels := _LABEL.findall(spoken.text)) > 1:
+    if len(labels := _LABEL.findall(spoken)) > 1:
         print_message(
             f"{labels[0]!r} is read as spoken text; delete such labels if they are not spoken"
         )
-    return spoken.text
+    return spoken
 
 
 def _find_file(text: str) -> Path | None:
@@ -122,8 +122,9 @@ def _find_file(text: str) -> Path | None:
     return None
 
 
-def _extract_from(content: bytes, suffix: str, language: str) -> tuple[DecodedText, SpokenText]:
+def _extract_from(content: bytes, suffix: str, language: str) -> tuple[str, str, str]:
+    """Return the spoken text of a file, its format and its encoding."""
     if suffix in _TABLE_SUFFIXES:
         raise UserError(f"this is a table ({suffix}); save the spoken text as a plain text file")
-    decoded = decode_text(content, language)
-    return decoded, extract_text(decoded.text, is_markdown=suffix in _MARKDOWN_SUFFIXES)
+    text, encoding = decode_text(content, language)
+    return *extract_text(text, is_markdown=suffix in _MARKDOWN_SUFFIXES), encoding

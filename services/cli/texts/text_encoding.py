@@ -3,8 +3,6 @@
 import codecs
 import contextlib
 import re
-from typing import NamedTuple
-
 import chardet
 
 from kouxing.shared.audio.audio_formats import audio_file_kind
@@ -39,15 +37,8 @@ _ENCODINGS = {  # of each language, apart from Unicode
 _MIN_CONFIDENCE = 0.01  # an accented word has 0.02; damaged text that fits Windows-1252 has 0.001
 
 
-class DecodedText(NamedTuple):
-    """A text and its encoding."""
-
-    text: str
-    encoding: str = ""  # empty: UTF-8
-
-
-def decode_text(content: bytes, language: str) -> DecodedText:
-    """Decode a text file in a language.
+def decode_text(content: bytes, language: str) -> tuple[str, str]:
+    """Return the text of a file in a language, and its encoding; empty for UTF-8.
 
     Raises ``UserError`` if the file is not a text, or its encoding is unknown. If the file has a
     known binary format, the message names the format.
@@ -79,7 +70,7 @@ def decode_text(content: bytes, language: str) -> DecodedText:
             text = content.decode(encoding)
             if all(ord(letter) >= 32 or letter.isspace() for letter in text):
                 name = codecs.lookup(encoding).name.upper().replace("_", "-")
-                return DecodedText(text, "" if name in ("ASCII", "UTF-8", "UTF-8-SIG") else name)
+                return text, "" if name in ("ASCII", "UTF-8", "UTF-8-SIG") else name
     raise UserError(
         "this is not a text file, or its encoding is unknown; save the spoken text as plain"
         " text in UTF-8"

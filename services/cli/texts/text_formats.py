@@ -6,7 +6,6 @@ are left out. A format whose text cannot be extracted is rejected by its name.
 
 import re
 from collections.abc import Callable
-from typing import NamedTuple
 
 from kouxing.services.cli.texts import markup, subtitles, transcripts
 from kouxing.services.cli.texts.text_columns import remove_columns
@@ -23,15 +22,8 @@ _UNSUPPORTED_TEXTS = {  # text files without an extractor, by their first charac
 _LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
 
 
-class SpokenText(NamedTuple):
-    """The spoken part of a text."""
-
-    text: str
-    format_name: str = ""  # format that the rest of the text has; empty: plain text
-
-
-def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
-    """Extract the spoken text from a text of any format.
+def extract_text(text: str, *, is_markdown: bool = False) -> tuple[str, str]:
+    """Return the spoken part of a text, and the text's format; empty for plain text.
 
     Raises ``UserError`` if the text has a format whose spoken text cannot be extracted; the message
     names it.
@@ -54,7 +46,7 @@ def extract_text(text: str, *, is_markdown: bool = False) -> SpokenText:
         format_name = "" if spoken == text else "a table of times or names"
     if _LEFT_TIME.search(spoken):
         raise UserError("the text has times in an unknown format; keep only the spoken text")
-    return SpokenText(spoken, format_name)
+    return spoken, format_name
 
 
 def _starts_with(pattern: str) -> Callable[[str], object]:
