@@ -132,8 +132,7 @@ class ConnectionLimiter:
         self._num_ended = 0  # connections that ended since memory was last freed
         self._descriptor_waiter = DescriptorWaiter()
         self.waker: Waker | None = None  # wakes the loop that receives the messages
-        self._running_lock = threading.Lock()  # held until the thread stops; faster than an event
-        self._running_lock.acquire()
+        self._is_closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="connections", daemon=True)
 
     def __len__(self) -> int:
@@ -210,7 +209,7 @@ class ConnectionLimiter:
     def close(self) -> None:
         """Stop watching."""
         if self._thread.is_alive():
-            self._running_lock.release()
+            self._is_closing.set()
             self._descriptor_waiter.close()
             self._thread.join()
         self._tarpit.close()
@@ -218,7 +217,7 @@ class ConnectionLimiter:
             socket.close()
 
     def _run(self) -> None:
-        while not self._running_lock.acquire(timeout=CHECK_INTERVAL_S):
+        while not self._is_closing.wait(CHECK_INTERVAL_S):
             now_s = time.monotonic()
             self.enforce_limits(now_s)
             if not self._has_undelivered:
