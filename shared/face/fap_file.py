@@ -40,10 +40,7 @@ _EXPRESSION_LIMITS = (6, 63, 6, 63, _ANY, _ANY)
 # numbers that follow a selection by itself
 _VISEME_ALONE = (0, 63, 0)
 _EXPRESSION_ALONE = (63, 0, 0, 0, 0)
-# inner lip FAP: outer lip FAP
-_LIP_PAIRS = {
-    4: 51, 5: 52, 6: 53, 7: 54, 8: 55, 9: 56, 10: 57, 11: 58, 12: 59, 13: 60,
-}  # fmt: skip
+_LIP_PAIRS = dict(zip(range(4, 14), range(51, 61), strict=True))  # inner and outer lip FAPs
 
 
 @dataclass(frozen=True, slots=True)
