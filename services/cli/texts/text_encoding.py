@@ -3,6 +3,7 @@
 import codecs
 import contextlib
 import re
+
 import chardet
 
 from kouxing.shared.audio.audio_formats import audio_file_kind
