@@ -13,7 +13,6 @@ import numpy as np
 import soxr
 
 from kouxing.shared.audio.audio_formats import (
-    MAX_ZERO_BYTES,
     NUM_BEGIN_BYTES,
     NUM_MARK_BYTES,
     audio_file_kind,
@@ -119,7 +118,7 @@ def _open_pipe(
     if stream.isatty():
         raise UserError(f"{name}: this is a terminal; pipe audio into the command")
     pipe = _PeekablePipe(stream)
-    begin = pipe.peek()
+    begin = pipe.peek(needs_more)
     if not begin:
         raise UserError(f"{name}: no audio arrived; check the command that writes it")
     start = find_media_start(begin)
@@ -146,7 +145,7 @@ def _open_pipe(
 
 def _open_raw(stream: BinaryIO, raw: RawFormat, name: str) -> AudioSource:
     pipe = _PeekablePipe(stream)
-    if kind := audio_file_kind(pipe.peek_header()):
+    if kind := audio_file_kind(pipe.peek(lambda begin: len(begin) < NUM_MARK_BYTES)):
         raise UserError(f"{name}: this is {kind}, not raw samples; leave out --raw")
     return raw_audio(pipe, raw, name)
 
@@ -165,27 +164,14 @@ class _PeekablePipe:
         self._begin = b""
         self.num_bytes = 0  # read so far
 
-    def peek(self) -> bytes:
-        """Return enough of the first bytes to recognize the format."""
-        while (
-            len(self._begin) < NUM_BEGIN_BYTES + MAX_ZERO_BYTES
-            and len(self._begin.lstrip(b"\0")) < NUM_BEGIN_BYTES
-            and needs_more(self._begin)
-        ):
-            piece = self._stream.read1(NUM_BEGIN_BYTES)
-            if not piece:
-                break
-            self._begin += piece
-        return self._begin
-
-    def peek_header(self) -> bytes:
-        """Return enough of the first bytes to recognize a common file format."""
-        while len(self._begin) < NUM_MARK_BYTES and (piece := self._stream.read1(NUM_BEGIN_BYTES)):
+    def peek(self, needs_more: Callable[[bytes], bool]) -> bytes:
+        """Return the first bytes, as many as are needed."""
+        while needs_more(self._begin) and (piece := self._stream.read1(NUM_BEGIN_BYTES)):
             self._begin += piece
         return self._begin
 
     def skip(self, num_bytes: int) -> bytes:
-        """Drop the first bytes; return the next bytes like ``peek``."""
+        """Drop the first bytes; return the other bytes that were read."""
         self._begin = self._begin[num_bytes:]
         return self._begin
 

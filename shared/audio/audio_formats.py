@@ -12,7 +12,7 @@ import av
 
 NUM_BEGIN_BYTES = 16_384  # enough for all of this module; three frames of the largest size
 _MAX_LEADING_ZEROS = 4  # zeros at the start that are part of a format
-MAX_ZERO_BYTES = 131_072  # padding before a format
+_MAX_ZERO_BYTES = 131_072  # padding before a format
 _NUM_FRAMED_BYTES = 8192  # size of the checked start of a stream that may begin within a frame
 _NUM_HEADER_BYTES = 4096  # size of the checked start of a WAV or MP4 file
 _COMMON = {
@@ -118,14 +118,16 @@ def unprobed_format(begin: bytes) -> str | None:
 
 
 def needs_more(begin: bytes) -> bool:
-    """Return whether more bytes are needed, up to ``NUM_BEGIN_BYTES``, to recognize a format."""
+    """Return whether more of the first bytes are needed to recognize a format."""
     if len(begin) < 12:
         return True
+    content = begin.lstrip(b"\0")
+    if len(content) >= NUM_BEGIN_BYTES or len(begin) >= NUM_BEGIN_BYTES + _MAX_ZERO_BYTES:
+        return False
     if begin.startswith(b"RIFF") or begin[4:8] == b"ftyp":
         return len(begin) < _NUM_HEADER_BYTES
-    if not any(begin):
-        return len(begin) < MAX_ZERO_BYTES
-    content = begin.lstrip(b"\0")
+    if not content:
+        return len(begin) < _MAX_ZERO_BYTES
     may_be = _TS_SYNC in (begin[0], begin[4]) or begin.startswith(b"\x80\0")
     may_be |= len(content) < _NUM_FRAMED_BYTES or _framed_codec(content) is not None
     return may_be and find_media_start(begin) is None
