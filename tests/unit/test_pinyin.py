@@ -1,7 +1,7 @@
 import pytest
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.mandarin.pinyin import phones_of_syllable, spell, transcribe
+from kouxing.shared.phones.mandarin.pinyin import phones_of_syllable, spell, transcribe, write
 from tests.languages import MANDARIN
 
 # The syllables of Mandarin by initial (Xinhua Zidian's table), ü written v after n and l.
@@ -195,3 +195,8 @@ def test_spelling_inverts_reading() -> None:
     for name in LEGAL:
         phones = phones_of_syllable(name)
         assert phones_of_syllable(spell(phones)) == phones, name
+
+
+def test_the_tone_mark_is_on_the_main_vowel() -> None:
+    spellings = "hao3 gou3 liu4 gui4 lve4 ê2 m2 hng4 r2 ma5".split()
+    assert " ".join(map(write, spellings)) == "hǎo gǒu liù guì lüè ế ḿ hǹg r ma"

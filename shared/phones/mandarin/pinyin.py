@@ -179,16 +179,12 @@ def write(spelling: str) -> str:
     letters = plain.replace("v", "u" if plain[0] in "jqxy" else "ü")
     tone = _to_tone_digit(spelling)[-1]
     mark = next((mark for mark, number in _TONES.items() if str(number) == tone), None)
-    if mark is None:
+    patterns = ("[aeê]|o(?=u)", "[iouü](?=[^iouü]*$)", "[mn]")  # without a vowel: hm, ng, r
+    marked = next(filter(None, (re.search(pattern, letters) for pattern in patterns)), None)
+    if mark is None or marked is None:
         return letters
-    vowels = [index for index, letter in enumerate(letters) if letter in "aeêiouü"]
-    marked = [
-        index for index in vowels if letters[index] in "aeê" or letters[index:].startswith("ou")
-    ]
-    # syllables without a vowel: hm, ng
-    nasals = [index for index, letter in enumerate(letters) if letter in "mn"]
-    place = (marked or vowels[-1:] or nasals)[0]
-    return unicodedata.normalize("NFC", letters[: place + 1] + mark + letters[place + 1 :])
+    place = marked.end()
+    return unicodedata.normalize("NFC", letters[:place] + mark + letters[place:])
 
 
 def transcribe(text: str) -> Transcript:
