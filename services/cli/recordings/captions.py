@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from kouxing.services.cli.options import CaptionKind
@@ -84,17 +83,8 @@ def make_captions(
 
 
 def _phone_captions(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Caption]:
-    joined = {
-        phone.index
-        for before, phone in pairwise(phones)
-        if before.symbol in inventory.initials and phone.symbol in inventory.vowels
-    }
     return [
-        Caption(
-            phone.onset_s,
-            phone.end_s,
-            inventory.write(phone.symbol),
-            is_joined=phone.index in joined,
-        )
-        for phone in phones
+        Caption(phone.onset_s, phone.end_s, inventory.write(phone.symbol), is_joined=number > 0)
+        for group in group_syllables(phones, inventory)
+        for number, phone in enumerate(group)
     ]
