@@ -7,6 +7,7 @@ Chinese characters are Japanese.
 
 import re
 import unicodedata
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 
@@ -37,9 +38,7 @@ def read_mixed_text(text: str) -> Transcript:
         transcript = inventory.read(part)
         dropped += transcript.dropped
         syllables += (
-            SpokenSyllable(
-                syllable.text, syllable.spelling, inventory.in_universal_phones(syllable.phones)
-            )
+            replace(syllable, phones=inventory.in_universal_phones(syllable.phones))
             for syllable in transcript.syllables
         )
     return Transcript(tuple(syllables), tuple(dropped))
