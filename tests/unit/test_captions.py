@@ -62,6 +62,14 @@ def test_highlights_only_the_current_caption_below_the_picture() -> None:
     assert clear[-1, :, 3].max() == 0, "the band of a transparent picture is transparent"
 
 
+def test_a_vowel_joins_its_initial() -> None:
+    captions = make_captions(CaptionKind.PHONES, motion_of(), SIZE)
+    assert captions is not None
+    (line,) = captions._lines
+    assert [caption.text for caption in line] == ["l", "ü", "sh", "i", "g", "ui"]
+    assert [caption.is_joined for caption in line] == [False, True] * 3
+
+
 def test_phones_of_other_languages_are_ipa() -> None:
     phones = [lips.phone(number, symbol, 0.2 * number, 0.2) for number, symbol in enumerate("vi")]
     motion = FaceMotion(motion_of().frames, 50.0, 25.0, None, phones, language="german")
