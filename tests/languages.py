@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSITIONS, Topology
 from kouxing.services.recognizer.search.phone_lm import ContextGraph, PhoneLanguageModel
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 from kouxing.shared.plugins import plugins
 
 MANDARIN = load_inventory("mandarin")
@@ -51,7 +52,7 @@ def small_inventory(**changes: object) -> PhoneInventory:
         "kinds": ("initial", "vowel", "silence"),
         "visemes": {"m": (("b", 1.0),), "a": (("a", 0.5), ("e", 0.5)), "sil": (("rest", 1.0),)},
         "before_rounded": {},
-        "pronounce": lambda text: [tuple(text)],
+        "read": lambda text: Transcript((SpokenSyllable(text, text, tuple(text)),)),
     }
     return PhoneInventory(**(values | changes))  # type: ignore[arg-type]
 

@@ -4,10 +4,11 @@ A language is a package of tables (``table_language``), if it has ``language.tom
 phones of the universal inventory.
 
 A language with its own phones is a Python package with ``phones.tsv`` and a function
-``pronounce``. It may also have:
+``pronounce``, which returns the phones of each syllable of a text. It may also have:
 
-- ``transcribe``, a function that returns a text's syllables with their spelling, and the parts that
-  it cannot read
+- ``transcribe``, a function in place of ``pronounce`` that returns a text's syllables with their
+  spelling, and the parts that it cannot read (``Transcript``)
+- ``UNREADABLE_HINT``, the end of the error about such a part
 - ``READABLE``, a pattern for the parts of a line of text to pronounce; by default words
 - ``spell``, a function that spells a syllable's phones; by default the symbols in a row
 - ``write``, a function that returns a spelling or a phone as it is printed; by default unchanged
@@ -78,8 +79,8 @@ class PhoneInventory:
     kinds: tuple[str, ...]  # (num_phones,) of KINDS
     visemes: dict[str, VisemeFractions]  # by phone
     before_rounded: dict[str, str]  # different viseme of a phone before a rounded one
-    pronounce: Callable[[str], list[Syllable]]  # text to syllables of phones; the lexicon
-    transcribe: Callable[[str], Transcript] | None = None  # like pronounce, with the spelling
+    read: Callable[[str], Transcript]  # text to syllables, and its unreadable parts; the lexicon
+    unreadable_hint: str = "; leave it out, or write it as it is spoken"  # end of an error
     readable: re.Pattern[str] = _WORDS  # finds the parts of a line to pronounce
     spell: Callable[[Syllable], str] = "".join  # phones of a syllable to its spelling
     write: Callable[[str], str] = str  # a spelling or a phone as printed: "ni3" is "nǐ"
@@ -135,15 +136,12 @@ class PhoneInventory:
         """Whether all phones are universal phones."""
         return all(self.universal.get(phone) == (phone,) for phone in self.phones)
 
-    def read(self, text: str) -> Transcript:
-        """Return a text's syllables with their spelling, and the parts that cannot be read."""
-        if self.transcribe is not None:
-            return self.transcribe(text)
-        syllables = (
-            SpokenSyllable(self.spell(phones), self.spell(phones), phones)
-            for phones in self.pronounce(text)
-        )
-        return Transcript(tuple(syllables))
+    def pronounce(self, text: str) -> list[Syllable]:
+        """Return the phones of each syllable; raise ``UserError`` if a part cannot be read."""
+        transcript = self.read(text)
+        if transcript.dropped:
+            raise UserError(f"cannot read {transcript.dropped[0]!r}{self.unreadable_hint}")
+        return transcript.phones
 
     def in_universal_phones(self, phones: Sequence[str]) -> Syllable:
         """Convert phones of this language to universal phones.
@@ -226,6 +224,7 @@ def _inventory_of(
     universal: Mapping[str, Syllable],
 ) -> PhoneInventory:
     """Return the inventory of a table of phones and the functions of a module."""
+    spell = getattr(lexicon, "spell", "".join)
     return PhoneInventory(
         language=language,
         phones=tuple(row["phone"] for row in rows),
@@ -234,14 +233,22 @@ def _inventory_of(
         before_rounded={
             row["phone"]: row["before_rounded"] for row in rows if row["before_rounded"]
         },
-        pronounce=lexicon.pronounce,
-        transcribe=getattr(lexicon, "transcribe", None),
+        read=getattr(lexicon, "transcribe", None) or partial(_spell_all, lexicon.pronounce, spell),
+        unreadable_hint=getattr(lexicon, "UNREADABLE_HINT", PhoneInventory.unreadable_hint),
         readable=getattr(lexicon, "READABLE", _WORDS),
-        spell=getattr(lexicon, "spell", "".join),
+        spell=spell,
         write=getattr(lexicon, "write", str),
         code=getattr(lexicon, "CODE", ""),
         universal=universal,
     )
+
+
+def _spell_all(
+    pronounce: Callable[[str], list[Syllable]], spell: Callable[[Syllable], str], text: str
+) -> Transcript:
+    """Return a text whose spelling follows from its phones."""
+    syllables = ((spell(phones), phones) for phones in pronounce(text))
+    return Transcript(tuple(SpokenSyllable(name, name, phones) for name, phones in syllables))
 
 
 def _inventory_of_tables(language: str, tables: TableLanguage) -> PhoneInventory:
@@ -262,8 +269,8 @@ def _inventory_of_tables(language: str, tables: TableLanguage) -> PhoneInventory
         before_rounded={
             phone: viseme for phone, viseme in universal.before_rounded.items() if phone in phones
         },
-        pronounce=tables.pronounce,
-        transcribe=tables.transcribe,
+        read=tables.transcribe,
+        unreadable_hint=f" as language {tables.code}; leave it out, or write it as it is spoken",
         code=tables.code,
         universal={phone: (phone,) for phone in phones},
     )

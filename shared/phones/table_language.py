@@ -73,12 +73,6 @@ class TableLanguage:
     rules: tuple[tuple[str, str], ...]
     phones: tuple[str, ...]
 
-    def pronounce(self, text: str) -> list[tuple[str, ...]]:
-        """Return the phones of each word of a text; raises ``UserError`` if one cannot be read."""
-        return self.transcribe(text).all_phones(
-            f" as language {self.code}; leave it out, or write it as it is spoken"
-        )
-
     def transcribe(self, text: str) -> Transcript:
         """Return the words of a text with their IPA; a number or a sign such as % is a word.
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import Record
 
 
@@ -26,12 +25,6 @@ class Transcript:
     def phones(self) -> list[tuple[str, ...]]:
         """The phones of each syllable."""
         return [syllable.phones for syllable in self.syllables]
-
-    def all_phones(self, hint: str) -> list[tuple[str, ...]]:
-        """Return ``phones``; raise ``UserError`` with a hint if a part cannot be read."""
-        if self.dropped:
-            raise UserError(f"cannot read {self.dropped[0]!r}{hint}")
-        return self.phones
 
 
 class TimedSyllable(Record, frozen=True):

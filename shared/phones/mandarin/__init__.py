@@ -12,9 +12,10 @@ Deviations: ``eng`` is table 1's {e, eng}, where Crystal has {ei, en, eng}. The 
 
 import re
 
-from kouxing.shared.phones.mandarin.pinyin import pronounce, spell, transcribe, write
+from kouxing.shared.phones.mandarin.pinyin import spell, transcribe, write
 
-__all__ = ["CODE", "READABLE", "pronounce", "spell", "transcribe", "write"]
+__all__ = ["CODE", "READABLE", "UNREADABLE_HINT", "spell", "transcribe", "write"]
 
 CODE = "zh"
 READABLE = re.compile(r"[\u3007\u4e00-\u9fff]+")
+UNREADABLE_HINT = " as Mandarin; use Chinese characters instead"

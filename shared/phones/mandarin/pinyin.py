@@ -134,14 +134,6 @@ def phones_of_syllable(syllable: str) -> tuple[str, ...]:
     return phones
 
 
-def pronounce(text: str) -> list[tuple[str, ...]]:
-    """Return the phones of each syllable of a text, in Chinese characters or in pinyin.
-
-    Raises ``UserError`` if a part of the text cannot be read.
-    """
-    return transcribe(text).all_phones(" as Mandarin; use Chinese characters instead")
-
-
 @lru_cache(maxsize=8192)
 def spell(phones: tuple[str, ...]) -> str:
     """Return the pinyin of a syllable's phones, without tone; an initial is its own spelling.

@@ -17,14 +17,10 @@ is left out, except for ɲ and ʎ. Texts may mix languages (``mixed_text``).
 from kouxing.shared.phones.transcript import Transcript
 from kouxing.shared.phones.universal.segments import read_ipa, symbol_to_ipa
 
-__all__ = ["pronounce", "read_ipa", "spell", "transcribe", "write"]
+__all__ = ["UNREADABLE_HINT", "read_ipa", "spell", "transcribe", "write"]
 
+UNREADABLE_HINT = "; choose its language"
 write = symbol_to_ipa  # of a phone; a spelling stays as it is
-
-
-def pronounce(text: str) -> list[tuple[str, ...]]:
-    """Return the phones of each word or character; raises ``UserError`` if one cannot be read."""
-    return transcribe(text).all_phones("; choose its language")
 
 
 def transcribe(text: str) -> Transcript:
