@@ -33,7 +33,7 @@ class AudioSession:
         self.is_closed = False  # control has closed it
         self._session = session
         self._warn = warn
-        self._frames_ended = asyncio.Event()
+        self.frames_ended = asyncio.Event()  # set when no more frames will arrive
 
     def send(self, pcm: bytes, num_samples: int) -> None:
         """Send ``num_samples`` samples per channel; drop them if the recognizer is too slow.
@@ -63,17 +63,13 @@ class AudioSession:
         """
         return [] if self.is_closed else self._session.take_errors()
 
-    def on_last_frame(self) -> None:
-        """Record that no more frames will arrive."""
-        self._frames_ended.set()
-
     async def finish(self, timeout_s: float) -> None:
         """Stop sending, wait up to ``timeout_s`` for the last frame, then close the session."""
         try:
             if not self.is_closed:
                 await self._session.finish()
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(self._frames_ended.wait(), timeout_s)
+                    await asyncio.wait_for(self.frames_ended.wait(), timeout_s)
                 await asyncio.sleep(LAST_PHONES_WAIT_S)
         except KouxingError as error:
             self._warn("close", str(error), self.name)
@@ -133,13 +129,13 @@ class AudioClient:
     def on_last_frame(self, session: str) -> None:
         """Record that the last frame of a session has arrived."""
         if session in self._open:
-            self._open[session].on_last_frame()
+            self._open[session].frames_ended.set()
 
     def on_closed(self, session: str) -> None:
         """Record that control has closed a session."""
         if session in self._open:
             self._open[session].is_closed = True
-            self._open[session].on_last_frame()
+            self._open[session].frames_ended.set()
 
 
 def error_text(error: UserError | KouxingError) -> str:
