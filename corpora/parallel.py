@@ -1,4 +1,4 @@
-"""Process items in parallel, on all cores of a machine with more than two."""
+"""Process items in parallel, on all cores of a machine with more than one."""
 
 import multiprocessing
 import os
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any, TypeVar
 
-_MIN_CORES = 3  # with fewer, processes would only compete with the caller
+_MIN_CORES = 2  # with one, a process would only compete with the caller
 _AHEAD_PER_CORE = 6  # items that may wait for the caller
 
 T = TypeVar("T")

@@ -235,6 +235,42 @@ def encoder(
 
 
 @app.command()
+def refined_encoder(
+    context: typer.Context,
+    corpora: Corpora,
+    output: Model,
+    start_from: Annotated[Path, typer.Option(help="Audio encoder to refine (.npz).")],
+    sounds: Sounds,
+    clips: Clips,
+    untranscribed: Untranscribed = None,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Number of steps, each with 140 s of audio.")
+    ] = 700,
+    force: Force = False,
+) -> None:
+    """Refine an audio encoder (.npz) with more music and noise, and write its model card.
+
+    It learns to give the same outputs for disturbed audio as for clean audio, and to ignore music.
+
+    Repeat the command to resume an interrupted run; the number of steps may change. The state of
+    the run is stored next to the output, and deleted at the end.
+    """
+    with _neural_training(output, force=force):
+        from kouxing.training.encoder.recipe import refine_encoder
+
+    refine_encoder(
+        corpora,
+        output,
+        start=start_from,
+        clips=clips,
+        untranscribed=untranscribed or [],
+        sounds=sounds,
+        num_steps=steps,
+        any_license=context.obj,
+    )
+
+
+@app.command()
 def visemes(
     context: typer.Context,
     clips: Clips,

@@ -15,9 +15,10 @@ from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, recipe, targets
 from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
-from kouxing.training.encoder.export import export_onnx
-from kouxing.training.encoder.network import NUM_FEATURES, AudioEncoder
-from kouxing.training.encoder.recipe import train_encoder
+from kouxing.training.encoder.export import export_onnx, save_encoder
+from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
+from kouxing.training.encoder.recipe import refine_encoder, train_encoder
+from kouxing.training.encoder.refinement import imitation_loss, rebuild_encoder
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, TargetColumns
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
 from kouxing.training.networks import optimizer
@@ -55,9 +56,10 @@ def piece(samples: np.ndarray, voice: VoiceKind = VoiceKind.SPEECH) -> Piece:
 def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 1)
     monkeypatch.setattr(batches, "_PAUSE_PROB", 0.0)
-    monkeypatch.setattr(batches, "_ONLY_BACKGROUND_PROB", 0.0)
     monkeypatch.setattr(batches, "change_speed", lambda samples, _: (samples, 1.0))
-    batch_source = BatchSource([piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS)
+    batch_source = BatchSource(
+        [piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS, only_background_prob=0.0
+    )
     _, rows = draw_batch(batch_source, 1)
     lips = rows[0, 100, COLUMNS.lips].reshape(-1, NUM_OUTPUTS)[:, 0] - rows[0, 100, PITCH]
     # A position's audio ends 45 ms after its start, and the target of row 0 is at 20 ms.
@@ -114,6 +116,67 @@ def test_trains_resumes_and_writes_a_model(
     with pytest.raises(UserError, match="targets of other recordings or models; delete it"):
         train(untranscribed=[], num_steps=3)
     train(untranscribed=[corpus], num_steps=3)
+    assert "resuming after step 2" in capsys.readouterr().err
+    assert load_encoder(output).num_features == NUM_FEATURES
+    assert "3 steps of" in output.with_suffix(".md").read_text()
+    assert {*tmp_path.glob("encoder*")} == {output, output.with_suffix(".md")}
+
+
+def test_rebuilds_an_exported_encoder(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    encoder = AudioEncoder(NUM_PHONES, width=16)
+    save_encoder(tmp_path / "encoder.npz", encoder)
+    inputs = torch.from_numpy(network_inputs(HELLO)[None, :20])
+    with torch.no_grad():
+        expected, rebuilt = encoder(inputs), rebuild_encoder(tmp_path / "encoder.npz")(inputs)
+    np.testing.assert_allclose(rebuilt, expected, atol=0.01)
+
+
+@pytest.mark.parametrize("kind", [VoiceKind.NONE, VoiceKind.SUNG])
+def test_known_kinds_of_voice_replace_those_of_the_teacher(kind: VoiceKind) -> None:
+    torch.manual_seed(0)
+    encoder = AudioEncoder(NUM_PHONES, width=16)
+    inputs = torch.from_numpy(network_inputs(np.resize(HELLO, 48_000))[None, :100])
+    voice, deviation = torch.full((1, 100), torch.nan), torch.ones(NUM_LIPS)
+    voice[:, 40:60] = kind
+    rates = []
+    for _ in range(2):
+        loss = imitation_loss(encoder, encoder, inputs, inputs, voice, deviation)
+        rates.append(torch.autograd.grad(loss, encoder.output.bias)[0].abs())
+        voice[:] = torch.nan
+    logits = slice(NUM_FEATURES + NUM_PHONES, NUM_FEATURES + NUM_PHONES + len(VoiceKind))
+    known, unknown = rates
+    assert known[logits].argmax() == kind
+    assert unknown[logits].max() < 1e-6
+    assert known[:NUM_FEATURES].max() < 1e-6
+
+
+def test_refines_resumes_and_writes_a_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
+    monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
+    torch.manual_seed(0)
+    start, output = tmp_path / "start.npz", tmp_path / "encoder.npz"
+    save_encoder(start, AudioEncoder(NUM_PHONES, width=16))
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    write_training_clip(clips, clip_name_for("train"), "anna", "CC0")
+    train = partial(
+        refine_encoder,
+        [write_speech(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})],
+        output,
+        start=start,
+        clips=clips,
+        untranscribed=[],
+        sounds=[write_noises(tmp_path / "sounds")],
+        any_license=False,
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe, "save_encoder", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train(num_steps=2)
+    train(num_steps=3)
     assert "resuming after step 2" in capsys.readouterr().err
     assert load_encoder(output).num_features == NUM_FEATURES
     assert "3 steps of" in output.with_suffix(".md").read_text()

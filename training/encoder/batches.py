@@ -6,7 +6,7 @@ and formants. Music, voices or noise are added in the background, then the augme
 Every batch has its own random generator, so resumed training gives the same network.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +42,7 @@ _PAUSE_PROB, _MAX_PAUSE = 0.5, 75  # positions
 _LEVEL_DB = 5.0  # deviation of the levels of recordings in an excerpt
 _MIDDLE = 0.875  # middle of a position's frames, positions after its first sample
 _KNOWN = 2.25  # end of the audio that the network has received, likewise
-_CLEAN_PROB, _ONLY_BACKGROUND_PROB, _BACKGROUND_PROB = 0.15, 0.08, 0.65
+_CLEAN_PROB, _BACKGROUND_PROB = 0.15, 0.65
 _VOICES_PROB, _MAX_VOICES = 0.35, 6  # for a background with other speakers
 _MIN_SNR_DB, _MAX_SNR_DB = 0.0, 25.0
 _MIN_PITCH, _MAX_PITCH = 0.75, 1.33  # for music and noise
@@ -56,19 +56,44 @@ class BatchSource:
     pieces: Sequence[Piece]
     backgrounds: Sequence[Samples]  # music and noise
     columns: TargetColumns
+    only_background_prob: float = 0.08  # of an excerpt without speech
 
     def draw(self, rng: np.random.Generator, probs: NDArray[np.float64]) -> Piece:
         """Draw a piece; ``probs`` are the cumulative probabilities."""
         return self.pieces[int(np.searchsorted(probs, rng.random() * probs[-1]))]
 
 
+@dataclass(frozen=True, slots=True)
+class Excerpt:
+    """Joined recordings, before and after augmentation, at the same speed."""
+
+    clean: Sound
+    disturbed: Floats
+    targets: Floats  # (source positions, columns)
+    speed: float
+
+    def source_positions(self) -> NDArray[np.floating]:
+        """Return the source position of each position."""
+        return self.speed * np.arange(NUM_ENCODER_FRAMES) + (self.speed - 1) * _MIDDLE
+
+
 def draw_batch(batch_source: BatchSource, number: int) -> Batch:
     """Draw a batch by its number."""
+    columns = batch_source.columns
+    rows = [
+        (network_inputs(excerpt.disturbed)[:NUM_ENCODER_FRAMES], _target_rows(excerpt, columns))
+        for excerpt in draw_excerpts(batch_source, number)
+    ]
+    inputs, targets = (np.stack(arrays, dtype=np.float16) for arrays in zip(*rows, strict=True))
+    return inputs, targets
+
+
+def draw_excerpts(batch_source: BatchSource, number: int) -> Iterator[Excerpt]:
+    """Draw the excerpts of a batch by its number."""
     rng = np.random.default_rng([SEED, number])
     probs = np.cumsum([piece.weight for piece in batch_source.pieces])
-    excerpts = [_excerpt(batch_source, probs, rng) for _ in range(NUM_EXCERPTS)]
-    inputs, targets = (np.stack(arrays, dtype=np.float16) for arrays in zip(*excerpts, strict=True))
-    return inputs, targets
+    for _ in range(NUM_EXCERPTS):
+        yield _draw_excerpt(batch_source, probs, rng)
 
 
 def network_inputs(samples: Floats) -> Floats:
@@ -77,33 +102,40 @@ def network_inputs(samples: Floats) -> Floats:
     return frames[: len(frames) // 2 * 2].reshape(-1, NUM_INPUTS)
 
 
-def _excerpt(
+def _draw_excerpt(
     batch_source: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[Floats, Floats]:
+) -> Excerpt:
     samples, targets = _speech(batch_source, probs, rng)
-    sound, speed = change_speed(samples, rng)
-    if rng.random() < _ONLY_BACKGROUND_PROB:
+    clean, speed = change_speed(samples, rng)
+    sound = clean
+    is_only_background = rng.random() < batch_source.only_background_prob
+    is_clean = rng.random() < _CLEAN_PROB
+    if is_only_background:
         targets[:] = np.nan
         targets[:, VOICE] = VoiceKind.NONE
         sound = _add_background(sound, batch_source, rng, 0.0, with_voices=False) - sound
-    elif rng.random() >= _CLEAN_PROB:
-        if rng.random() < _BACKGROUND_PROB:
-            snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
-            sound = _add_background(sound, batch_source, rng, snr_db, with_voices=True)
+    elif not is_clean and rng.random() < _BACKGROUND_PROB:
+        snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
+        sound = _add_background(sound, batch_source, rng, snr_db, with_voices=True)
+    if not is_clean:
         sound = disturb(sound, rng)
-    inputs = network_inputs(scale_level(sound.astype(np.float32), rng))[:NUM_ENCODER_FRAMES]
-    source = speed * np.arange(NUM_ENCODER_FRAMES) + (speed - 1) * _MIDDLE
-    chosen = _rows(targets, source)
+    return Excerpt(clean, scale_level(sound.astype(np.float32), rng), targets, speed)
+
+
+def _target_rows(excerpt: Excerpt, columns: TargetColumns) -> Floats:
+    """Return the targets of each position, (positions, columns) with delayed lips."""
+    speed, targets = excerpt.speed, excerpt.targets
+    chosen = rows_at(targets, excerpt.source_positions())
     chosen[:, PITCH] += np.float32(np.log2(speed))
-    lips = batch_source.columns.lips
+    lips = columns.lips
     delayed = [
-        _rows(targets[:, lips], speed * (np.arange(NUM_ENCODER_FRAMES) + known) - 1)
+        rows_at(targets[:, lips], speed * (np.arange(NUM_ENCODER_FRAMES) + known) - 1)
         for known in (_KNOWN - delay_s / ENCODER_FRAME_S for delay_s in LIP_DELAYS_S)
     ]
-    return inputs, np.concatenate([chosen[:, : lips.start], *delayed], axis=1)
+    return np.concatenate([chosen[:, : lips.start], *delayed], axis=1)
 
 
-def _rows(targets: Floats, positions: NDArray[np.floating]) -> Floats:
+def rows_at(targets: Floats, positions: NDArray[np.floating]) -> Floats:
     """Return the rows that are nearest to positions; NaN before the first one."""
     rows: Floats = targets[np.clip(np.rint(positions).astype(np.int64), 0, len(targets) - 1)]
     rows[positions < -1] = np.nan

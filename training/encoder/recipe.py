@@ -10,6 +10,7 @@ deletes them at the end.
 
 import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -31,15 +32,17 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, rea
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.encoder import VoiceKind
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.encoder.batches import BATCH_S, Batch, BatchSource, draw_batch
 from kouxing.training.encoder.export import save_encoder
 from kouxing.training.encoder.lip_teacher import LipTeacher, teacher_features, train_lip_teacher
 from kouxing.training.encoder.network import AudioEncoder
+from kouxing.training.encoder.refinement import rebuild_encoder, refine
 from kouxing.training.encoder.targets import Samples, SourceRecording, TargetColumns, TargetStore
 from kouxing.training.encoder.teachers import Teachers
 from kouxing.training.model_card import write_card
@@ -48,7 +51,13 @@ from kouxing.training.seed import SEED
 from kouxing.training.training_set import weights_of
 
 _LEARNING_RATE, _WARM_UP_STEPS, _DECAY_FRACTION = 2e-3, 200, 0.5
-_OTHER_VOICES = {"laughter": VoiceKind.LAUGHTER, "breath": VoiceKind.NONE}  # by the kind of a sound
+# by the kind of a sound
+_OTHER_VOICES = {
+    "laughter": VoiceKind.LAUGHTER,
+    "breath": VoiceKind.NONE,
+    "singing": VoiceKind.SUNG,
+}
+_BACKGROUND_SAMPLES = 30 * SAMPLE_RATE_HZ  # a longer background is split
 _OTHER_VOICE_WEIGHT = 0.02  # per recording; the total weight of speech is 1
 
 
@@ -79,6 +88,105 @@ def train_encoder(
     """
     teachers, inventory = load_teachers(whisper)
     errors = RowErrors()
+    sources = _read_sources(
+        corpora, clips, untranscribed, sounds, inventory, errors, any_license=any_license
+    )
+    folder, checkpoint = (output.with_suffix(end) for end in (".targets", ".checkpoint.pt"))
+    folder.mkdir(parents=True, exist_ok=True)
+    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", sources.clips, teachers)
+    store = TargetStore(folder, sources.recordings, teachers, lip_teacher, errors)
+    columns = TargetColumns(len(inventory))
+    batch_source = BatchSource(store.pieces(), sources.backgrounds, columns)
+    trained = _train_network(batch_source, num_steps, checkpoint)
+    trained.rescale_lips(store.lips_mean, store.lips_deviation)
+    save_encoder(output, trained)
+    write_card(
+        output,
+        title="Audio encoder: voice and lip features, a recurrent network",
+        details=f"with Whisper's encoder as a teacher (Radford et al. 2023, MIT license), seed "
+        f"{SEED}, {num_steps} steps of {BATCH_S:.0f} s of sound",
+        recordings=sources.utterances,
+        errors=errors,
+        notes=f"It also learned from {len(untranscribed)} folders of speech without text.",
+    )
+    errors.report_to(print_message)
+    checkpoint.unlink()
+    shutil.rmtree(folder)
+
+
+def refine_encoder(
+    corpora: Sequence[Path],
+    output: Path,
+    *,
+    start: Path,
+    clips: Path,
+    untranscribed: Sequence[Path],
+    sounds: Sequence[Path],
+    num_steps: int,
+    any_license: bool,
+) -> None:
+    """Refine an audio encoder with more disturbances, and write it with its model card.
+
+    The arguments are the options of ``kouxing train refined-encoder``. Raises ``UserError`` if
+    there is nothing to train on, or a file cannot be read.
+    """
+    torch.set_num_threads(1)  # reproducible sums on every machine
+    torch.manual_seed(SEED)
+    errors = RowErrors()
+    sources = _read_sources(
+        corpora,
+        clips,
+        untranscribed,
+        sounds,
+        load_inventory(DEFAULT_LANGUAGE),
+        errors,
+        any_license=any_license,
+    )
+    recordings, checkpoint = (output.with_suffix(end) for end in (".samples.npz", ".checkpoint.pt"))
+    refined = refine(
+        rebuild_encoder(start),
+        rebuild_encoder(start),
+        sources.recordings,
+        sources.backgrounds,
+        errors,
+        num_steps=num_steps,
+        samples_path=recordings,
+        checkpoint=checkpoint,
+    )
+    save_encoder(output, refined)
+    write_card(
+        output,
+        title="Audio encoder: voice and lip features, a recurrent network",
+        details=f"with `{start.name}` as the first weights and the teacher, seed {SEED}, "
+        f"{num_steps} steps of {BATCH_S:.0f} s of sound",
+        recordings=sources.utterances,
+        errors=errors,
+        notes=f"It also learned from {len(untranscribed)} folders of speech without text.",
+    )
+    errors.report_to(print_message)
+    for path in (recordings, checkpoint):
+        path.unlink()
+
+
+@dataclass(frozen=True, slots=True)
+class _Sources:
+    utterances: Sequence[Utterance]
+    clips: Sequence[LipClip]
+    recordings: Sequence[SourceRecording]  # all speech, and other sounds of a voice
+    backgrounds: Sequence[Samples]
+
+
+def _read_sources(
+    corpora: Sequence[Path],
+    clips: Path,
+    untranscribed: Sequence[Path],
+    sounds: Sequence[Path],
+    inventory: PhoneInventory,
+    errors: RowErrors,
+    *,
+    any_license: bool,
+) -> _Sources:
+    """Find what to train on; raises ``UserError`` if there is no speech, clip or background."""
     utterances = [
         utterance
         for corpus in corpora
@@ -89,7 +197,11 @@ def train_encoder(
     if not utterances:
         raise errors.no_recording_error("of split 'train' in the corpora")
     all_sounds = read_sounds(sounds, any_license=any_license)
-    backgrounds = training_backgrounds(all_sounds)
+    backgrounds = [
+        sound[start : start + _BACKGROUND_SAMPLES]
+        for sound in training_backgrounds(all_sounds)
+        for start in range(0, len(sound), _BACKGROUND_SAMPLES)
+    ]
     if not backgrounds:
         raise UserError("no music or noise to mix with the speech; add a folder with --sounds")
     others = [
@@ -108,26 +220,7 @@ def train_encoder(
         raise no_clip_error(clips)
     paths = [clips / f"{clip.name}.flac" for clip in filmed]
     recordings = [*_speech_of(utterances, untranscribed, paths), *others]
-    folder, checkpoint = (output.with_suffix(end) for end in (".targets", ".checkpoint.pt"))
-    folder.mkdir(parents=True, exist_ok=True)
-    lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", filmed, teachers)
-    store = TargetStore(folder, recordings, teachers, lip_teacher, errors)
-    batch_source = BatchSource(store.pieces(), backgrounds, TargetColumns(len(inventory)))
-    trained = _train_network(batch_source, num_steps, checkpoint)
-    trained.rescale_lips(store.lips_mean, store.lips_deviation)
-    save_encoder(output, trained)
-    write_card(
-        output,
-        title="Audio encoder: voice and lip features, a recurrent network",
-        details=f"with Whisper's encoder as a teacher (Radford et al. 2023, MIT license), seed "
-        f"{SEED}, {num_steps} steps of {BATCH_S:.0f} s of sound",
-        recordings=utterances,
-        errors=errors,
-        notes=f"It also learned from {len(untranscribed)} folders of speech without text.",
-    )
-    errors.report_to(print_message)
-    checkpoint.unlink()
-    shutil.rmtree(folder)
+    return _Sources(utterances, filmed, recordings, backgrounds)
 
 
 def _speech_of(
