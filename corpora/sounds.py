@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.corpora.tables import read_rows
 from kouxing.shared.audio.pcm import as_integers
@@ -44,9 +45,13 @@ def read_sounds(folders: Sequence[Path], *, any_license: bool) -> list[Sound]:
         rows = read_rows(manifest, ("path", "kind", "license"))
         if not rows:
             raise UserError(f"{manifest} has no rows; list one sound per row")
-        for row in rows:
-            if any_license or may_distribute(row["license"]):
-                sounds += _split_sound(row["kind"], folder / row["path"])
+        files = [
+            (row["kind"], folder / row["path"])
+            for row in rows
+            if any_license or may_distribute(row["license"])
+        ]
+        for parts in process_in_order(_split_sound, files):
+            sounds += parts
     return sounds
 
 
@@ -62,7 +67,8 @@ def training_backgrounds(sounds: Sequence[Sound]) -> list[NDArray[np.int16]]:
     ]
 
 
-def _split_sound(kind: str, path: Path) -> list[Sound]:
+def _split_sound(file: tuple[str, Path]) -> list[Sound]:
+    kind, path = file
     samples = as_integers(read_audio(path))
     if kind in _HELD_OUT_BY_FILE:
         return [Sound(path.name, kind, samples, zlib.crc32(path.name.encode()) % 4 == 2)]
