@@ -93,7 +93,7 @@ def parse_target(url: str) -> Target:
 
 
 def change_delay(target: Target, delay_s: float) -> Target:
-    """Return a target with another delay, also in its address."""
+    """Return a copy of a target with a new delay, which its address also shows."""
     options = {**target.options, "delay": f"{1e3 * delay_s:g}"}
     protocol = protocols()[target.protocol]
     url = _normalize(urlsplit(target.url), target.host, options, protocol)

@@ -53,7 +53,7 @@ class AudioSource:
     warnings: list[str] = field(default_factory=list)  # problems; complete after the last block
     is_live: bool = False  # whether the audio arrives in real time
     notices: list[str] = field(default_factory=list)  # messages to print before reading
-    # Whether the audio is longer, in seconds; False if that is not known before decoding.
+    # Whether the audio is longer than this many seconds; False if unknown before decoding.
     is_longer_than: Callable[[float], bool] = lambda limit_s: False
 
 

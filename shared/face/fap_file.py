@@ -195,7 +195,7 @@ def _parse_values(
                     _parse_high(2, values[num_viseme:high], _EXPRESSION_LIMITS),
                     sane.astype(np.float32),
                 )
-    raise ValueError(f"found {len(values)} values, the mask sets {int(mask.sum())} FAPs")
+    raise ValueError(f"found {len(values)} values, but the mask sets {int(mask.sum())} FAPs")
 
 
 def _parse_high(fap: int, numbers: list[float], limits: tuple[int, ...]) -> list[int]:

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 import torch
 
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
 from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
 from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
-from kouxing.training.encoder import batches, lip_teacher, recipe, targets
+from kouxing.training.encoder import batches, lip_teacher, recipe, refinement, targets
 from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
 from kouxing.training.encoder.export import export_onnx, save_encoder
 from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
 from kouxing.training.encoder.recipe import refine_encoder, train_encoder
-from kouxing.training.encoder.refinement import imitation_loss, rebuild_encoder
-from kouxing.training.encoder.targets import PITCH, VOICE, Piece, TargetColumns
+from kouxing.training.encoder.refinement import imitation_loss, rebuild_encoder, refine
+from kouxing.training.encoder.targets import PITCH, VOICE, Piece, SourceRecording, TargetColumns
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
 from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
@@ -58,7 +59,7 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_PAUSE_PROB", 0.0)
     monkeypatch.setattr(batches, "change_speed", lambda samples, _: (samples, 1.0))
     batch_source = BatchSource(
-        [piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS, only_background_prob=0.0
+        [piece(np.resize(HELLO, 128_000))], [as_integers(HELLO)], COLUMNS, background_only_prob=0.0
     )
     _, rows = draw_batch(batch_source, 1)
     lips = rows[0, 100, COLUMNS.lips].reshape(-1, NUM_OUTPUTS)[:, 0] - rows[0, 100, PITCH]
@@ -149,6 +150,39 @@ def test_known_kinds_of_voice_replace_those_of_the_teacher(kind: VoiceKind) -> N
     assert known[logits].argmax() == kind
     assert unknown[logits].max() < 1e-6
     assert known[:NUM_FEATURES].max() < 1e-6
+
+
+def test_refined_weights_are_averaged_with_the_first_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def add_one(network: AudioEncoder, *_: object, **__: object) -> AudioEncoder:
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.add_(1.0)
+        return network
+
+    monkeypatch.setattr(refinement, "optimize", add_one)
+    torch.manual_seed(0)
+    teacher, student = AudioEncoder(NUM_PHONES, width=16), AudioEncoder(NUM_PHONES, width=16)
+    student.load_state_dict(teacher.state_dict())
+    refined = refine(
+        teacher,
+        student,
+        [SourceRecording("hello", lambda: as_integers(HELLO), 1.0)],
+        [],
+        RowErrors(),
+        num_steps=1,
+        samples_path=tmp_path / "samples.npz",
+        checkpoint=tmp_path / "checkpoint.pt",
+    )
+    gains = {
+        name: value - teacher.state_dict()[name] for name, value in refined.state_dict().items()
+    }
+    sung = NUM_FEATURES + NUM_PHONES + VoiceKind.SUNG
+    assert gains["output.bias"][sung] == pytest.approx(0.6 + 1.5)
+    gains["output.bias"][sung] = 0.6
+    for gain in gains.values():
+        np.testing.assert_allclose(gain, 0.6, atol=1e-5)
 
 
 def test_refines_resumes_and_writes_a_model(

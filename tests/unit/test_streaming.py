@@ -71,7 +71,7 @@ def interrupted_blocks() -> Iterator[Samples]:
     [
         ([[], [RECORDED]], "wrote out/s.mp4"),
         ([[FAILED]], "no video was written"),
-        ([[], KeyboardInterrupt], "the driver continues to write the video of session s"),
+        ([[], KeyboardInterrupt], "the driver is still writing the video of session s"),
     ],
 )
 def test_ctrl_c_names_the_video_or_says_that_there_is_none(

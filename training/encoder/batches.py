@@ -56,7 +56,7 @@ class BatchSource:
     pieces: Sequence[Piece]
     backgrounds: Sequence[Samples]  # music and noise
     columns: TargetColumns
-    only_background_prob: float = 0.08  # of an excerpt without speech
+    background_only_prob: float = 0.08  # of an excerpt without speech
 
     def draw(self, rng: np.random.Generator, probs: NDArray[np.float64]) -> Piece:
         """Draw a piece; ``probs`` are the cumulative probabilities."""
@@ -108,7 +108,7 @@ def _draw_excerpt(
     samples, targets = _speech(batch_source, probs, rng)
     clean, speed = change_speed(samples, rng)
     sound = clean
-    is_only_background = rng.random() < batch_source.only_background_prob
+    is_only_background = rng.random() < batch_source.background_only_prob
     is_clean = rng.random() < _CLEAN_PROB
     if is_only_background:
         targets[:] = np.nan

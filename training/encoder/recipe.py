@@ -102,7 +102,7 @@ def train_encoder(
     save_encoder(output, trained)
     write_card(
         output,
-        title="Audio encoder: voice and lip features, a recurrent network",
+        title="Audio encoder: a recurrent network for voice and lip features",
         details=f"with Whisper's encoder as a teacher (Radford et al. 2023, MIT license), seed "
         f"{SEED}, {num_steps} steps of {BATCH_S:.0f} s of sound",
         recordings=sources.utterances,
@@ -156,7 +156,7 @@ def refine_encoder(
     save_encoder(output, refined)
     write_card(
         output,
-        title="Audio encoder: voice and lip features, a recurrent network",
+        title="Audio encoder: a recurrent network for voice and lip features",
         details=f"with `{start.name}` as the first weights and the teacher, seed {SEED}, "
         f"{num_steps} steps of {BATCH_S:.0f} s of sound",
         recordings=sources.utterances,

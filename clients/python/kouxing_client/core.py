@@ -248,9 +248,9 @@ class ClientCore:
     def _locate(self, session: SessionCore) -> None:
         """Ask control where a silent session is: its ``session-moved`` may be lost."""
         now_s = self._sockets.now_s
-        if now_s < session.located_s + SILENT_S:
+        if now_s < session.last_located_s + SILENT_S:
             return
-        session.located_s = now_s
+        session.last_located_s = now_s
 
         def on_status(answer: Future[Status]) -> None:
             try:

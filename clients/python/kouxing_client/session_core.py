@@ -201,7 +201,7 @@ class SessionCore:
         self.failure: KouxingError | None = None  # reason for the end; None: closed
         self.is_over = False
         self.is_blocked = False  # the audio socket accepts no more
-        self.located_s = 0.0  # when control was last asked where the silent session is
+        self.last_located_s = 0.0  # when control was last asked where the silent session is
         self._audio: Connection | None = None
         self._subscriptions: list[Subscription] = []
         self._resubscribe_end_s = 0.0  # audio waits for subscriptions until this time

@@ -119,7 +119,7 @@ class _Streamer:
     def _end_video(self) -> None:
         """Close the session after Ctrl-C, and print the path of its video."""
         clear_interrupt()
-        print_message("stopping; press Ctrl-C again to end before the video is complete")
+        print_message("stopping; press Ctrl-C again to exit without waiting for the video")
         with contextlib.suppress(KouxingError):  # closed already, or control is gone
             self._session.close()
         self._wait_for_video()
@@ -218,9 +218,7 @@ class _Streamer:
                     progress.update(task, completed=drawn_s - drawn_before_s)
                     self._read_events(STATUS_S)
         except KeyboardInterrupt:
-            print_message(
-                f"the driver continues to write the video of session {self._session.name}"
-            )
+            print_message(f"the driver is still writing the video of session {self._session.name}")
             raise
 
 
