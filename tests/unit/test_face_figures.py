@@ -19,11 +19,16 @@ COLUMNS = "path speaker license seconds note phones_path"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder with one speaker's calm and loud vowels."""
+    """Return a folder with one speaker's calm vowels, and louder and higher ones."""
     samples, rate_hz = soundfile.read(VOWELS_FILE, dtype="float32")
     rows = []
-    for name, gain, emotion in (("calm", 0.1, "boredom"), ("loud", 0.9, "anger"), ("x", 0.3, "")):
-        soundfile.write(tmp_path / f"{name}.wav", gain * samples[:40_000], rate_hz)
+    for name, gain, pitch, emotion in (
+        ("calm", 0.1, 1.0, "boredom"),
+        ("loud", 0.9, 1.4, "anger"),
+        ("x", 0.3, 1.0, ""),
+    ):
+        vowels = gain * samples[: int(pitch * 40_000)]
+        soundfile.write(tmp_path / f"{name}.wav", vowels, int(pitch * rate_hz))
         note = emotion and f"emotion {emotion}"
         rows.append(f"{name}.wav\tann\tCC0\t2.5\t{note}\tphones.tsv")
     write_manifest(tmp_path, COLUMNS, rows)

@@ -68,7 +68,7 @@ def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
         (["2.1 x 25 1", mask(2), "0 1.5"], "line 3: FAP 2 is 1.5; .* from 0 to 6"),
         (["2.1 x 25 1", "0 1 0", "0"], "line 2: expected a mask of 68"),
         (["2.1 x 25 1", mask(69, digits=69), "0 1"], "line 2: the mask sets a 69th"),
-        (["2.1 x 25 1", mask(3, 4), "0 1"], "line 3: found 1 values, the mask sets 2"),
+        (["2.1 x 25 1", mask(3, 4), "0 1"], "line 3: found 1 values, but the mask sets 2"),
         (["2.1 x 25 1", mask(3), "0 one"], "line 3: a value is not a number"),
         (["2.1 x 25 1", mask(3), "x 1"], "line 3: 'x' is not a frame number"),
         (["2.1 x 25 2", mask(3), "0 1", mask(3), "5 1"], "line 5: found frame 5, expected frame 1"),
