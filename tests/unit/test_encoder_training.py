@@ -14,12 +14,12 @@ from kouxing.services.recognizer.acoustic.onnx_session import create_inference_s
 from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
-from kouxing.training.encoder import batches, lip_teacher, recipe, refinement, targets
+from kouxing.training.encoder import batches, lip_teacher, recipe, targets, trainer
 from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
-from kouxing.training.encoder.export import export_onnx, save_encoder
+from kouxing.training.encoder.export import export_onnx, rebuild_encoder, save_encoder
 from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
 from kouxing.training.encoder.recipe import refine_encoder, train_encoder
-from kouxing.training.encoder.refinement import imitation_loss, rebuild_encoder, refine
+from kouxing.training.encoder.refinement import imitation_loss, refine
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, SourceRecording, TargetColumns
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
 from kouxing.training.networks import optimizer
@@ -142,7 +142,7 @@ def test_known_kinds_of_voice_replace_those_of_the_teacher(kind: VoiceKind) -> N
     voice[:, 40:60] = kind
     rates = []
     for _ in range(2):
-        loss = imitation_loss(encoder, encoder, inputs, inputs, voice, deviation)
+        loss = imitation_loss(encoder, encoder, deviation, inputs, inputs, voice)
         rates.append(torch.autograd.grad(loss, encoder.output.bias)[0].abs())
         voice[:] = torch.nan
     logits = slice(NUM_FEATURES + NUM_PHONES, NUM_FEATURES + NUM_PHONES + len(VoiceKind))
@@ -161,15 +161,13 @@ def test_refined_weights_are_averaged_with_the_first_ones(
                 parameter.add_(1.0)
         return network
 
-    monkeypatch.setattr(refinement, "optimize", add_one)
+    monkeypatch.setattr(trainer, "optimize", add_one)
     torch.manual_seed(0)
-    teacher, student = AudioEncoder(NUM_PHONES, width=16), AudioEncoder(NUM_PHONES, width=16)
-    student.load_state_dict(teacher.state_dict())
+    teacher = AudioEncoder(NUM_PHONES, width=16)
     refined = refine(
         teacher,
-        student,
         [SourceRecording("hello", lambda: as_integers(HELLO), 1.0)],
-        [],
+        [as_integers(HELLO)],
         RowErrors(),
         num_steps=1,
         samples_path=tmp_path / "samples.npz",

@@ -4,15 +4,14 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
-from onnx import numpy_helper
 from torch import nn
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout
 from kouxing.training.networks.network import EncoderShape, ReadoutShape
+from kouxing.training.networks.onnx_graph import read_tensors, read_weight
 
 M = TypeVar("M", bound=nn.Module)
 _Tensors = Mapping[str, NDArray[Any]]
@@ -20,7 +19,7 @@ _Tensors = Mapping[str, NDArray[Any]]
 
 def rebuild_encoder(model: BlockModel) -> BlockEncoder:
     """Rebuild the encoder."""
-    tensors, sizes = _tensors_of(model), model.runner.sizes
+    tensors, sizes = read_tensors(model.network), model.runner.sizes
     shape = EncoderShape(
         width=sizes.width,
         heads=sizes.heads,
@@ -32,7 +31,7 @@ def rebuild_encoder(model: BlockModel) -> BlockEncoder:
 
 def rebuild_readout(model: BlockModel) -> BlockReadout:
     """Rebuild the readout, whose recurrent layer is exported in ONNX's layout."""
-    tensors = _tensors_of(model)
+    tensors = read_tensors(model.network)
     inner = len(tensors["readout.inner.bias"])
     shape = ReadoutShape(inner=inner, gru=model.runner.sizes.state, dropout=0.0, noise=0.0)
     readout = BlockReadout(len(tensors["readout.mean"]), model.topology.num_states, shape)
@@ -51,18 +50,13 @@ def rebuild_readout(model: BlockModel) -> BlockReadout:
     return _load(readout, {**tensors, **others}, "readout.")
 
 
-def _tensors_of(model: BlockModel) -> _Tensors:
-    graph = onnx.load_from_string(model.network.tobytes()).graph
-    return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
-
-
 def _load(module: M, tensors: _Tensors, prefix: str = "") -> M:
     """Load the weights of a module (:mod:`kouxing.training.networks.onnx_graph`)."""
     state = {}
     for name, tensor in module.state_dict().items():
         stem = f"{prefix}{name}".removesuffix(".weight")
         if f"{stem}.integers" in tensors and name.endswith(".weight"):
-            weight = (tensors[f"{stem}.integers"] * tensors[f"{stem}.scales"]).T
+            weight = read_weight(tensors, stem)
             if tensor.ndim == 3:  # a convolution, place by place
                 weight = weight.reshape(len(weight), tensor.shape[2], -1).transpose(0, 2, 1)
         else:

@@ -1,4 +1,4 @@
-"""Exports the audio encoder to ONNX, and writes its model file.
+"""Exports the audio encoder to ONNX, writes its model file, and reads it back into PyTorch.
 
 The graph computes one step for any number of sessions.
 
@@ -21,9 +21,11 @@ Products use 8-bit integers (:mod:`kouxing.training.networks.onnx_graph`).
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.encoder import FORMAT, VoiceKind
+from kouxing.services.recognizer.acoustic.model_file import load_component
 from kouxing.training.encoder.network import (
     MEAN_PITCH,
     NUM_FEATURES,
@@ -31,7 +33,16 @@ from kouxing.training.encoder.network import (
     AudioEncoder,
 )
 from kouxing.training.model_files import write_archive
-from kouxing.training.networks.onnx_graph import Floats, Graph, floats, module_arrays
+from kouxing.training.networks.onnx_graph import (
+    Floats,
+    Graph,
+    floats,
+    module_arrays,
+    read_tensors,
+    read_weight,
+)
+
+_NUM_SCALARS = 4  # voicing, pitch, level, effort
 
 
 def save_encoder(path: Path, encoder: AudioEncoder) -> None:
@@ -42,6 +53,34 @@ def save_encoder(path: Path, encoder: AudioEncoder) -> None:
 def export_onnx(encoder: AudioEncoder) -> NDArray[np.uint8]:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
     return _EncoderGraph(encoder).build_step_model()
+
+
+def rebuild_encoder(path: Path) -> AudioEncoder:
+    """Read a model file back into PyTorch; UserError if it is missing or broken."""
+    return load_component(
+        path,
+        FORMAT,
+        "audio encoder",
+        lambda file: _rebuild(file.array("network", None).astype(np.uint8)),
+    )
+
+
+def _rebuild(file: NDArray[np.uint8]) -> AudioEncoder:
+    tensors = read_tensors(file)
+    num_outputs, width = len(tensors["output.bias"]), len(tensors["entry.bias"])
+    num_phones = num_outputs - NUM_FEATURES - len(VoiceKind) - _NUM_SCALARS
+    encoder = AudioEncoder(num_phones, width)
+    names = {"entry": "entry.{}", "output": "output.{}"}
+    for layer in ("first", "second"):
+        for kind in ("ih", "hh"):
+            names[f"{layer}.{kind}"] = f"{layer}.{{}}_{kind}_l0"
+    state = {}
+    for stem, name in names.items():
+        weight = np.array(read_weight(tensors, stem), np.float32)
+        state[name.format("weight")] = torch.from_numpy(weight)
+        state[name.format("bias")] = torch.from_numpy(np.array(tensors[f"{stem}.bias"]))
+    encoder.load_state_dict(state)
+    return encoder.eval()
 
 
 class _EncoderGraph(Graph):

@@ -52,8 +52,8 @@ WIDTH = 448
 NUM_LIPS = len(LIP_DELAYS_S) * NUM_OUTPUTS
 NUM_FEATURES = 2 * NUM_COMPONENTS + NUM_LIPS  # the first outputs
 
-_LIPS_WEIGHT = 3.0
-_PHONES_WEIGHT, _VOICING_WEIGHT, _SCALAR_WEIGHT = 1 / 2, 1 / 3, 1 / 5
+LIPS_WEIGHT = 3.0
+PHONES_WEIGHT, VOICING_WEIGHT, SCALAR_WEIGHT = 1 / 2, 1 / 3, 1 / 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,20 +126,21 @@ class AudioEncoder(nn.Module):
         losses = (
             _squared_error(now.early, targets[..., self.columns.whisper]),
             _squared_error(late.late, before[..., self.columns.whisper]),
-            _LIPS_WEIGHT * _squared_error(now.lips, targets[..., self.columns.lips]),
-            _PHONES_WEIGHT * _mean(entropy, has_phones),
+            LIPS_WEIGHT * _squared_error(now.lips, targets[..., self.columns.lips]),
+            PHONES_WEIGHT * weighted_mean(entropy, has_phones),
             cross_entropy(late.voice.flatten(0, 1), voice.flatten().long()),
-            _VOICING_WEIGHT * _mean(voicing, has_phones),
-            _mean((late.pitch + MEAN_PITCH - pitch.nan_to_num()).abs(), is_voiced),
-            _SCALAR_WEIGHT * _squared_error(late.level, before[..., LEVEL]),
-            _SCALAR_WEIGHT * _squared_error(late.effort, before[..., EFFORT]),
+            VOICING_WEIGHT * weighted_mean(voicing, has_phones),
+            weighted_mean((late.pitch + MEAN_PITCH - pitch.nan_to_num()).abs(), is_voiced),
+            SCALAR_WEIGHT * _squared_error(late.level, before[..., LEVEL]),
+            SCALAR_WEIGHT * _squared_error(late.effort, before[..., EFFORT]),
         )
         return torch.stack(losses).sum()
 
 
 def _squared_error(outputs: Tensor, targets: Tensor) -> Tensor:
-    return _mean((outputs - targets.nan_to_num()).square(), ~targets.isnan())
+    return weighted_mean((outputs - targets.nan_to_num()).square(), ~targets.isnan())
 
 
-def _mean(values: Tensor, known: Tensor) -> Tensor:
-    return (values * known).sum() / known.sum().clamp(min=1)
+def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    """Return the mean; weights have the same shape, and may be true or false."""
+    return (values * weights).sum() / weights.sum().clamp(min=1)

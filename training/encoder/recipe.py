@@ -9,14 +9,13 @@ deletes them at the end.
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.lip_clips import (
@@ -37,16 +36,16 @@ from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
-from kouxing.training.device import DEVICE, mixed_precision
-from kouxing.training.encoder.batches import BATCH_S, Batch, BatchSource, draw_batch
-from kouxing.training.encoder.export import save_encoder
+from kouxing.training.device import DEVICE
+from kouxing.training.encoder.batches import BATCH_S, BatchSource, draw_batch
+from kouxing.training.encoder.export import rebuild_encoder, save_encoder
 from kouxing.training.encoder.lip_teacher import LipTeacher, teacher_features, train_lip_teacher
 from kouxing.training.encoder.network import AudioEncoder
-from kouxing.training.encoder.refinement import rebuild_encoder, refine
+from kouxing.training.encoder.refinement import refine
 from kouxing.training.encoder.targets import Samples, SourceRecording, TargetColumns, TargetStore
 from kouxing.training.encoder.teachers import Teachers
+from kouxing.training.encoder.trainer import train_on_batches
 from kouxing.training.model_card import write_card
-from kouxing.training.networks.optimizer import optimize
 from kouxing.training.seed import SEED
 from kouxing.training.training_set import weights_of
 
@@ -87,29 +86,19 @@ def train_encoder(
     nothing to train on, or a file cannot be read.
     """
     teachers, inventory = load_teachers(whisper)
-    errors = RowErrors()
     sources = _read_sources(
-        corpora, clips, untranscribed, sounds, inventory, errors, any_license=any_license
+        corpora, clips, untranscribed, sounds, inventory, any_license=any_license
     )
     folder, checkpoint = (output.with_suffix(end) for end in (".targets", ".checkpoint.pt"))
     folder.mkdir(parents=True, exist_ok=True)
     lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", sources.clips, teachers)
-    store = TargetStore(folder, sources.recordings, teachers, lip_teacher, errors)
+    store = TargetStore(folder, sources.recordings, teachers, lip_teacher, sources.errors)
     columns = TargetColumns(len(inventory))
     batch_source = BatchSource(store.pieces(), sources.backgrounds, columns)
     trained = _train_network(batch_source, num_steps, checkpoint)
     trained.rescale_lips(store.lips_mean, store.lips_deviation)
-    save_encoder(output, trained)
-    write_card(
-        output,
-        title="Audio encoder: a recurrent network for voice and lip features",
-        details=f"with Whisper's encoder as a teacher (Radford et al. 2023, MIT license), seed "
-        f"{SEED}, {num_steps} steps of {BATCH_S:.0f} s of sound",
-        recordings=sources.utterances,
-        errors=errors,
-        notes=f"It also learned from {len(untranscribed)} folders of speech without text.",
-    )
-    errors.report_to(print_message)
+    teacher = "Whisper's encoder as a teacher (Radford et al. 2023, MIT license)"
+    _write_model(output, trained, teacher, num_steps, sources)
     checkpoint.unlink()
     shutil.rmtree(folder)
 
@@ -131,39 +120,22 @@ def refine_encoder(
     there is nothing to train on, or a file cannot be read.
     """
     torch.set_num_threads(1)  # reproducible sums on every machine
-    torch.manual_seed(SEED)
-    errors = RowErrors()
+    inventory = load_inventory(DEFAULT_LANGUAGE)
     sources = _read_sources(
-        corpora,
-        clips,
-        untranscribed,
-        sounds,
-        load_inventory(DEFAULT_LANGUAGE),
-        errors,
-        any_license=any_license,
+        corpora, clips, untranscribed, sounds, inventory, any_license=any_license
     )
     recordings, checkpoint = (output.with_suffix(end) for end in (".samples.npz", ".checkpoint.pt"))
     refined = refine(
         rebuild_encoder(start),
-        rebuild_encoder(start),
         sources.recordings,
         sources.backgrounds,
-        errors,
+        sources.errors,
         num_steps=num_steps,
         samples_path=recordings,
         checkpoint=checkpoint,
     )
-    save_encoder(output, refined)
-    write_card(
-        output,
-        title="Audio encoder: a recurrent network for voice and lip features",
-        details=f"with `{start.name}` as the first weights and the teacher, seed {SEED}, "
-        f"{num_steps} steps of {BATCH_S:.0f} s of sound",
-        recordings=sources.utterances,
-        errors=errors,
-        notes=f"It also learned from {len(untranscribed)} folders of speech without text.",
-    )
-    errors.report_to(print_message)
+    teacher = f"`{start.name}` as the first weights and the teacher"
+    _write_model(output, refined, teacher, num_steps, sources)
     for path in (recordings, checkpoint):
         path.unlink()
 
@@ -171,9 +143,11 @@ def refine_encoder(
 @dataclass(frozen=True, slots=True)
 class _Sources:
     utterances: Sequence[Utterance]
+    num_untranscribed: int  # folders of speech without text
     clips: Sequence[LipClip]
     recordings: Sequence[SourceRecording]  # all speech, and other sounds of a voice
     backgrounds: Sequence[Samples]
+    errors: RowErrors
 
 
 def _read_sources(
@@ -182,11 +156,11 @@ def _read_sources(
     untranscribed: Sequence[Path],
     sounds: Sequence[Path],
     inventory: PhoneInventory,
-    errors: RowErrors,
     *,
     any_license: bool,
 ) -> _Sources:
     """Find what to train on; raises ``UserError`` if there is no speech, clip or background."""
+    errors = RowErrors()
     utterances = [
         utterance
         for corpus in corpora
@@ -220,7 +194,23 @@ def _read_sources(
         raise no_clip_error(clips)
     paths = [clips / f"{clip.name}.flac" for clip in filmed]
     recordings = [*_speech_of(utterances, untranscribed, paths), *others]
-    return _Sources(utterances, filmed, recordings, backgrounds)
+    return _Sources(utterances, len(untranscribed), filmed, recordings, backgrounds, errors)
+
+
+def _write_model(
+    output: Path, encoder: AudioEncoder, teacher: str, num_steps: int, sources: _Sources
+) -> None:
+    """Write the model with its card, and report the recordings that could not be used."""
+    save_encoder(output, encoder)
+    write_card(
+        output,
+        title="Audio encoder: a recurrent network for voice and lip features",
+        details=f"with {teacher}, seed {SEED}, {num_steps} steps of {BATCH_S:.0f} s of sound",
+        recordings=sources.utterances,
+        errors=sources.errors,
+        notes=f"It also learned from {sources.num_untranscribed} folders of speech without text.",
+    )
+    sources.errors.report_to(print_message)
 
 
 def _speech_of(
@@ -270,26 +260,13 @@ def _load_lip_teacher(path: Path, all_clips: Sequence[LipClip], teachers: Teache
 def _train_network(batch_source: BatchSource, num_steps: int, checkpoint: Path) -> AudioEncoder:
     torch.manual_seed(SEED)
     encoder = AudioEncoder(batch_source.columns.num_phones).to(DEVICE)
-    batches: Iterator[Batch] | None = None
-
-    def losses(step: int) -> Iterator[Tensor]:
-        nonlocal batches
-        if batches is None:
-            numbers = range(step, num_steps)
-            batches = process_in_order(partial(draw_batch, batch_source), numbers)
-        with mixed_precision():
-            loss = encoder.loss(
-                *(torch.from_numpy(part).to(DEVICE).float() for part in next(batches))
-            )
-        yield loss
-
-    return optimize(
+    return train_on_batches(
         encoder,
-        [{"params": list(encoder.parameters()), "lr": _LEARNING_RATE}],
-        losses,
-        num_steps=num_steps,
+        partial(draw_batch, batch_source),
+        encoder.loss,
+        learning_rate=_LEARNING_RATE,
         warm_up_steps=_WARM_UP_STEPS,
         decay_fraction=_DECAY_FRACTION,
-        max_norm=1.0,
+        num_steps=num_steps,
         checkpoint=checkpoint,
-    ).cpu()
+    )

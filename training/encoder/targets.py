@@ -49,8 +49,8 @@ NUM_COMPONENTS = 128
 CHUNK_SIZE = 64  # recordings
 _NUM_FITTED = 192  # recordings that the principal components are computed from
 _SUNG_PROB = 0.25
-_MAX_SUNG_SAMPLES = 64_000  # limit for the sung part of the speech
-_MIN_SAMPLES, _MAX_SAMPLES = 8000, 320_000
+MAX_SUNG_SAMPLES = 64_000  # limit for the sung part of the speech
+MIN_SAMPLES, MAX_SAMPLES = 8000, 320_000
 _SILENT = 0.5  # posterior of silence above which a position is not speech
 _LAUGHING_LEVEL = -2.0  # level above which laughter is audible
 _MIN_VARIANCE = 1e-6
@@ -239,9 +239,9 @@ class TargetStore:
 def _cut(recording: SourceRecording) -> list[Samples]:
     """Read a recording in parts of up to 20 s; UserError if it cannot be read."""
     samples = recording.read()
-    starts = range(0, max(1, len(samples) - _MIN_SAMPLES), _MAX_SAMPLES)
-    parts = [samples[start : start + _MAX_SAMPLES] for start in starts]
-    return [part for part in parts if len(part) >= _MIN_SAMPLES]
+    starts = range(0, max(1, len(samples) - MIN_SAMPLES), MAX_SAMPLES)
+    parts = [samples[start : start + MAX_SAMPLES] for start in starts]
+    return [part for part in parts if len(part) >= MIN_SAMPLES]
 
 
 def _components_of(centered: Floats) -> Floats:
@@ -257,7 +257,7 @@ def _components_of(centered: Floats) -> Floats:
 
 def _sung_copy(piece: Piece, rng: np.random.Generator) -> list[Piece]:
     """Create a sung copy of the start of a recording; an empty list if it has no voice."""
-    speech = as_floats(piece.samples[:_MAX_SUNG_SAMPLES])
+    speech = as_floats(piece.samples[:MAX_SUNG_SAMPLES])
     sung = sing(speech, len(speech) // ENCODER_FRAME_SAMPLES, rng)
     if sung is None:
         return []

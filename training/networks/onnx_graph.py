@@ -195,6 +195,17 @@ class Graph:
         return self.node("Reshape", [joined, self.integers(f"three_{size}", -1, 3 * size)])
 
 
+def read_tensors(file: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    """Read the constants of an ONNX file, by name."""
+    graph = onnx.load_from_string(file.tobytes()).graph
+    return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+
+
+def read_weight(tensors: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """Return the weight of a product, (outputs, inputs), from its integers and scales."""
+    return np.asarray((tensors[f"{name}.integers"] * tensors[f"{name}.scales"]).T)
+
+
 def module_arrays(module: nn.Module, prefix: str = "") -> dict[str, Floats]:
     """Return a module's parameters and buffers, with ``prefix`` before their names."""
     return {prefix + name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}
