@@ -25,6 +25,30 @@ test("sound waits for its image and one more FAP frame", () => {
   assert.ok(Math.abs(silent.delayMs - 180) <= 5, "without sound, the face waits only for most frames");
 });
 
+test("a face that is far behind its sound from the start is shown", () => {
+  for (const frameMs of [400, 600, 2000]) {
+    for (const isAudible of [true, false]) {
+      const playout = new Playout();
+      playout.isAudible = isAudible;
+      stream(playout, { forMs: frameMs + 3000, frameMs });
+      assert.ok(Math.abs(playout.frameWaitMs) <= 30, `${playout.frameWaitMs} at ${frameMs}`);
+      assert.ok(Math.abs(playout.delayMs - frameMs) <= 30, `${playout.delayMs} at ${frameMs}`);
+      assert.ok(playout.frames.count > 50, "it did not start again");
+    }
+  }
+});
+
+test("a queued stream starts with the delay of its end", () => {
+  const playout = new Playout();
+  for (let ms = 0; ms < 1000; ms += FRAME_MS) {
+    const nowMs = 1000 + ms / 20; // the queue arrives within 50 ms
+    playout.soundArrived(nowMs, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
+    if (ms >= 60) playout.frameArrived(nowMs, (ms - 60) * SAMPLES_PER_MS);
+  }
+  stream(playout, { fromMs: 1040, forMs: 100 });
+  assert.ok(Math.abs(playout.delayMs - 120) <= 20, `${playout.delayMs}`);
+});
+
 test("sound waits for a slow loudspeaker", () => {
   const playout = new Playout();
   playout.outputLatencyMs = 600;

@@ -5,7 +5,9 @@ import { SlidingWindow } from "./sliding-window.js";
 
 export const SAMPLES_PER_MS = 16;
 const FRAME_MS = 20; // between two FAP frames; interpolation needs both
-const FIRST_DELAY_MS = 120; // delay until arrivals have been measured
+// The first delay, until arrivals have been measured: after the sound, and after its frame, which arrives later
+const FIRST_SOUND_DELAY_MS = 120;
+const FIRST_FRAME_DELAY_MS = 60;
 // percentile: of the arrivals to wait for. marginMs: added for interpolation. jumpMs: smaller errors
 // are corrected by gliding. With sound, playback must not run dry or jump audibly. Without sound,
 // a face that is one frame too old is not visible as late.
@@ -18,7 +20,7 @@ const MIN_FRAMES = 20; // number of frames after which the percentile is used
 const RESTART_ERROR_MS = 300; // a stream that is late or early by more than this is restarted …
 const RESTART_LATE_FOR_MS = 100; // … after it was late for this long; less than the delay, so that no sound is lost
 const RESTART_EARLY_FOR_MS = 300; // … or early for this long
-const START_MS = 300; // time at the start in which the earliest arrival sets the offset
+const START_MS = 300; // time at the start in which the earliest arrivals set the offset
 const MAX_BEHIND_MS = 3000; // restart immediately if media time jumps ahead by more than this
 const MAX_FRAMES = 1000;
 
@@ -57,6 +59,8 @@ export class Playout {
   imageDelayMs = 0; // time from computing a face until its image is visible; it is drawn earlier by this
   offsetMs = null; // read only
   #startMs = 0; // when the first offset was set
+  #firstFrameMs; // the offset for the earliest frame
+  #firstSoundMs; // the offset for the earliest sound
   #targetMs = null; // target of the offset
   #adjustedMs = 0; // when the target was set
   #glidedMs = 0; // when the offset was moved last
@@ -71,6 +75,7 @@ export class Playout {
   /** Start again: another session, or the stream paused. */
   reset() {
     this.offsetMs = null;
+    this.#firstFrameMs = this.#firstSoundMs = Infinity;
     this.#targetMs = null;
     this.#lateFrames = new Streak();
     this.#lateSound = new Streak();
@@ -109,7 +114,7 @@ export class Playout {
     const isEarly = this.offsetMs !== null && latenessMs + outputMs < this.offsetMs - RESTART_ERROR_MS;
     if (this.#earlyFrames.update(nowMs, isEarly) > RESTART_EARLY_FOR_MS) this.reset(); // the others were delayed
     if (this.#isLate(nowMs, latenessMs, this.#lateFrames)) return;
-    this.#start(nowMs, latenessMs + FIRST_DELAY_MS / 2);
+    this.#start(nowMs, latenessMs + FIRST_FRAME_DELAY_MS, Infinity);
     this.frames.add(nowMs, latenessMs);
   }
 
@@ -118,7 +123,7 @@ export class Playout {
     const startMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const endMs = startMs - numSamples / SAMPLES_PER_MS;
     if (this.#isLate(nowMs, endMs, this.#lateSound)) return;
-    this.#start(nowMs, endMs + FIRST_DELAY_MS);
+    this.#start(nowMs, Infinity, endMs + FIRST_SOUND_DELAY_MS);
     this.soundStarts.add(nowMs, startMs);
     this.soundEnds.add(nowMs, endMs);
   }
@@ -149,10 +154,17 @@ export class Playout {
     this.offsetMs += Math.max(-maxMs, Math.min(maxMs, errorMs));
   }
 
-  /** Set the first offset. Queued data arrives in a burst, and its end gives the best estimate. */
-  #start(nowMs, offsetMs) {
+  /**
+   * Set the first offset. Queued data arrives in a burst, and its end gives the best estimate. Sound and
+   * frames have their own estimates, because a frame can arrive long after its sound.
+   */
+  #start(nowMs, frameOffsetMs, soundOffsetMs) {
     if (this.offsetMs === null) this.#startMs = nowMs;
-    else if (nowMs - this.#startMs > START_MS || offsetMs >= this.offsetMs) return;
+    else if (nowMs - this.#startMs > START_MS) return;
+    this.#firstFrameMs = Math.min(this.#firstFrameMs, frameOffsetMs);
+    this.#firstSoundMs = Math.min(this.#firstSoundMs, soundOffsetMs);
+    const offsetMs = Math.max(...[this.#firstFrameMs, this.#firstSoundMs].filter(Number.isFinite));
+    if (offsetMs === this.offsetMs) return;
     this.offsetMs = offsetMs;
     this.#forgetArrivals();
   }
