@@ -8,6 +8,10 @@ const RETRY_MS := 1000
 @export var gateway := "ws://127.0.0.1:8080"
 ## Session to follow; if empty, the newest.
 @export var session := ""
+## The gateway's token, if it requires one.
+@export var token := ""
+## The gateway's certificate, if it is self-signed.
+@export var certificate: X509Certificate
 @export var face: Node3D
 
 var _socket := WebSocketPeer.new()
@@ -36,7 +40,9 @@ func _process(_delta: float) -> void:
 			_is_open = false
 			if Time.get_ticks_msec() >= _retry_at_ms:
 				_retry_at_ms = Time.get_ticks_msec() + RETRY_MS
-				_socket.connect_to_url(gateway + "/viewer?session=" + session.uri_encode())
+				var query := "?session=" + session.uri_encode() + "&token=" + token.uri_encode()
+				var url := gateway.trim_suffix("/") + "/viewer" + query
+				_socket.connect_to_url(url, TLSOptions.client(certificate))
 
 
 ## Return the names of a mesh's blendshapes.

@@ -33,11 +33,17 @@ public sealed class KouxingStream : IDisposable
     /// <summary>Why the avatar cannot speak; empty if it can.</summary>
     public string Error { get; private set; } = "";
 
+    /// <summary>Why the last connection failed; empty while the stream is connected.</summary>
+    public string ConnectionError { get; private set; } = "";
+
     /// <summary>Follow a session until disposed; an empty name means the newest.</summary>
     /// <param name="meshes">Names of the shapes of each mesh: ARKit's, Oculus', VRM's, or other programs' names.</param>
-    public KouxingStream(string gateway, string session, IEnumerable<IEnumerable<string>> meshes)
+    /// <param name="token">The gateway's token, if it requires one.</param>
+    public KouxingStream(
+        string gateway, string session, IEnumerable<IEnumerable<string>> meshes, string token = "")
     {
-        _url = new Uri(gateway + "/viewer?session=" + Uri.EscapeDataString(session));
+        string query = "?session=" + Uri.EscapeDataString(session) + "&token=" + Uri.EscapeDataString(token);
+        _url = new Uri(gateway.TrimEnd('/') + "/viewer" + query);
         var lists = meshes.Select(names => "[" + string.Join(",", names.Select(Quote)) + "]");
         _avatar = Encoding.UTF8.GetBytes("{\"avatar\": [" + string.Join(",", lists) + "]}");
         _ = Task.Run(RunAsync);
@@ -54,13 +60,14 @@ public sealed class KouxingStream : IDisposable
                 using (var socket = new ClientWebSocket())
                 {
                     await socket.ConnectAsync(_url, _stop.Token);
+                    ConnectionError = "";
                     var avatar = new ArraySegment<byte>(_avatar);
                     await socket.SendAsync(avatar, WebSocketMessageType.Text, true, _stop.Token);
                     await ReceiveAsync(socket);
                 }
             }
             catch (OperationCanceledException) when (_stop.IsCancellationRequested) { return; }
-            catch (Exception) { } // the gateway is not running, or a message is damaged: connect again
+            catch (Exception error) { ConnectionError = error.GetBaseException().Message; }
             await Task.Delay(RetryMs);
         }
     }

@@ -34,6 +34,7 @@ from tests.system import (
     NODE,
     ROOT,
     VOWELS_FILE,
+    Gateway,
     System,
     free_port,
     samples_of_file,
@@ -332,16 +333,23 @@ def test_the_c_program_ignores_the_move_of_an_earlier_session(programs: list[lis
                 program.kill()
 
 
-def test_the_csharp_program_follows_through_the_gateway(system: System, tmp_path: Path) -> None:
-    program = tmp_path / "follow.exe"
+@pytest.fixture(scope="module")
+def csharp_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    program = tmp_path_factory.mktemp("csharp") / "follow.exe"
     subprocess.run(["mcs", "--parse", *STREAM.parent.glob("*.cs")], check=True)
     subprocess.run(["mcs", f"-out:{program}", FOLDER / "Follow.cs", STREAM], check=True)
+    return program
+
+
+def test_the_csharp_program_follows_through_the_gateway(
+    system: System, csharp_program: Path
+) -> None:
     address = system.page.replace("http", "ws").rstrip("/")
     name, jaw, samples = "avatar", 0.0, SAMPLES  # also the type of a message
     with (
         Client(system.control) as client,
         subprocess.Popen(
-            ["mono", program, name, address], stdout=subprocess.PIPE, text=True
+            ["mono", csharp_program, name, address], stdout=subprocess.PIPE, text=True
         ) as follower,
     ):
         assert follower.stdout is not None
@@ -353,3 +361,19 @@ def test_the_csharp_program_follows_through_the_gateway(system: System, tmp_path
                 jaw = float(follower.stdout.readline())
         follower.terminate()
     assert jaw <= 1
+
+
+def test_the_csharp_program_passes_the_token_to_the_gateway(csharp_program: Path) -> None:
+    with FakeControl() as control:
+        gateway = Gateway(control.address, token="a+secret")
+        command: list[str | Path] = ["mono", csharp_program, "", gateway.page.replace("http", "ws")]
+        for token, stream, text in (
+            ("a+secret", "stdout", "0.00"),
+            ("wrong", "stderr", "cannot connect to the gateway"),
+        ):
+            environment = {**os.environ, "KOUXING_TOKEN": token}
+            pipe: Any = {stream: subprocess.PIPE}
+            with subprocess.Popen(command, env=environment, text=True, **pipe) as follower:
+                assert text in getattr(follower, stream).readline()
+                follower.terminate()
+        assert gateway.stop() == 0
