@@ -153,7 +153,9 @@ def _open_raw(stream: BinaryIO, raw: RawFormat, name: str) -> AudioSource:
 def _wav_audio(stream: Readable, begin: bytes, wav: WavPcm, name: str) -> AudioSource:
     stream.read(wav.offset)
     parts = WavParts(stream, begin, wav.num_bytes, name)
-    return raw_audio(parts, wav.format, name, lambda: parts.num_missing)
+    source = raw_audio(parts, wav.format, name, lambda: parts.num_missing)
+    stated_s = (wav.num_bytes or 0) / wav.format.bytes_per_s
+    return replace(source, is_longer_than=lambda limit_s: stated_s > limit_s)
 
 
 class _PeekablePipe:

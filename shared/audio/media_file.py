@@ -16,6 +16,7 @@ from kouxing.shared.audio.audio_formats import (
     is_media_format,
     is_transport_stream,
     misread_wav_codec,
+    read_stated_size,
     unprobed_format,
     why_unreadable,
 )
@@ -111,14 +112,17 @@ class MediaAudio:
         has_index = not kind.flags & flags.generic_index.value
         self._has_times = self._restarts or has_index or kind.name == "flac"
         self.duration_s = None if is_pipe else self._stated_s()
+        self._stated_by_pipe_s = self._duration_of_pipe_s(begin) if is_pipe else None
         self.blocks = self._blocks(first)
 
     def is_longer_than(self, limit_s: float) -> bool:
         """Return whether the audio is longer; False if that is not known before decoding.
 
         If the file states a longer duration, this counts its packets, because the file may be cut
-        off, and FFmpeg estimates some durations.
+        off, and FFmpeg estimates some durations. For a pipe, the header decides.
         """
+        if self._stated_by_pipe_s is not None:
+            return self._stated_by_pipe_s > limit_s + _PADDING_S
         if (self.duration_s or 0.0) <= limit_s:
             return False
         place, read_s = self._file.seek(0, io.SEEK_CUR), 0.0
@@ -279,6 +283,14 @@ class MediaAudio:
         if self._container.duration is None:
             return None
         return float(self._container.duration / av.time_base)
+
+    def _duration_of_pipe_s(self, begin: bytes) -> float:
+        """Return the duration from a pipe's header; 0 if unknown."""
+        if self._container.format.name not in ("wav", "w64", "aiff"):
+            return self._stated_s() or 0.0
+        # FFmpeg needs the size of the file, or uses a placeholder in the header.
+        bytes_per_s = (self._decoder.bit_rate or 0) / 8
+        return (read_stated_size(begin) or 0) / bytes_per_s if bytes_per_s else 0.0
 
     def _check_end(self, read_s: float) -> None:
         """Warn about damage, and about a file that ends before its header states."""

@@ -18,6 +18,11 @@ class RawFormat(NamedTuple):
     num_channels: int = 1
     dtype: np.dtype[Any] = np.dtype("<i2")
 
+    @property
+    def bytes_per_s(self) -> int:
+        """Number of bytes per second of audio."""
+        return self.dtype.itemsize * self.num_channels * self.sample_rate_hz
+
 
 class WavPcm(NamedTuple):
     """The samples in a WAV file."""

@@ -11,7 +11,7 @@ import pytest
 import soundfile
 from numpy.typing import NDArray
 
-from kouxing.shared.audio.audio_file import AudioSource, open_audio, read_audio
+from kouxing.shared.audio.audio_file import AudioSource, limited_blocks, open_audio, read_audio
 from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, is_media_format
 from kouxing.shared.audio.raw_format import RawFormat
 from kouxing.shared.errors import UserError
@@ -129,6 +129,29 @@ def test_reads_every_encoding_of_a_wav_pipe(open_pipe: Open, subtype: str) -> No
     samples = samples_of(source)
     assert len(samples) == 3000
     np.testing.assert_allclose(samples, 0.25, atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["a.flac", "a.mkv", "a.m4a", "a.au", "a.aiff", "a.w64", "a.flv"])
+def test_a_pipe_that_states_a_long_duration_is_rejected_at_once(
+    tmp_path: Path, open_pipe: Open, name: str
+) -> None:
+    data = write_audio(tmp_path / name, SPEECH, RATE_HZ, movflags="faststart")
+    assert len(list(limited_blocks(open_pipe(data), 2.5))) >= 100
+    with pytest.raises(UserError, match="the audio is longer than"):
+        next(limited_blocks(open_pipe(data), 0.9))
+
+
+@pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24"])
+def test_a_wav_pipe_that_states_a_long_duration_is_rejected_at_once(
+    open_pipe: Open, subtype: str
+) -> None:
+    data = wav_file(SPEECH, subtype=subtype)
+    with pytest.raises(UserError, match="the audio is longer than"):
+        next(limited_blocks(open_pipe(data), 0.9))
+    placeholder = (0x7FFFF000).to_bytes(4, "little")  # as SoX writes it
+    place = data.find(b"data") + 4
+    data = data[:4] + placeholder + data[8:place] + placeholder + data[place + 4 :]
+    assert len(list(limited_blocks(open_pipe(data), 2.0))) == 100
 
 
 def test_reads_all_parts_of_a_wav_file(open_either: Open) -> None:
