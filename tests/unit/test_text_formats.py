@@ -275,6 +275,11 @@ def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
         ("mandarin", "電話", "big5"),
         ("mandarin", "臺灣", "big5"),
         ("mandarin", "圖書館", "big5"),
+        ("mandarin", "天數", "big5"),
+        ("mandarin", "木條", "big5"),
+        ("mandarin", "枝头", "gb18030"),
+        ("mandarin", "转转", "gb18030"),
+        ("mandarin", "角度θ", "gb18030"),
         ("mandarin", "上手需要和以", "gb18030"),
         ("mandarin", "nǐ hǎo", "gb18030"),
         ("mandarin", "ok", "utf-16-le"),
@@ -286,6 +291,19 @@ def test_detects_the_encoding_of_a_file(encoding: str, form: str) -> None:
 )
 def test_an_encoding_depends_on_the_language(language: str, text: str, encoding: str) -> None:
     assert decode_text(text.encode(encoding), language) == (text, encoding.upper())
+
+
+@pytest.mark.parametrize(
+    ("language", "text"),
+    [
+        ("universal", "Да, שלום"),
+        ("mandarin", "他说 Привет"),
+        ("mandarin", "「の」和 [ʂ]"),
+        ("russian", "да"),
+    ],
+)
+def test_a_utf_8_file_may_have_any_script(language: str, text: str) -> None:
+    assert decode_text(text.encode(), language) == (text, "")
 
 
 @pytest.mark.parametrize(

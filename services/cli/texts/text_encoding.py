@@ -35,6 +35,9 @@ _ENCODINGS = {  # of each language, apart from Unicode
     "turkish": ("cp1254",),
     "vietnamese": ("cp1258",),
 }
+_NOT_CHINESE = re.compile(
+    "[\u0250-\u02af\u0400-\u0fff\u3040-\u30ff]"
+)  # IPA, Hebrew, kana and others
 _MIN_CONFIDENCE = 0.01  # an accented word has 0.02; damaged text that fits Windows-1252 has 0.001
 
 
@@ -66,7 +69,7 @@ def decode_text(content: bytes, language: str) -> tuple[str, str]:
         is_big_endian = content[::2].count(0) > content[1::2].count(0)
         candidates.insert(0, "utf-16-be" if is_big_endian else "utf-16-le")
     unique = dict.fromkeys(candidates)
-    for encoding in sorted(unique, key=lambda name: _has_rare_characters(content, name)):
+    for encoding in sorted(unique, key=lambda name: _has_rare_characters(content, name, language)):
         with contextlib.suppress(UnicodeDecodeError):
             text = content.decode(encoding)
             if all(ord(letter) >= 32 or letter.isspace() for letter in text):
@@ -86,14 +89,20 @@ def _has_pinyin(content: bytes) -> bool:
         return False
 
 
-def _has_rare_characters(content: bytes, encoding: str) -> bool:
-    """Return whether a Chinese encoding gives characters outside GB 2312, or level 1 of Big5."""
+def _has_rare_characters(content: bytes, encoding: str, language: str) -> bool:
+    """Return whether an encoding gives characters that are rare in Chinese texts.
+
+    They are outside GB 2312 or level 1 of Big5, or not Chinese. ``universal`` allows other scripts.
+    """
     try:
+        text = content.decode(encoding)
+        if language in ("mandarin", "cantonese") and _NOT_CHINESE.search(text):
+            return True
         match encoding:
             case "gb18030":
                 content.decode("gb2312")
             case "big5":
-                return any(letter.encode("big5") >= b"\xc7" for letter in content.decode("big5"))
+                return any(letter.encode("big5") >= b"\xc7" for letter in text)
     except UnicodeDecodeError:
         return True
     return False
