@@ -229,6 +229,18 @@ def test_limits_the_points_of_a_draco_mesh_because_its_attributes_are_unknown(
         read_glb(path)
 
 
+def test_rejects_a_draco_mesh_that_needs_too_much_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decode(_: bytes) -> None:
+        raise MemoryError
+
+    path = edit(write_glb(tmp_path / "my.glb", meshes({"jawOpen": SHAPES["jawOpen"]})), draco)
+    monkeypatch.setattr(DracoPy, "decode", decode)
+    with pytest.raises(UserError, match=r"my\.glb: a Draco mesh needs far more memory"):
+        read_glb(path)
+
+
 def test_applies_default_weights_of_other_shapes_only(tmp_path: Path) -> None:
     """The shapes of speech start at rest; the others, such as the shape of the nose, stay."""
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from kouxing.services.driver.head.draco_header import read_mesh_size
+from kouxing.services.driver.head.draco_decoder import decode_mesh, read_mesh_size
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content, parse_json, read_file
 
@@ -165,8 +165,6 @@ class GlbFile:
             accessors["indices"] = primitive["indices"]
         decoded = {}
         if _DRACO in primitive.get("extensions", {}):
-            import DracoPy  # noqa: PLC0415 - few files need it
-
             compressed = primitive["extensions"][_DRACO]
             data = self.view(compressed["bufferView"])
             num_faces, num_points = read_mesh_size(data)
@@ -178,7 +176,12 @@ class GlbFile:
             kinds = [self.item("accessors", index)["type"] for index in indices]
             num_values = 3 * num_faces + num_points * sum(_NUM_COMPONENTS[kind] for kind in kinds)
             self._allow(4 * num_values)
-            mesh = DracoPy.decode(data)
+            try:
+                mesh = decode_mesh(data, 4 * num_values)
+            except MemoryError:
+                raise UserError(
+                    "a Draco mesh needs far more memory than its attributes; export it again"
+                ) from None
             decoded["indices"] = np.asarray(mesh.faces, np.float64).reshape(-1, 1)
             for name in accessors.keys() & compressed["attributes"].keys():
                 item = self.item("accessors", accessors[name])

@@ -1,14 +1,50 @@
-"""Reads the size of a Draco mesh before it is decoded (Draco Bitstream Specification 2.2).
+"""Decodes Draco meshes from untrusted files (Draco Bitstream Specification 2.2).
 
-DracoPy cannot limit the size of a decoded mesh, and a few bytes can describe millions of faces.
-The header does not contain the number of attributes, and only a decoder can find their headers.
+DracoPy cannot limit the size of a decoded mesh, and a few bytes can describe millions of faces or
+thousands of attributes. The header contains only the number of faces.
 """
 
+import contextlib
 import io
+import resource
 import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
+_MEMORY_USE = Path("/proc/self/statm")  # only Linux has it
+_DECODER_BYTES = 256 << 20  # memory that a decoder may need for a small mesh
+_COPIES = 4  # a decoder needs up to this many times the size of the decoded mesh
 _HAS_METADATA = 0x8000  # flag
 _SEQUENTIAL = 0  # encoding whose header contains the number of points
+
+
+def decode_mesh(data: bytes, num_bytes: int) -> Any:
+    """Return DracoPy's mesh, which is expected to have ``num_bytes``.
+
+    Raises ``MemoryError`` if the mesh needs much more memory, for example for attributes that the
+    file does not list. Systems other than Linux have no such limit.
+    """
+    import DracoPy  # noqa: PLC0415 - few files need it
+
+    with _limited_memory(_DECODER_BYTES + _COPIES * num_bytes):
+        return DracoPy.decode(data)
+
+
+@contextlib.contextmanager
+def _limited_memory(num_bytes: int) -> Iterator[None]:
+    """Limit the memory that all threads of this process can allocate in the enclosed code."""
+    if not _MEMORY_USE.exists():
+        yield
+        return
+    used_bytes = int(_MEMORY_USE.read_text().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limits = (used_bytes + num_bytes, *(limit for limit in (soft, hard) if limit >= 0))
+    resource.setrlimit(resource.RLIMIT_AS, (min(limits), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def read_mesh_size(data: bytes) -> tuple[int, int]:

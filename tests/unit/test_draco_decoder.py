@@ -1,13 +1,16 @@
-"""The size of a Draco mesh is known before it is decoded."""
+"""The size of a Draco mesh is known before it is decoded, and its memory is limited."""
 
+import resource
 import struct
+from pathlib import Path
 from typing import Any
 
 import DracoPy
 import numpy as np
 import pytest
 
-from kouxing.services.driver.head.draco_header import read_mesh_size
+from kouxing.services.driver.head import draco_decoder
+from kouxing.services.driver.head.draco_decoder import decode_mesh, read_mesh_size
 
 NUM_COLUMNS = 20
 
@@ -31,6 +34,25 @@ def test_reads_the_size_of_a_mesh(compression_level: int, with_metadata: bool) -
     num_faces, max_points = read_mesh_size(data)
     assert num_faces == 2 * (NUM_COLUMNS - 1) ** 2
     assert NUM_COLUMNS**2 <= max_points <= 3 * num_faces
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux limits the memory")
+def test_limits_the_memory_of_attributes_that_are_not_listed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(draco_decoder, "_DECODER_BYTES", 1 << 20)
+    points = np.zeros((199_998, 3), np.float32)
+    points[:, 0] = np.arange(len(points))
+    faces = np.arange(len(points), dtype=np.uint32).reshape(-1, 3)
+    others = {f"other{i}": np.zeros((len(points), 4), np.uint32) for i in range(30)}
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    few: bytes = DracoPy.encode(points, faces)
+    assert len(decode_mesh(few, 24 * len(points)).points) == len(points)
+    many: bytes = DracoPy.encode(points, faces, generic_attributes=others)
+    assert len(many) < len(few) + 2000
+    with pytest.raises(MemoryError):
+        decode_mesh(many, 24 * len(points))
+    assert resource.getrlimit(resource.RLIMIT_AS) == limits
 
 
 def test_skips_nested_metadata() -> None:
