@@ -120,11 +120,24 @@ test("a hint names the problem and the remedy", () => {
   const starting = { ...well, isConnected: false, wasConnected: false };
   assert.equal(hintText(starting), "");
   assert.match(hintText({ ...starting, isRefused: true }), /#token/);
+  assert.match(hintText({ ...well, isConnected: false, isRefused: true }), /#token/);
   assert.match(hintText({ ...well, missing: ["control"] }), /Control is not running.*kouxing run/);
   assert.match(
     hintText({ ...well, missing: ["recognizer", "synthesizer"] }),
     /recognizer, synthesizer.*kouxing recognizer; kouxing synthesizer/,
   );
+});
+
+test("a rejected connection stays rejected until the page connects", () => {
+  const state = new GatewayState();
+  state.setConnected(true);
+  state.setConnected(false);
+  assert.equal(state.isRefused, false);
+  state.isRefused = true;
+  state.setConnected(false);
+  assert.equal(state.isRefused, true);
+  state.setConnected(true);
+  assert.equal(state.isRefused, false);
 });
 
 test("a fault is shown after a second, and its end only if it was shown", () => {

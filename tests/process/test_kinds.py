@@ -8,7 +8,7 @@ from unittest import mock
 
 import pytest
 
-from kouxing.services.cli.launch.run import assigned_environment
+from kouxing.services.cli.launch.run import assigned_environment, token_environment
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.service_kinds import (
     KINDS,
@@ -67,6 +67,15 @@ def test_only_a_server_gets_a_reserved_port() -> None:
         socket.create_server(address).close()
     with socket.socket() as other:
         other.bind(address)
+
+
+@pytest.mark.parametrize(("https", "token"), [("proxy", ""), ("proxy", "secret"), ("", "")])
+def test_a_gateway_that_is_restarted_keeps_its_token(https: str, token: str) -> None:
+    settings = read_settings(assignments={"gateway.https": https, "gateway.token": token})
+    environment = token_environment(settings)
+    if https and not token:
+        assert len(environment.pop("KOUXING_GATEWAY_TOKEN")) >= 20
+    assert environment == {}
 
 
 def test_a_common_key_is_set_for_the_services_that_have_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import signal
 import sys
 import webbrowser
@@ -106,6 +107,7 @@ def run(
             {
                 **assigned_environment(given),
                 **head_environment(settings, head, out),
+                **token_environment(settings),
                 **free_ports,
                 **control_environment,
             },
@@ -193,6 +195,14 @@ def head_environment(settings: Settings, option: str, out: Path) -> dict[str, st
         raise UserError(f"cannot create {out}: {error.strerror}; set driver.out") from None
     export_glb(load_head(head), page_head)
     return environment | {variable_name("gateway", "head"): str(page_head)}
+
+
+def token_environment(settings: Settings) -> dict[str, str]:
+    """Return the environment in which a gateway keeps the page's token when it is restarted."""
+    gateway = settings.load(GatewayConfig)
+    if gateway.token or not gateway.is_encrypted:
+        return {}
+    return {variable_name("gateway", "token"): secrets.token_urlsafe(16)}
 
 
 def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:

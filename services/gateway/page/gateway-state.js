@@ -11,7 +11,7 @@ export class GatewayState {
   acoustic = ""; // acoustic model of the session: full or light
   missing = []; // services that are not running
 
-  /** Whether the gateway rejected the first connection, although it served this page. */
+  /** Whether the gateway rejected the connection, although it runs: the first one, or because of the token. */
   isRefused = false;
 
   /** Whether the page is connecting for the first time. */
@@ -22,7 +22,8 @@ export class GatewayState {
   setConnected(isConnected) {
     this.isConnected = isConnected;
     this.wasConnected ||= isConnected;
-    this.isRefused = !this.wasConnected;
+    if (isConnected) this.isRefused = false;
+    else this.isRefused ||= !this.wasConnected;
     if (!isConnected) this.session = null;
   }
 

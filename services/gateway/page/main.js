@@ -1,6 +1,6 @@
 // Connects the parts of the page.
 
-import { socketUrl } from "./address.js";
+import { isTokenWrong, socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
 import { GatewayState } from "./gateway-state.js";
@@ -79,9 +79,13 @@ const socket = new ViewerSocket(
   (session) => socketUrl("/viewer", { session }),
   query.get("session") ?? "",
   {
-    state(isConnected) {
+    async state(isConnected) {
       gateway.setConnected(isConnected);
       statusBar.show();
+      if (!isConnected && gateway.wasConnected) {
+        const isWrong = await isTokenWrong();
+        if (!gateway.isConnected) gateway.isRefused = isWrong;
+      }
     },
     fap: (mediaTime, values) => player.addFrame(mediaTime, values),
     sound(mediaTime, samples) {
