@@ -112,6 +112,48 @@ test("after a stall, the page is live within a second, however fast the delayed 
   }
 });
 
+/**
+ * Let sound arrive in chunks of chunkMs, each within a share of its duration. Return how much sound
+ * arrives too late to be played, ms, after the first 5 s.
+ */
+function streamChunks(playout, { chunkMs, share, forMs, pauseMs = 0 }) {
+  let lostMs = 0;
+  for (let startMs = 0; startMs < forMs; startMs += chunkMs) {
+    const pausedMs = startMs > forMs / 2 ? pauseMs : 0;
+    for (let ms = startMs; ms < startMs + chunkMs; ms += FRAME_MS) {
+      const nowMs = startMs + chunkMs + share * (ms - startMs) + pausedMs;
+      playout.soundArrived(nowMs, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
+      if (ms >= 60) playout.frameArrived(nowMs, (ms - 60) * SAMPLES_PER_MS);
+      playout.adjust(nowMs);
+      if (startMs > 5000) lostMs += Math.min(FRAME_MS, Math.max(0, nowMs - ms - playout.offsetMs));
+    }
+  }
+  return lostMs;
+}
+
+test("sound that arrives in long chunks is played from their start", () => {
+  for (const chunkMs of [20, 200, 600, 640, 800, 1000, 2000]) {
+    for (const share of [0.02, 0.2, 0.4]) {
+      for (const pauseMs of [0, 3000]) {
+        const playout = new Playout();
+        const lostMs = streamChunks(playout, { chunkMs, share, pauseMs, forMs: 40000 });
+        const limitMs = pauseMs > 0 && chunkMs < 640 ? 1000 : 0; // a pause is first noticed when sound is late
+        assert.ok(lostMs <= limitMs, `${lostMs} ms of chunks of ${chunkMs} ms, ${share}, ${pauseMs}`);
+        const lastMs = playout.delayMs - chunkMs;
+        assert.ok(lastMs < 200, `${playout.delayMs}: much longer than the chunks of ${chunkMs} ms`);
+      }
+    }
+  }
+});
+
+test("another session starts without the delay of long chunks", () => {
+  const playout = new Playout();
+  streamChunks(playout, { chunkMs: 1000, share: 0.2, forMs: 10000 });
+  playout.reset();
+  stream(playout, { clockMs: 10000, forMs: 1000 });
+  assert.ok(playout.delayMs <= 120, `${playout.delayMs}`);
+});
+
 test("faces between two frames are interpolated", () => {
   const track = new FapTrack();
   const out = new Float32Array(2);

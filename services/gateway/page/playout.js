@@ -20,6 +20,9 @@ const MIN_FRAMES = 20; // number of frames after which the percentile is used
 const RESTART_ERROR_MS = 300; // a stream that is late or early by more than this is restarted …
 const RESTART_LATE_FOR_MS = 100; // … after it was late for this long; less than the delay, so that no sound is lost
 const RESTART_EARLY_FOR_MS = 300; // … or early for this long
+const BURST_MS = 1000; // maximum duration of a burst of data that was delayed or is sent in long chunks
+const NUM_BURSTS = 2; // in WINDOW_MS; a sender with more of them sends long chunks
+const RESTART_EARLY_WITH_LONG_CHUNKS_MS = 3000; // longer than a chunk, whose end is early
 const START_MS = 300; // time at the start in which the earliest arrivals set the offset
 const MAX_BEHIND_MS = 3000; // restart immediately if media time jumps ahead by more than this
 const MAX_FRAMES = 1000;
@@ -52,6 +55,8 @@ class Streak {
  * by at most 5 ms per second, and the sound follows by resampling. Only if the error exceeds 30 ms,
  * half of it is corrected immediately, every half second. So one bad second does not cause a jump. After a
  * stall, the delayed data arrives in a burst. The burst is not measured, so the page is live when it ends.
+ * If bursts recur, the sender sends long chunks. Then all data is measured, and the offset is that of the
+ * start of a chunk, which arrives latest.
  */
 export class Playout {
   isAudible = true;
@@ -67,13 +72,24 @@ export class Playout {
   #lateFrames;
   #lateSound;
   #earlyFrames;
+  #burst = null; // { sinceMs, offsetMs: the offset before it } of frames, until the frames are on time again
+  #burstEnds = new SlidingWindow(WINDOW_MS);
+  #hasLongChunks = false;
 
   constructor() {
     this.reset();
   }
 
-  /** Start again: another session, or the stream paused. */
+  /** Start again with another session. */
   reset() {
+    this.#burst = null;
+    this.#burstEnds.reset();
+    this.#hasLongChunks = false;
+    this.#restart();
+  }
+
+  /** Start again after a pause of the stream. */
+  #restart() {
     this.offsetMs = null;
     this.#firstFrameMs = this.#firstSoundMs = Infinity;
     this.#targetMs = null;
@@ -112,7 +128,9 @@ export class Playout {
     const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const outputMs = Math.max(this.imageDelayMs, this.outputLatencyMs);
     const isEarly = this.offsetMs !== null && latenessMs + outputMs < this.offsetMs - RESTART_ERROR_MS;
-    if (this.#earlyFrames.update(nowMs, isEarly) > RESTART_EARLY_FOR_MS) this.reset(); // the others were delayed
+    const maxEarlyMs = this.#hasLongChunks ? RESTART_EARLY_WITH_LONG_CHUNKS_MS : RESTART_EARLY_FOR_MS;
+    if (this.#earlyFrames.update(nowMs, isEarly) > maxEarlyMs) this.#restart(); // the others were delayed
+    this.#countBursts(nowMs, latenessMs);
     if (this.#isLate(nowMs, latenessMs, this.#lateFrames)) return;
     this.#start(nowMs, latenessMs + FIRST_FRAME_DELAY_MS, Infinity);
     this.frames.add(nowMs, latenessMs);
@@ -134,7 +152,7 @@ export class Playout {
     if (this.offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
     if (this.frames.count < MIN_FRAMES) return;
     this.#adjustedMs = nowMs;
-    const { percentile, marginMs, jumpMs } = this.isAudible ? WITH_SOUND : WITHOUT_SOUND;
+    const { percentile, marginMs, jumpMs } = this.isAudible || this.#hasLongChunks ? WITH_SOUND : WITHOUT_SOUND;
     let latestMs = this.frames.percentile(percentile) + this.imageDelayMs;
     if (this.isAudible && this.soundStarts.count) {
       // The lateness of a long chunk of sound is the lateness of its first sample.
@@ -155,18 +173,35 @@ export class Playout {
   }
 
   /**
-   * Set the first offset. Queued data arrives in a burst, and its end gives the best estimate. Sound and
-   * frames have their own estimates, because a frame can arrive long after its sound.
+   * Set the first offset. Queued data arrives in a burst, and its end gives the best estimate. A long
+   * chunk must be played from its start. Sound and frames have their own estimates, because a frame
+   * can arrive long after its sound.
    */
   #start(nowMs, frameOffsetMs, soundOffsetMs) {
     if (this.offsetMs === null) this.#startMs = nowMs;
     else if (nowMs - this.#startMs > START_MS) return;
-    this.#firstFrameMs = Math.min(this.#firstFrameMs, frameOffsetMs);
-    this.#firstSoundMs = Math.min(this.#firstSoundMs, soundOffsetMs);
+    if (!this.#hasLongChunks || this.#firstFrameMs === Infinity) {
+      this.#firstFrameMs = Math.min(this.#firstFrameMs, frameOffsetMs);
+    }
+    if (!this.#hasLongChunks || this.#firstSoundMs === Infinity) {
+      this.#firstSoundMs = Math.min(this.#firstSoundMs, soundOffsetMs);
+    }
     const offsetMs = Math.max(...[this.#firstFrameMs, this.#firstSoundMs].filter(Number.isFinite));
     if (offsetMs === this.offsetMs) return;
     this.offsetMs = offsetMs;
     this.#forgetArrivals();
+  }
+
+  /** Count the bursts of frames: they start late and end on time. After a pause, the stream stays late. */
+  #countBursts(nowMs, latenessMs) {
+    if (this.#burst !== null) {
+      const hasEnded = latenessMs <= this.#burst.offsetMs;
+      if (hasEnded) this.#burstEnds.add(nowMs, latenessMs);
+      if (this.#burstEnds.count >= NUM_BURSTS) this.#hasLongChunks = true;
+      if (hasEnded || nowMs - this.#burst.sinceMs > BURST_MS) this.#burst = null;
+    } else if (this.offsetMs !== null && latenessMs > this.offsetMs + RESTART_ERROR_MS) {
+      this.#burst = { sinceMs: nowMs, offsetMs: this.offsetMs };
+    }
   }
 
   /**
@@ -178,7 +213,8 @@ export class Playout {
     if (this.offsetMs === null) return false;
     const lateMs = latenessMs - this.offsetMs;
     const lateForMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : RESTART_ERROR_MS));
-    if (lateForMs > RESTART_LATE_FOR_MS || lateMs < -MAX_BEHIND_MS) this.reset();
+    const isPaused = lateForMs > RESTART_LATE_FOR_MS || (streak.holds && this.#hasLongChunks);
+    if (isPaused || lateMs < -MAX_BEHIND_MS) this.#restart();
     return this.offsetMs !== null && streak.holds;
   }
 }
