@@ -104,7 +104,10 @@ def test_a_built_in_command_does_not_import_the_added_ones(added: list[str]) -> 
             "from kouxing.services.service_kinds import read_settings; read_settings()",
             "numpy zmq aiohttp",
         ),
-        ("import kouxing.services.gateway.service", "scipy onnxruntime prometheus_client"),
+        (
+            "import kouxing.services.gateway.service",
+            "scipy onnxruntime prometheus_client cryptography",
+        ),
         (
             "from kouxing.services.driver.service import DriverConfig, View;"
             " View(DriverConfig(view='none'), print)",

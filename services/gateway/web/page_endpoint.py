@@ -10,7 +10,6 @@ from kouxing_client.field_types import MAX_ENDPOINT
 
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.web.access import AccessPolicy
-from kouxing.services.gateway.web.certificate import load_tls_context
 from kouxing.shared.errors import UserError
 from kouxing.shared.settings.endpoints import WILDCARDS, is_address, is_loopback
 
@@ -39,6 +38,8 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     names = {name.lower() for name in own_names}  # as `AccessPolicy` gets a request's host
     tls = None
     if config.certificate:
+        from kouxing.services.gateway.web.certificate import load_tls_context
+
         tls = load_tls_context(config.certificate, [*sorted(names), "localhost", "127.0.0.1"])
     address = f"{f'[{host}]' if ':' in host else host}:{port}"
     fragment = f"#token={quote(token)}" if token else ""
