@@ -8,6 +8,7 @@ import os
 import socket
 import threading
 from array import array
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -247,6 +248,37 @@ def test_results_may_be_read_in_several_event_loops(control: FakeControl) -> Non
         control.publish(control.faps, frame(1), frame(2))
         assert {reader.result() for reader in readers} == {1.0, 2.0}
     asyncio.run(client.close())
+
+
+class ContendedQueue(deque[FapFrame]):
+    """A queue whose first message another reader takes first."""
+
+    is_contended = True
+
+    def popleft(self) -> FapFrame:
+        message = super().popleft()
+        if not self.is_contended:
+            return message
+        self.is_contended = False
+        raise IndexError
+
+
+@pytest.mark.parametrize("is_async", [True, False])
+def test_a_reader_waits_again_if_another_one_takes_its_result(
+    control: FakeControl, client: Client, is_async: bool
+) -> None:
+    frames = client.open_session("s").frames()
+    frames._inbox.messages = ContendedQueue()
+    control.publish(control.faps, frame(1), frame(2))
+    if is_async:
+        reader: AsyncResults[FapFrame] = AsyncResults(frames._inbox, lambda: None)
+
+        async def read() -> FapFrame:
+            return await reader.__anext__()
+
+        assert asyncio.run(read()).sequence == 2
+    else:
+        assert next(frames).sequence == 2
 
 
 def test_a_new_subscriber_receives_what_the_publisher_repeats(

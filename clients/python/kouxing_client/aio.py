@@ -156,8 +156,9 @@ class AsyncResults(BaseResults, Generic[T]):
         return self
 
     async def __anext__(self) -> T:
-        await self._signal.wait_async(self._has_results)
-        result = self._take_or_fail()
-        if result is None:
-            raise StopAsyncIteration
-        return cast(T, result)
+        while True:
+            await self._signal.wait_async(self._has_results)
+            if (result := self._take_or_fail()) is not None:
+                return cast(T, result)
+            if self.has_ended:  # otherwise another reader has taken the result
+                raise StopAsyncIteration

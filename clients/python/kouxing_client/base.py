@@ -1,5 +1,6 @@
 """The common base of ``Client`` and ``AsyncClient``: arguments, audio formats and waiting."""
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -325,7 +326,7 @@ class BaseResults:
 
     def _take(self) -> Any:
         """Return the next result, or None if none is left."""
-        if self._inbox.messages:
+        with contextlib.suppress(IndexError):
             return self._inbox.messages.popleft()
         if self._inbox.failure is not None:
             raise self._inbox.failure

@@ -216,9 +216,9 @@ class Results(BaseResults, Generic[T]):
         return self
 
     def __next__(self) -> T:
-        result = self.get()
-        if result is None:
-            raise StopIteration
+        while (result := self.get()) is None:
+            if self.has_ended:  # otherwise another reader has taken the result
+                raise StopIteration
         return result
 
     def get(self, timeout_s: float | None = None) -> T | None:
