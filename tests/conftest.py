@@ -12,6 +12,7 @@ from kouxing.services.service_kinds import KINDS
 from tests.system import System
 from tests.videos import write_video
 
+HAS_FAILED = pytest.StashKey[bool]()
 settings.register_profile(
     "kouxing", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -35,12 +36,25 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Fail skipped tests in continuous integration, where everything that tests need exists."""
     report = yield
     if report.skipped and os.environ.get("FAIL_SKIPPED_TESTS"):
         report.outcome = "failed"
+    item.stash[HAS_FAILED] = report.when == "call" and report.failed
     return report
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """After a failed test, end all fixtures, which it may have left in another state.
+
+    The next test gets new services and pages, so one fault makes only one test fail.
+    """
+    if item.stash.get(HAS_FAILED, False):
+        item.session._setupstate.teardown_exact(None)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,6 +6,7 @@ import time
 from random import Random
 
 from kouxing.evaluation.system.attackers import GREETING, LOCALHOST, LONG, ready_command
+from tests.system import LIMIT_S
 
 MORE = 1  # flag of a frame
 
@@ -57,7 +58,7 @@ def connect_raw(port: int, kind: str = "DEALER", host: str = LOCALHOST) -> socke
 
     ``kind`` is ZeroMQ's name of the socket kind. Raises OSError if the other end refuses.
     """
-    connection = socket.create_connection((LOCALHOST, port), 5.0, (host, 0))
+    connection = socket.create_connection((LOCALHOST, port), LIMIT_S, (host, 0))
     try:
         connection.sendall(GREETING + ready_command(kind))
         answer = b""

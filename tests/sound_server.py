@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system import wait_until
+from tests.system import LIMIT_S, wait_until
 
 _COMMAND = (
     *"pulseaudio -n --daemonize=no --exit-idle-time=-1 --use-pid-file=no --disable-shm=yes".split(),
@@ -30,4 +30,4 @@ def sound_server(folder: Path) -> Iterator[None]:
             yield
         finally:
             server.terminate()
-            server.wait(30)
+            server.wait(LIMIT_S)

@@ -46,6 +46,7 @@ VIDEO_RATE_HZ = 10
 MAX_RESERVATIONS = 50
 
 _reservations: deque[contextlib.ExitStack] = deque()  # of ports
+_udp_ports = iter(range(20_000 + os.getpid() % 10_000, 32_000))
 
 
 def samples_of_file(path: Path) -> NDArray[np.float32]:
@@ -79,6 +80,22 @@ def free_port() -> int:
     reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     _keep(reservation)
     return int(reserved.getsockname()[1])
+
+
+def free_udp_port() -> int:
+    """Return a UDP port, for a test that binds it later or needs one that nobody binds.
+
+    The system gives programs only higher ports. The TCP port of this number is reserved, so other
+    processes of the tests choose another one.
+    """
+    for port in _udp_ports:
+        with contextlib.ExitStack() as reservation, contextlib.suppress(OSError):
+            reservation.enter_context(socket.socket()).bind(("127.0.0.1", port))
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind(("127.0.0.1", port))
+            _keep(reservation.pop_all())
+            return port
+    raise AssertionError("all ports are in use")
 
 
 def own_addresses(

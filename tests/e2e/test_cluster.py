@@ -41,7 +41,7 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
 
 @pytest.fixture
 def control(tmp_path: Path) -> Iterator[System]:
-    with System(["control"], tmp_path, {"KOUXING_CONTROL_LOST_AFTER_S": "2"}) as running:
+    with System(["control"], tmp_path, {"KOUXING_CONTROL_LOST_AFTER_S": "6"}) as running:
         yield running
 
 

@@ -17,7 +17,7 @@ from kouxing_client import Client
 from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.shared.settings.keys import control_endpoint
 from tests.containers import READ_CAP, USER_ID, Containers, network_or_skip
-from tests.system import ROOT, VOWELS_FILE
+from tests.system import LIMIT_S, ROOT, VOWELS_FILE
 
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))
 HOSTS = {  # containers by name, and their services
@@ -85,11 +85,7 @@ def containers(
     yield new_containers
     for process in running.values():
         process.terminate()
-    grace_s = {
-        host: int(COMPOSE["services"][HOSTS[host]]["stop_grace_period"].removesuffix("s"))
-        for host in running
-    }
-    statuses = {host: process.wait(grace_s[host]) for host, process in running.items()}
+    statuses = {host: process.wait(LIMIT_S) for host, process in running.items()}
     assert set(statuses.values()) == {0}, statuses
 
 
@@ -136,7 +132,7 @@ def test_containers_are_healthy_private_and_speak(
         ), reported_endpoints
 
     speaker = start(containers, "client-1", "client", keys, "speak", str(VOWELS_FILE), "--fast")
-    assert speaker.wait(60) == 0, containers.log("client-1").read_text("utf-8")
+    assert speaker.wait(LIMIT_S) == 0, containers.log("client-1").read_text("utf-8")
     assert " phones in " in containers.log("client-1").read_text("utf-8")
 
 
@@ -151,7 +147,7 @@ def check_page(reported_endpoints: Collection[str], gateway: str) -> None:
         if item.startswith(address)
     ]
     for query, status in (("", 403), (f"?{secret}", 200)):
-        with contextlib.closing(HTTPConnection(gateway, int(own_port), timeout=60)) as http:
+        with contextlib.closing(HTTPConnection(gateway, int(own_port), timeout=LIMIT_S)) as http:
             http.request("GET", f"/senders{query}")
             assert http.getresponse().status == status
 

@@ -186,7 +186,7 @@ def test_surplus_peers_do_not_reconnect_at_once(monkeypatch: pytest.MonkeyPatch)
         wait_until(lambda: all(has_ended(peer) for peer in peers))
 
 
-def is_soon_disconnected(connection: socket.socket, bound: Socket, num_checks: int = 500) -> bool:
+def is_soon_disconnected(connection: socket.socket, bound: Socket, num_checks: int = 5000) -> bool:
     """Whether a connection ends soon, while its other end's messages are received."""
     for _ in range(num_checks):
         list(bound.receive())

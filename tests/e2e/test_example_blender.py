@@ -9,7 +9,7 @@ import pytest
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.shared.face.shapes import ARKIT
 from tests import heads
-from tests.system import ROOT, free_port
+from tests.system import ROOT, free_udp_port
 
 FOLDER = ROOT / "examples" / "blender"
 BLENDER = FOLDER / ".venv"  # `make blender` puts Blender there, as a Python module
@@ -84,7 +84,7 @@ def test_the_add_on_plays_a_recording_and_follows_a_stream(tmp_path: Path) -> No
         for number, weight in enumerate((0.0, 0.5, 1.0)):
             row = [weight * (name == "jawOpen") for name in ARKIT.names]
             rows.writerow([number * 0.04, *row])
-    arguments = [str(glb), str(table), str(free_port()), str(FOLDER)]
+    arguments = [str(glb), str(table), str(free_udp_port()), str(FOLDER)]
     result = subprocess.run(
         [BLENDER / "bin" / "python", "-c", SCRIPT, *arguments],
         capture_output=True,

@@ -25,7 +25,7 @@ MOVED = {"recognizer": {"audio", "phones"}, "synthesizer": {"faps"}}
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "2"}
+    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "6"}  # a busy service is not lost
     with System(CHAIN, tmp_path_factory.mktemp("moves"), settings) as running:
         yield running
 
@@ -76,7 +76,7 @@ def test_a_session_continues_without_its_worker(
             unsent = unsent[1600:]
             if blow == signal.SIGTERM and name not in instances_of(client):
                 assert session.info["epoch"] > before["epoch"], "it left before its session moved"
-        while witness.wait(0.2):
+        while witness.wait(1.0):
             list(witness.receive())
         if blow == signal.SIGSTOP:
             lost.send_signal(signal.SIGCONT)

@@ -26,7 +26,7 @@ from kouxing.shared.wire.session import AudioChunk, Error
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
 from tests.samples import with_opening
-from tests.system import free_port, wait_until
+from tests.system import LIMIT_S, free_port, wait_until
 
 RATE_HZ = START.opening.sample_rate_hz
 PHONE_INPUT = {"phone_input": f"tcp://127.0.0.1:{free_port()}"}
@@ -133,7 +133,7 @@ def test_decodes_live_audio_before_unpaced_audio(service: Recognizer) -> None:
         paced = bus.connect_dealer(service.endpoints["audio"])
         for number in range(num_short):  # of 20 ms
             paced.send(chunk(number, 320, "live"))
-            assert service._audio.wait(30.0)
+            assert service._audio.wait(LIMIT_S)
             before = other.media_time
             service.step(0.0)
             assert live.next_media_time == 320 * (number + 1)  # at once
@@ -174,7 +174,7 @@ def test_other_sessions_continue_while_a_model_is_loaded(
 
     def load_slowly(language: str) -> AcousticModel:
         loaded_on.append(threading.get_ident())
-        assert is_released.wait(60.0)
+        assert is_released.wait(LIMIT_S)
         return load_model_for_language(language)
 
     monkeypatch.setattr(pending_sessions, "load_model_for_language", load_slowly)

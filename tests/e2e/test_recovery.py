@@ -110,7 +110,7 @@ def test_shows_the_measured_delay(browser: Browser) -> None:
     browser.wait_for(IS_LIVE)
     browser.wait_for(rf"/(live \d+ m|behind.* \d+\.\d )s/.test({STATUS})")
     # Each frame comes 60 ms after its sound; the first number of the label is the delay.
-    assert browser.evaluate("window.kouxing.state.voiceToImageMs") > 60
+    browser.wait_for("window.kouxing.state.voiceToImageMs > 60")
     assert browser.evaluate(rf"Number(({STATUS}.match(/live (\d+) ms/) ?? [0, 61])[1])") > 60
 
 

@@ -28,7 +28,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.receivers import LIVE_LINK_ORDER, frame_of, read_live_link
-from tests.system import LIMIT_S, wait_until
+from tests.system import LIMIT_S, free_port, free_udp_port, wait_until
 from tests.vtube_studio import VTubeStudioStub
 
 OPEN_MOUTH = frame_of("vrm", aa=1.0).faps
@@ -63,12 +63,6 @@ def receiver() -> Iterator[socket.socket]:
         yield udp_socket
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def problem_of(senders: SenderPool, url: str) -> str:
     return next(state.problem for state in senders.states() if state.target == url)
 
@@ -99,7 +93,7 @@ def test_an_osc_server_receives_the_face(senders: SenderPool) -> None:
 def test_reports_a_missing_receiver_and_finds_it_later(
     senders: SenderPool, receiver: socket.socket, reports: list[tuple[str, str]]
 ) -> None:
-    port = free_port()
+    port = free_udp_port()
     missing = f"osc://127.0.0.1:{port}"
     receiver_url = f"osc://127.0.0.1:{receiver.getsockname()[1]}"
     senders.start(parse_target(missing))
@@ -151,7 +145,7 @@ def test_a_tracker_must_not_receive_what_it_sends(
 ) -> None:
     resolve = socket.getaddrinfo
     monkeypatch.setattr(socket, "getaddrinfo", lambda _, *args: resolve("127.0.0.1", *args))
-    port = free_port()
+    port = free_udp_port()
     url = f"vmc://pc.local:{port}?camera=0.0.0.0:{port}"
     senders.start(parse_target(url))
     wait_until(lambda: "is the port of the avatar program itself" in problem_of(senders, url))
@@ -227,8 +221,9 @@ def test_media_time_continues_at_rest(senders: SenderPool, receiver: socket.sock
 
 
 def test_the_permission_of_vtube_studio_is_requested_once(senders: SenderPool) -> None:
-    with VTubeStudioStub() as stub:
-        url = f"vts://127.0.0.1:{stub.port}"
+    port = free_port()
+    with VTubeStudioStub(port) as stub:
+        url = f"vts://127.0.0.1:{port}"
         senders.start(parse_target(url))
         wait_until(lambda: bool(stub.frames))
         assert stub.requests == [
@@ -237,7 +232,6 @@ def test_the_permission_of_vtube_studio_is_requested_once(senders: SenderPool) -
         assert stub.frames[0]["MouthOpen"] == 0.0
         senders.show(0.0, OPEN_MOUTH)
         wait_until(lambda: stub.frames[-1]["MouthOpen"] > 0.9)
-        port = stub.port
     wait_until(lambda: "start it" in problem_of(senders, url))
     with VTubeStudioStub(port, token="a-token") as stub:  # restarted; it accepts the token
         wait_until(lambda: bool(stub.frames))
@@ -301,7 +295,7 @@ def test_new_options_replace_a_sender_and_keep_its_permission(senders: SenderPoo
 def test_a_tracker_passes_through_with_the_mouth_of_the_session(
     senders: SenderPool, receiver: socket.socket
 ) -> None:
-    port, camera = receiver.getsockname()[1], free_port()
+    port, camera = receiver.getsockname()[1], free_udp_port()
     target = parse_target(f"livelink://127.0.0.1:{port}?camera={camera}")
     senders.start(target)
     wait_until(lambda: senders.states()[0].rate_hz > 0)  # both sockets are open
@@ -324,8 +318,8 @@ def test_an_occupied_tracker_port_is_reported_once(
     senders: SenderPool, receiver: socket.socket, reports: list[tuple[str, str]]
 ) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        camera = other.getsockname()[1]
+        camera = free_udp_port()
+        other.bind(("127.0.0.1", camera))
         url = f"vmc://127.0.0.1:{receiver.getsockname()[1]}?camera={camera}"
         senders.start(parse_target(url))
         wait_until(lambda: f"cannot receive from a tracker on 127.0.0.1:{camera}" in str(reports))

@@ -239,7 +239,8 @@ def test_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> None:
         )
         port, token = next(filter(None, matches)).groups()
         for query, status in (("", 403), (f"?token={token}", 101)):
-            with contextlib.closing(HTTPConnection("127.0.0.1", int(port), timeout=60)) as http:
+            connection = HTTPConnection("127.0.0.1", int(port), timeout=LIMIT_S)
+            with contextlib.closing(connection) as http:
                 http.request("GET", f"/viewer{query}", headers=UPGRADE)
                 assert http.getresponse().status == status
 

@@ -54,14 +54,14 @@ def test_answers_while_too_many_connections_send_no_request(server: MetricsServe
     address = ("127.0.0.1", server.server_port)
     with ExitStack() as connections:
         for _ in range(MAX_REQUESTS + 1):
-            connection = socket.create_connection(address, timeout=30)
+            connection = socket.create_connection(address, timeout=LIMIT_S)
             connections.enter_context(connection).sendall(b"GET /metr")
         assert get(server.server_port, "/healthz") == "alive\n"
 
 
 @pytest.mark.parametrize("request_line", [b"GET /healthz HTTP/1.1", b"\xff\xff / HTTP/9"])
 def test_answers_have_no_version(server: MetricsServer, request_line: bytes) -> None:
-    with closing(socket.create_connection(("127.0.0.1", server.server_port), 30)) as client:
+    with closing(socket.create_connection(("127.0.0.1", server.server_port), LIMIT_S)) as client:
         client.sendall(request_line + b"\r\n\r\n")
         answer = client.makefile("rb").read()
     assert answer

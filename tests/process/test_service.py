@@ -36,7 +36,7 @@ from kouxing.shared.wire.speech import Progress
 from tests.fake_control import FakeControl
 from tests.raw_bytes import answer_handshake
 from tests.samples import START
-from tests.system import LIMIT_S, wait_until
+from tests.system import LIMIT_S, free_port, wait_until
 
 STALL_S = HEARTBEAT_S + RESYNC_AFTER_S + 0.1
 
@@ -328,8 +328,9 @@ def test_registers_at_an_address_where_another_program_answered_before(
     monkeypatch.setattr(
         "kouxing.shared.service.base.explain_unreachable", lambda *_, **__: "not asked"
     )
-    listener = socket.create_server(("127.0.0.1", 0))
-    commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    port = free_port()
+    listener = socket.create_server(("127.0.0.1", port))
+    commands = f"tcp://127.0.0.1:{port}"
     worker = Worker(commands)
     worker.endpoints = {"input": worker.input.endpoint}
     answer_handshake(listener, curve, rest)

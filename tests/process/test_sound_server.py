@@ -9,9 +9,10 @@ import pytest
 
 from kouxing.shared.audio.sound_devices import list_sound_devices, open_monitor
 from tests.sound_server import sound_server
-from tests.system import wait_until
+from tests.system import LIMIT_S, wait_until
 
 RATE_HZ, TONE_HZ = 16_000, 1000
+TONE_S = 600  # longer than the tests take on a busy machine
 MAX_BLOCKS = 3000  # 60 s: playback without a loudspeaker may start late
 PLAYER = (
     *"pacat --client-name=Player --format=s16le --channels=1 --latency-msec=50".split(),
@@ -23,14 +24,14 @@ PLAYER = (
 def _server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Start a sound server and a program that plays a tone."""
     folder = tmp_path_factory.mktemp("sound")
-    tone = 16384 * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(60 * RATE_HZ))
+    tone = 16384 * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(TONE_S * RATE_HZ))
     (folder / "tone").write_bytes(tone.astype("<i2").tobytes())
     with sound_server(folder), (folder / "tone").open("rb") as sound:
         player = subprocess.Popen(PLAYER, stdin=sound, stderr=subprocess.DEVNULL)
         wait_until(lambda: len(programs()) == 1)
         yield
         player.terminate()
-        player.wait(30)
+        player.wait(LIMIT_S)
 
 
 def programs() -> list[str]:

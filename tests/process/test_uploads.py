@@ -42,7 +42,7 @@ CRASH = "import os; os.abort()"
 HANG = """
 import os, pathlib, sys, time
 pathlib.Path(sys.stdin.read()).write_text(str(os.getpid()))
-time.sleep(60)
+time.sleep(600)
 """
 
 
