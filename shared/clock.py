@@ -9,6 +9,7 @@ import time
 from collections import deque
 
 MEDIA_RATE_HZ = 16_000
+CLIENT_CLOCK_RATE = 1.01  # a client's clock may run this much faster
 MAX_GAP_S = 10.0  # longer gaps in media time have no frames
 MIN_STALL_S = 0.5  # a longer delay is a stall; a busy machine delays a process by less
 

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from aiohttp import WSMessage, WSMsgType
 
 from kouxing.services.gateway.audio.audio_input import MAX_QUEUED_BYTES, AudioInput
 from kouxing.services.gateway.messages.pcm_format import PcmFormat, check_text
@@ -25,7 +26,7 @@ class FakeSession:
 
     def __init__(self, frame_bytes: int, idle_limit_s: float) -> None:
         self.idle_limit_s = idle_limit_s
-        self.pcm = b""
+        self.pcm = bytearray()
         self.num_flushes = 0
         self._frame_bytes = frame_bytes
 
@@ -185,7 +186,36 @@ async def test_the_rate_limit_allows_a_burst_and_then_real_time() -> None:
     limit = RealTimeLimit()
     for _ in range(120):
         await limit.wait(0.05)
-    assert asyncio.get_running_loop().time() == pytest.approx(1.0, abs=0.01)
+    assert asyncio.get_running_loop().time() == pytest.approx(1.0, abs=0.1)
+
+
+class LiveClient:
+    """A WebSocket with half a second of audio and a command every half second."""
+
+    def __init__(self, num_chunks: int, chunk: bytes) -> None:
+        self._chunk = chunk
+        self._num_chunks = num_chunks
+        self._num_received = 0
+
+    async def receive(self) -> WSMessage:
+        num_chunks, is_command = divmod(self._num_received, 2)
+        if num_chunks == self._num_chunks:
+            return WSMessage(WSMsgType.CLOSE, None, None)
+        await asyncio.sleep(num_chunks / 2 - asyncio.get_running_loop().time())
+        self._num_received += 1
+        if is_command:
+            return WSMessage(WSMsgType.TEXT, '{"skip": 320}', None)
+        return WSMessage(WSMsgType.BINARY, self._chunk, None)
+
+
+@with_fake_time
+async def test_commands_and_a_fast_sound_card_do_not_delay_live_audio() -> None:
+    client = LiveClient(2001, bytes(2 * round(0.5 * 16000 * 1.008)))
+    async with audio_input(is_synthesized=False) as (audio, _):
+        async for message in audio.messages(cast(Any, client)):
+            if message.type is WSMsgType.BINARY:
+                await audio.push(message.data)
+    assert asyncio.get_running_loop().time() == pytest.approx(1000.0, abs=0.1)
 
 
 class FakeClient:

@@ -38,7 +38,8 @@ class AudioInput:
         self._encoding = EncodingCheck(pcm_format.num_channels) if is_pcm16 else None
         self._incomplete = b""  # part of a sample, or of a file's header
         self._drain_task: asyncio.Task[None] | None = None  # done when all audio is forwarded
-        self._rate_limit = RealTimeLimit()
+        self._audio_limit = RealTimeLimit()
+        self._command_limit = RealTimeLimit()
         self._queue = RealTimeQueue(session, pcm_format, keep_alive=is_synthesized)
 
     @contextlib.asynccontextmanager
@@ -76,7 +77,7 @@ class AudioInput:
             await self._queue.put(pcm)
         else:
             self.session.send(pcm, num_samples)
-            await self._rate_limit.wait(duration_s)
+            await self._audio_limit.wait(duration_s)
 
     def skip(self, num_samples: int) -> None:
         """Skip audio of the client after its audio so far: media time advances."""
@@ -110,7 +111,7 @@ class AudioInput:
             if message.type in _END_TYPES:
                 return
             if message.type is WSMsgType.TEXT:
-                await self._rate_limit.wait(COMMAND_S)
+                await self._command_limit.wait(COMMAND_S)
             yield message
 
 

@@ -8,8 +8,10 @@ from collections.abc import Iterator
 
 from aiohttp import web
 
+from kouxing.shared.clock import CLIENT_CLOCK_RATE
+
 BURST_S = 5.0  # allowed lead over real time; a network that stalled delivers a burst
-COMMAND_S = 0.05  # a command costs as much as this duration of audio
+COMMAND_S = 0.05  # a command uses this much of its limit
 
 
 class ConnectionQuota:
@@ -48,7 +50,7 @@ class ConnectionQuota:
 
 
 class RealTimeLimit:
-    """Limits one browser's data to real time, after an initial burst."""
+    """Limits one browser's data to real time on its clock, after an initial burst."""
 
     def __init__(self) -> None:
         self._used_until_s = 0.0  # when all data so far would end in real time
@@ -56,7 +58,7 @@ class RealTimeLimit:
     def admit(self, duration_s: float) -> bool:
         """Charge for data of a given duration; return False if it must be dropped instead."""
         now_s = asyncio.get_running_loop().time()
-        used_until_s = max(self._used_until_s, now_s) + duration_s
+        used_until_s = max(self._used_until_s, now_s) + duration_s / CLIENT_CLOCK_RATE
         if used_until_s > now_s + BURST_S:
             return False
         self._used_until_s = used_until_s
@@ -65,5 +67,5 @@ class RealTimeLimit:
     async def wait(self, duration_s: float) -> None:
         """Charge for data of a given duration; return when more may be read."""
         now_s = asyncio.get_running_loop().time()
-        self._used_until_s = max(self._used_until_s, now_s) + duration_s
+        self._used_until_s = max(self._used_until_s, now_s) + duration_s / CLIENT_CLOCK_RATE
         await asyncio.sleep(max(0.0, self._used_until_s - now_s - BURST_S))

@@ -15,7 +15,7 @@ from kouxing.services.recognizer.sessions.sound_messages import SoundMessages
 from kouxing.services.recognizer.sessions.synthesizer_link import SynthesizerLink
 from kouxing.shared.audio.encoding_check import EncodingCheck
 from kouxing.shared.audio.pcm import decode_pcm
-from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
+from kouxing.shared.clock import CLIENT_CLOCK_RATE, MAX_GAP_S, MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.peer import NO_PEER
@@ -43,8 +43,6 @@ STALLED_AFTER_S = 0.2  # a live client that sends no audio for this time has sta
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
 RESEND_WAIT_S = 1.0  # wait for resent audio; then the session continues after the gap
 M = TypeVar("M", bound=Message)
-
-_CLIENT_CLOCK_RATE = 1.01  # a client's clock may run this much faster
 
 
 class RecognizerSession:
@@ -322,7 +320,7 @@ class _LeadLimiter:
     def allows(self, begin_s: float, duration_s: float, now_s: float) -> bool:
         """Return whether audio is within the allowed lead, including the gap before it."""
         gap_s = 0.0 if self._end_s is None else max(0.0, begin_s - self._end_s)
-        passed_s = (now_s - self._updated_s) * _CLIENT_CLOCK_RATE
+        passed_s = (now_s - self._updated_s) * CLIENT_CLOCK_RATE
         lead_s = max(self._lead_s - passed_s, -MAX_LEAD_S) + duration_s
         lead_s += gap_s if gap_s <= MAX_GAP_S else 0.0
         if lead_s > MAX_LEAD_S:
