@@ -114,7 +114,7 @@ test("after a stall, the page is live within a second, however fast the delayed 
 
 /**
  * Let sound arrive in chunks of chunkMs, each within a share of its duration. Return how much sound
- * arrives too late to be played, ms, after the first 5 s.
+ * arrives too late to be played, ms, after the first 5 s and 4 chunks.
  */
 function streamChunks(playout, { chunkMs, share, forMs, pauseMs = 0 }) {
   let lostMs = 0;
@@ -125,7 +125,8 @@ function streamChunks(playout, { chunkMs, share, forMs, pauseMs = 0 }) {
       playout.soundArrived(nowMs, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
       if (ms >= 60) playout.frameArrived(nowMs, (ms - 60) * SAMPLES_PER_MS);
       playout.adjust(nowMs);
-      if (startMs > 5000) lostMs += Math.min(FRAME_MS, Math.max(0, nowMs - ms - playout.offsetMs));
+      const lateMs = Math.max(0, nowMs - ms - playout.offsetMs);
+      if (startMs > Math.max(5000, 4 * chunkMs)) lostMs += Math.min(FRAME_MS, lateMs);
     }
   }
   return lostMs;

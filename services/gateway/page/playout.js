@@ -180,12 +180,12 @@ export class Playout {
   #start(nowMs, frameOffsetMs, soundOffsetMs) {
     if (this.offsetMs === null) this.#startMs = nowMs;
     else if (nowMs - this.#startMs > START_MS) return;
-    if (!this.#hasLongChunks || this.#firstFrameMs === Infinity) {
-      this.#firstFrameMs = Math.min(this.#firstFrameMs, frameOffsetMs);
-    }
-    if (!this.#hasLongChunks || this.#firstSoundMs === Infinity) {
-      this.#firstSoundMs = Math.min(this.#firstSoundMs, soundOffsetMs);
-    }
+    const choose = (first, next) => (this.#hasLongChunks && first < Infinity ? first : Math.min(first, next));
+    const frameMs = choose(this.#firstFrameMs, frameOffsetMs);
+    const soundMs = choose(this.#firstSoundMs, soundOffsetMs);
+    if (frameMs === this.#firstFrameMs && soundMs === this.#firstSoundMs) return;
+    this.#firstFrameMs = frameMs;
+    this.#firstSoundMs = soundMs;
     const offsetMs = Math.max(...[this.#firstFrameMs, this.#firstSoundMs].filter(Number.isFinite));
     if (offsetMs === this.offsetMs) return;
     this.offsetMs = offsetMs;
