@@ -16,7 +16,9 @@ from kouxing.shared.errors import UserError
 
 LAST_FRAME_TIMEOUT_S = 1.5  # maximum wait for the last frame after the end of the audio
 LAST_PHONES_WAIT_S = 0.2  # wait for the last phones, which arrive separately from the last frame
-CONTROL_TIMEOUT_S = 3.0
+CONTROL_START_S = 3.0  # wait until control must have started
+# Control needs up to 5 s to open a session if it has just restarted, or if a service hangs.
+CONTROL_TIMEOUT_S = 10.0
 
 Warn = Callable[[str, str, str], None]  # reason, text, session
 
@@ -103,7 +105,7 @@ class AudioClient:
                 key=self._key,
                 insecure=self._key is None,
                 timeout_s=CONTROL_TIMEOUT_S,
-                start_s=CONTROL_TIMEOUT_S,
+                start_s=CONTROL_START_S,
             )
         self.num_opening += 1
         try:
