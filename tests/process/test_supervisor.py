@@ -26,7 +26,8 @@ class EndedProcess:
 
     is_unresponsive = False
 
-    def __init__(self, status: int, log: bytes = b"") -> None:
+    def __init__(self, status: int, log: bytes = b"", *, is_ready: bool = False) -> None:
+        self.is_ready = is_ready
         self.stderr = io.BytesIO(log)
         self._status = status
         self._was_read = threading.Event()
@@ -97,13 +98,31 @@ def test_a_service_whose_process_cannot_be_started_is_started_again_later(
     with pytest.raises(KeyError):
         watched.process("control")
     ended, cannot_start = output.getvalue().splitlines()
-    assert ended == "control ended with status 1; restarting it now"
+    assert ended == "control ended with status 1; restarting control now"
     assert cannot_start.startswith("control cannot start: Resource temporarily un")
     now_s += supervisor.MAX_BACKOFF_S
     watched.check()
     assert started == [100.0, 100.0, 100.0 + supervisor.MAX_BACKOFF_S]
     with pytest.raises(UserError, match=r"control cannot start; see .*/control\.log"):
         watched.check()
+
+
+def test_a_wrong_configuration_at_a_restart_is_reported_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    processes = [EndedProcess(1, is_ready=True), EndedProcess(USER_ERROR, WRONG_PORT)]
+    started = iter(processes)
+    output = io.StringIO()
+    watched = Supervisor([], tmp_path, Console(file=output), services=())
+    monkeypatch.setattr(supervisor, "ServiceProcess", lambda *_, **__: next(started))
+    monkeypatch.setattr(time, "monotonic", lambda: 100.0)
+    watched.start_service("gateway", {})
+    watched.check()
+    watched.check()
+    assert output.getvalue().splitlines() == [
+        "gateway ended with status 1; restarting gateway now",
+        "gateway.port: 0 is too small; restarting gateway in 0.2 s",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ class _Service:
     started_s: float = -math.inf
     restart_at_s: float = math.inf
     backoff_s: float = 0.0  # delay before the restart after an early crash
+    has_been_ready: bool = False  # one of its processes was ready
     is_restarting: bool = False  # restarted, but not ready yet
     error: str = ""  # error in the configuration that the process printed
 
@@ -141,7 +142,7 @@ class Supervisor:
     def wait(self) -> None:
         """Wait until ``stop`` is called.
 
-        Raises ``UserError`` if a service reports a wrong configuration.
+        Raises ``UserError`` if a service cannot start because of a wrong configuration.
         """
         self._stopping.wait()
         if self._failure is not None:
@@ -150,7 +151,7 @@ class Supervisor:
     def check(self) -> None:
         """Kill services that hang, and restart those that have ended.
 
-        Raises ``UserError`` if a service reports a wrong configuration.
+        Raises ``UserError`` if a service cannot start because of a wrong configuration.
         """
         now_s = time.monotonic()
         processes = self._processes()
@@ -215,6 +216,7 @@ class Supervisor:
 
     def _check_process(self, service: _Service, process: ServiceProcess, now_s: float) -> None:
         status = process.poll()
+        service.has_been_ready |= process.is_ready
         if status is None:
             if process.is_hung:
                 self._warn(f"{service.name} is not responding; killing it")
@@ -223,17 +225,20 @@ class Supervisor:
                 service.is_restarting = False
                 self._print(f"{service.name} is running again", "green")
             return
+        ended = f"{service.name} ended with status {status}"
         if status == USER_ERROR:
             if service.log_thread is not None:
                 service.log_thread.join()
-            raise UserError(service.error or f"{service.name} cannot start; see {service.log_path}")
+            ended = service.error or f"{service.name} cannot start; see {service.log_path}"
+            if not service.has_been_ready:
+                raise UserError(ended)
         service.process = None
         is_steady = now_s - service.started_s > STEADY_S
         wait_s = 0.0 if is_steady else service.backoff_s
         service.backoff_s = min(max(2 * wait_s, MIN_BACKOFF_S), MAX_BACKOFF_S)
         service.restart_at_s = now_s + wait_s
         when = f"in {wait_s:g} s" if wait_s else "now"
-        self._warn(f"{service.name} ended with status {status}; restarting it {when}")
+        self._warn(f"{ended}; restarting {service.name} {when}")
 
     def _start(self, service: _Service) -> None:
         process = service.process = ServiceProcess(
