@@ -53,11 +53,18 @@ SINE = 0.5 * np.sin(np.arange(32_000) * 0.1)
 
 @asynccontextmanager
 async def serve(uploads: UploadHandler) -> AsyncIterator[Post]:
+    async with serve_at_port(uploads) as (post, _):
+        yield post
+
+
+@asynccontextmanager
+async def serve_at_port(uploads: UploadHandler) -> AsyncIterator[tuple[Post, int]]:
     route = web.post("/upload", uploads.serve)
     runner = web.AppRunner(make_application(head="woman", routes=[route], access=AccessPolicy()))
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
-    address = f"http://127.0.0.1:{runner.addresses[0][1]}/upload"
+    port = runner.addresses[0][1]
+    address = f"http://127.0.0.1:{port}/upload"
     async with aiohttp.ClientSession() as http, asyncio.timeout(200):
 
         async def post(data: bytes | AsyncIterator[bytes] = b"abc", name: str = "") -> Answer:
@@ -67,7 +74,7 @@ async def serve(uploads: UploadHandler) -> AsyncIterator[Post]:
                 return answer.status, await answer.read(), warnings
 
         try:
-            yield post
+            yield post, port
         finally:
             await runner.cleanup()
 
@@ -225,3 +232,22 @@ async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch
         status, data, _ = await post(media_bytes("WAV", SINE), "a.wav")
         assert status == 413
         assert b"larger than" in data
+
+
+@async_test
+async def test_a_client_that_does_not_read_its_sound_does_not_block_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    handler = AudioUploadHandler()
+    long = media_bytes("FLAC", np.tile(SINE, 300))  # its WAV exceeds the buffers of a connection
+    async with serve_at_port(handler) as (post, port):
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1000)
+        head = f"POST /upload HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(long)}\r\n\r\n"
+        writer.write(head.encode() + long)
+        assert b" 200 " in await reader.readline()
+        assert (await post(media_bytes("WAV", SINE), "a.wav"))[0] == 200
+        monkeypatch.setattr(upload_handlers, "MAX_UNREAD_SOUNDS", 1)
+        assert await post(b"abc") == error(503, AudioUploadHandler.busy_text)
+        writer.transport.abort()
+        while (await post(media_bytes("WAV", SINE), "a.wav"))[0] != 200:
+            await asyncio.sleep(0.02)

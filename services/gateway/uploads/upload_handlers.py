@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import tempfile
+import weakref
 from abc import ABC, abstractmethod
 from asyncio import subprocess
 from collections.abc import Sequence
@@ -26,6 +27,7 @@ PRESENCE_CHECK_S = 0.5  # interval of checks whether the browser is still connec
 NICENESS = 19  # lowest priority, so that live streams do not suffer
 MAX_AUDIO_BYTES = 200 << 20
 DECODING_TIMEOUT_S = 60.0
+MAX_UNREAD_SOUNDS = 4  # decoded files that browsers have not read yet; each has up to 345 MB
 MAX_RECORDING_BYTES = 8 << 20
 LEARNING_TIMEOUT_S = 180.0
 REMARKS_HEADER = "Kouxing-Remarks"
@@ -125,8 +127,15 @@ class AudioUploadHandler(UploadHandler):
 
     busy_text = "another file is being read; try again in a few seconds"
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._unread: weakref.WeakSet[BinaryIO] = weakref.WeakSet()  # aiohttp closes each
+
     async def answer(self, request: web.Request) -> web.StreamResponse:
-        """Answer a file."""
+        """Answer a file. The browser reads the answer while other files are handled."""
+        if sum(not file.closed for file in self._unread) >= MAX_UNREAD_SOUNDS:
+            await discard_body(request)
+            return _upload_error(503, self.busy_text)
         try:
             with tempfile.TemporaryDirectory(prefix="kouxing-") as folder:
                 return await self._decode_upload(Path(folder), request)
@@ -137,7 +146,7 @@ class AudioUploadHandler(UploadHandler):
         name = _NOT_IN_NAMES.sub("_", request.query.get("name", ""))[-_MAX_NAME_CHARACTERS:].lstrip(
             "-. "
         )
-        source, target = folder / "in" / (name or "file"), folder / "out.wav"
+        source = folder / "in" / (name or "file")
         source.parent.mkdir()
         if not await asyncio.wait_for(_store(request, source), UPLOAD_TIMEOUT_S):
             await discard_body(request)
@@ -146,24 +155,20 @@ class AudioUploadHandler(UploadHandler):
             )
         # Python imports modules from the working folder, so the file must be in another folder
         command = (sys.executable, "-m", audio_decoder.__name__, str(source))
-        with target.open("wb") as output:
-            status, _, messages = await self.run(
-                request, command, DECODING_TIMEOUT_S, output=output
-            )
-        messages = messages.replace(f"{source.parent}/", "")
-        if status == USER_ERROR:
-            raise UserError(messages)
-        if status != 0:
-            LOG.error("decoding an audio file failed with status %d: %s", status, messages)
-            raise UserError(f"{source.name}: the file cannot be decoded; export it again")
+        with contextlib.ExitStack() as stack:
+            sound = stack.enter_context(tempfile.TemporaryFile(prefix="kouxing-"))
+            status, _, messages = await self.run(request, command, DECODING_TIMEOUT_S, output=sound)
+            messages = messages.replace(f"{source.parent}/", "")
+            if status == USER_ERROR:
+                raise UserError(messages)
+            if status != 0:
+                LOG.error("decoding an audio file failed with status %d: %s", status, messages)
+                raise UserError(f"{source.name}: the file cannot be decoded; export it again")
+            sound.seek(0)
+            self._unread.add(sound)
+            stack.pop_all()  # aiohttp closes the file
         headers = {"Content-Type": "audio/wav", REMARKS_HEADER: quote(messages)}
-        response = web.StreamResponse(headers=headers)
-        response.content_length = target.stat().st_size
-        await response.prepare(request)
-        with target.open("rb") as file:
-            while data := file.read(_READ_BYTES):
-                await response.write(data)
-        return response
+        return web.Response(body=sound, headers=headers)
 
 
 class LearnMouthHandler(UploadHandler):
