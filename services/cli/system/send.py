@@ -67,6 +67,7 @@ class _SessionFinder:
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
+        self._client.close()  # ends a request that control does not answer
         self._thread.join()
 
     def _run(self) -> None:
