@@ -80,7 +80,8 @@ class DriverConfig(HeadConfig):
     ] = "1280x720"
     """Size of the window and of videos, in pixels."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 25.0
-    """Images per second in the window and in videos."""
+    """Frames per second in videos and of the virtual camera. A window uses the display's refresh
+    rate."""
 
     @property
     def size_px(self) -> tuple[int, int]:
