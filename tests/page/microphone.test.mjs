@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { Microphone } from "../../services/gateway/page/microphone.js";
+import { SpeechControls } from "../../services/gateway/page/speech-controls.js";
 
 const FILE = { name: "speech.wav", size: 1 };
 
@@ -135,4 +136,54 @@ test("the browser's reason has no period of its own", async () => {
   const { microphone, states } = makeMicrophone();
   await microphone.start();
   assert.ok(states.some((text) => text.includes("not be found here. Close other programs")));
+});
+
+/** Return speech controls, their buttons by id, and a sound that is on. */
+function makeControls() {
+  const buttons = {};
+  const makeButton = () => ({ setAttribute() {} });
+  globalThis.document = { getElementById: (id) => (buttons[id] ??= makeButton()) };
+  const sound = {
+    isWanted: true,
+    get state() {
+      return this.isWanted ? "on" : "off";
+    },
+    async turnOn() {
+      this.isWanted = true;
+    },
+    turnOff() {
+      this.isWanted = false;
+    },
+  };
+  const ignore = () => {};
+  const handlers = { mouthProfile: () => "", language: () => "", lipModel: () => null, level: ignore };
+  const controls = new SpeechControls(sound, { ...handlers, error: ignore, session: ignore });
+  return { microphone: controls.microphone, buttons, sound };
+}
+
+test("sound that the user turns off stays off when the microphone or a file ends", async () => {
+  const { microphone, buttons, sound } = makeControls();
+  await microphone.startFile(FILE);
+  FakeWebSocket.newest.openSession("file");
+  assert.equal(sound.state, "on", "a file is audible");
+  buttons.sound.onclick();
+  microphone.stop();
+  assert.equal(sound.state, "off");
+
+  buttons.sound.onclick();
+  await microphone.start();
+  FakeWebSocket.newest.openSession("voice");
+  assert.equal(sound.state, "off", "the user's own voice is not audible");
+  buttons.sound.onclick();
+  buttons.sound.onclick();
+  microphone.stop();
+  assert.equal(sound.state, "off");
+});
+
+test("sound is turned on again after the microphone", async () => {
+  const { microphone, sound } = makeControls();
+  await microphone.start();
+  FakeWebSocket.newest.openSession("voice");
+  microphone.stop();
+  assert.equal(sound.state, "on");
 });

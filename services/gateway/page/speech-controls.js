@@ -45,7 +45,7 @@ export class SpeechControls {
       if (event.dataTransfer.files.length > 0) this.#speakFile(event.dataTransfer.files[0]);
     };
     element("sound").onclick = () => {
-      if (sound.state === "on") sound.turnOff();
+      if (sound.state === "on") this.#turnSoundOff();
       else this.turnSoundOn();
     };
   }
@@ -96,6 +96,12 @@ export class SpeechControls {
     this.unblockSound();
     this.#handlers.fileStarted();
     this.microphone.startFile(file);
+  }
+
+  /** Turn sound off for the user. It stays off when the microphone or the file ends. */
+  #turnSoundOff() {
+    this.#wasSoundWanted = false;
+    this.#sound.turnOff();
   }
 
   #mute() {
