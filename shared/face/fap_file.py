@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.files.output_file import open_output
+from kouxing.shared.files.output_file import open_output, path_as_text
 from kouxing.shared.files.user_file import read_file, split_lines
 
 _VERSION = "2.1"
@@ -119,7 +119,7 @@ def write_fap(path: Path, animation: FapAnimation) -> None:
             rows = [[*map(str, numbers), *row] for numbers, row in zip(high, rows, strict=True)]
     digits = [str(int(high is not None)) for high in (visemes, expressions)]
     mask = " ".join([*digits, *["1"] * 66])
-    name = " ".join(animation.name.split()) or "kouxing"
+    name = " ".join(path_as_text(animation.name).split()) or "kouxing"
     lines = [f"{_VERSION} {name} {animation.frame_rate_hz:.10g} {len(low)}"]
     for number, row in enumerate(rows):
         lines += [mask, f"{number} {' '.join(row)}"]

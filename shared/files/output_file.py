@@ -122,6 +122,11 @@ def write_private(path: Path, content: bytes) -> None:
         raise
 
 
+def path_as_text(path: Path | str) -> str:
+    """Return a path as text that a file can contain. Bytes that are not UTF-8 are replaced."""
+    return os.fsencode(path).decode("utf-8", "replace")
+
+
 def write_error(path: Path, error: Any) -> UserError:
     """Return the error for a file that cannot be written, from an ``OSError`` or FFmpeg's error."""
     if isinstance(error, FileNotFoundError):

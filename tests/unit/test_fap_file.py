@@ -1,5 +1,6 @@
 """Reading and writing .fap files and their variants."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,12 @@ def test_writes_visemes_and_expressions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.faps, faps)
     np.testing.assert_array_equal(again.visemes, visemes)
     np.testing.assert_array_equal(again.expressions, expressions)
+
+
+def test_writes_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"\xff.fap")
+    write_fap(path, FapAnimation(path.stem, 25.0, np.zeros((1, 68), np.float32)))
+    assert read_fap(path).name == "\ufffd"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import sys
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -98,6 +99,14 @@ def test_json_and_xml_have_the_same_cues(tmp_path: Path) -> None:
         {"start": float(cue.attrib["start"]), "end": float(cue.attrib["end"]), "value": cue.text}
         for cue in root.iterfind("mouthCues/mouthCue")
     ] == content["mouthCues"]
+
+
+def test_any_file_name_gives_valid_files() -> None:
+    source = Path(os.fsdecode(b"/\xff\x01.wav"))
+    content = json.loads(format_cues(".json", HI, "X", 0.47, source).encode())
+    assert content["metadata"]["soundFile"] == "/\ufffd\x01.wav"
+    root = ET.fromstring(format_cues(".xml", HI, "X", 0.47, source).encode())  # noqa: S314 - our own
+    assert root.findtext("metadata/soundFile") == "/\ufffd\ufffd.wav"
 
 
 def test_no_switch_of_moho_follows_the_end_of_the_recording(

@@ -7,6 +7,7 @@ end of the recording, with the mouth at rest.
 
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 
 from kouxing.services.cli.options import CurveFormat
 from kouxing.shared.face.mouth_shapes import CLOSED, REST, SILENCE, Cue, mouth_cues, oculus_cues
+from kouxing.shared.files.output_file import path_as_text
 
 Frames: TypeAlias = Iterable[tuple[float, NDArray[np.float32]]]  # times in seconds, FAPs (68,)
+_NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 _Span: TypeAlias = tuple[str, str, str]  # start, end, and the mouth between them
 
 
@@ -62,9 +65,10 @@ def _format_xml(spans: Sequence[_Span], _: str, source: Path | None) -> str:
         f'    <mouthCue start="{start}" end="{end}">{mouth}</mouthCue>\n'
         for start, end, mouth in spans
     )
+    name = _NOT_IN_XML.sub("\ufffd", escape(_name(source)))
     return (
         '<?xml version="1.0" encoding="utf-8"?>\n<rhubarbResult>\n  <metadata>\n'
-        f"    <soundFile>{escape(_name(source))}</soundFile>\n"
+        f"    <soundFile>{name}</soundFile>\n"
         f"    <duration>{spans[-1][1]}</duration>\n  </metadata>\n"
         f"  <mouthCues>\n{cues}  </mouthCues>\n</rhubarbResult>\n"
     )
@@ -83,7 +87,7 @@ def _format_json(spans: Sequence[_Span], _: str, source: Path | None) -> str:
 
 
 def _name(source: Path | None) -> str:
-    return "" if source is None else str(source.absolute())
+    return "" if source is None else path_as_text(source.absolute())
 
 
 CUE_FORMATS: dict[str, Callable[[Sequence[_Span], str, Path | None], str]] = {
