@@ -134,10 +134,12 @@ def test_the_microphone_continues_in_a_new_session_after_the_gateway_crashed(
 def test_the_script_in_the_documentation_speaks_over_webrtc(browser: Browser) -> None:
     (script,) = code_blocks(WEBRTC_PAGE, "js")
     browser.evaluate("window.logged = []; console.log = (value) => window.logged.push(value)")
+    browser.evaluate("window.errors = []; onerror = (text) => void window.errors.push(text)")
     result = browser.command(
         "Runtime.evaluate", expression=script, replMode=True, awaitPromise=True
     )
     assert "exceptionDetails" not in result, result
     browser.wait_for("window.logged.some((value) => value > 0.1)")
     browser.wait_for("window.logged.filter((value) => typeof value === 'string').length > 5")
+    assert browser.evaluate("window.errors") == []
     browser.evaluate("peer.close()")
