@@ -7,6 +7,7 @@ README of Rhubarb Lip Sync 1.13, "Command-line options" and "Machine-readable st
 import argparse
 import io
 import json
+import math
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import redirect_stderr
@@ -127,7 +128,9 @@ def _moho_switches(cues: Iterable[Cue], rate_hz: float, names: dict[str, str]) -
 
     If several mouths start in a frame, the last one counts.
     """
-    mouths = {1 + int(rate_hz * start_s): names.get(mouth, mouth) for start_s, mouth in cues}
+    mouths = {
+        1 + math.floor(rate_hz * start_s + 1e-6): names.get(mouth, mouth) for start_s, mouth in cues
+    }
     return "MohoSwitch1\n" + "".join(f"{frame} {mouth}\n" for frame, mouth in mouths.items())
 
 

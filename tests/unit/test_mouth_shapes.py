@@ -120,6 +120,16 @@ def test_no_switch_of_moho_follows_the_end_of_the_recording(
     assert capsys.readouterr().out == "MohoSwitch1\n1 X\n6 C\n10 X\n"
 
 
+def test_a_switch_of_moho_at_the_start_of_a_frame_belongs_to_this_frame(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [(number / 50, OPEN if number >= 58 else REST) for number in range(100)]
+    motion = FaceMotion(frames, 50.0, 25.0, samples=np.zeros(2 * MEDIA_RATE_HZ, np.float32))
+    monkeypatch.setattr(rhubarb, "_animate", lambda _: motion)
+    rhubarb.main(["-q", "-f", "dat", "--datFrameRate", "25", "said.wav"])
+    assert capsys.readouterr().out == "MohoSwitch1\n1 X\n30 C\n51 X\n"
+
+
 @pytest.mark.slow
 def test_the_command_line_equals_rhubarbs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
