@@ -147,6 +147,21 @@ test("sound that arrives in long chunks is played from their start", () => {
   }
 });
 
+test("a machine that stalls often is not taken for a sender of long chunks", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 5000 });
+  const beforeMs = playout.delayMs;
+  for (let startMs = 5000; startMs < 20000; startMs += 2000) {
+    const endMs = startMs + 600; // of a stall
+    for (let ms = startMs; ms < endMs; ms += FRAME_MS) {
+      playout.soundArrived(endMs, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
+      playout.frameArrived(endMs, (ms - 60) * SAMPLES_PER_MS);
+    }
+    stream(playout, { fromMs: endMs, forMs: 1400 });
+    assert.ok(Math.abs(playout.delayMs - beforeMs) <= 30, `${playout.delayMs}`);
+  }
+});
+
 test("another session starts without the delay of long chunks", () => {
   const playout = new Playout();
   streamChunks(playout, { chunkMs: 1000, share: 0.2, forMs: 10000 });

@@ -21,7 +21,8 @@ const RESTART_ERROR_MS = 300; // a stream that is late or early by more than thi
 const RESTART_LATE_FOR_MS = 100; // … after it was late for this long; less than the delay, so that no sound is lost
 const RESTART_EARLY_FOR_MS = 300; // … or early for this long
 const BURST_MS = 1000; // maximum duration of a burst of data that was delayed or is sent in long chunks
-const NUM_BURSTS = 2; // in WINDOW_MS; a sender with more of them sends long chunks
+const NUM_BURSTS = 2; // with nothing between them; a sender of so many sends long chunks
+const BURST_GAP_MS = 100; // if frames arrive later than this after a burst, the sender does not send long chunks
 const RESTART_EARLY_WITH_LONG_CHUNKS_MS = 3000; // longer than a chunk, whose end is early
 const START_MS = 300; // time at the start in which the earliest arrivals set the offset
 const MAX_BEHIND_MS = 3000; // restart immediately if media time jumps ahead by more than this
@@ -55,8 +56,8 @@ class Streak {
  * by at most 5 ms per second, and the sound follows by resampling. Only if the error exceeds 30 ms,
  * half of it is corrected immediately, every half second. So one bad second does not cause a jump. After a
  * stall, the delayed data arrives in a burst. The burst is not measured, so the page is live when it ends.
- * If bursts recur, the sender sends long chunks. Then all data is measured, and the offset is that of the
- * start of a chunk, which arrives latest.
+ * If nothing arrives between bursts, the sender sends long chunks. Then all data is measured, and the offset
+ * is that of the start of a chunk, which arrives latest.
  */
 export class Playout {
   isAudible = true;
@@ -73,7 +74,8 @@ export class Playout {
   #lateSound;
   #earlyFrames;
   #burst = null; // { sinceMs, offsetMs: the offset before it } of frames, until the frames are on time again
-  #burstEnds = new SlidingWindow(WINDOW_MS);
+  #numBursts = 0; // with nothing between them
+  #burstEndMs = 0; // end of the last one
   #hasLongChunks = false;
 
   constructor() {
@@ -83,7 +85,7 @@ export class Playout {
   /** Start again with another session. */
   reset() {
     this.#burst = null;
-    this.#burstEnds.reset();
+    this.#numBursts = 0;
     this.#hasLongChunks = false;
     this.#restart();
   }
@@ -192,15 +194,23 @@ export class Playout {
     this.#forgetArrivals();
   }
 
-  /** Count the bursts of frames: they start late and end on time. After a pause, the stream stays late. */
+  /**
+   * Count the bursts of frames: they start late and end on time. After a pause, the stream stays late. On a
+   * busy machine, frames also arrive between the bursts.
+   */
   #countBursts(nowMs, latenessMs) {
     if (this.#burst !== null) {
       const hasEnded = latenessMs <= this.#burst.offsetMs;
-      if (hasEnded) this.#burstEnds.add(nowMs, latenessMs);
-      if (this.#burstEnds.count >= NUM_BURSTS) this.#hasLongChunks = true;
+      if (hasEnded) {
+        this.#numBursts++;
+        this.#burstEndMs = nowMs;
+      }
+      if (this.#numBursts >= NUM_BURSTS) this.#hasLongChunks = true;
       if (hasEnded || nowMs - this.#burst.sinceMs > BURST_MS) this.#burst = null;
     } else if (this.offsetMs !== null && latenessMs > this.offsetMs + RESTART_ERROR_MS) {
       this.#burst = { sinceMs: nowMs, offsetMs: this.offsetMs };
+    } else if (nowMs - this.#burstEndMs > BURST_GAP_MS) {
+      this.#numBursts = 0;
     }
   }
 
