@@ -323,8 +323,12 @@ export class LipSync extends EventTarget {
 
   #onVisibility = () => {
     if (this.#source === null) return;
-    if (document.hidden) this.#report(TEXTS.hidden);
-    else this.#resumeContext();
+    if (document.hidden) {
+      this.#report(TEXTS.hidden);
+      return;
+    }
+    this.#onContextState(); // a context that ran all the time reports no change
+    this.#resumeContext();
   };
 
   #resumeContext = () => {

@@ -409,6 +409,19 @@ test("a click or a visible tab has no effect if the page has closed its context"
   assert.equal(context.resume.mock.callCount(), 2);
 });
 
+test("the notice about a tab in the background disappears when the tab is visible", async () => {
+  const lips = await LipSync.create({ context });
+  await followMicrophone(lips);
+  const notices = [];
+  lips.addEventListener("notice", ({ detail }) => notices.push(detail));
+  for (const hidden of [true, false]) {
+    globalThis.document.hidden = hidden;
+    globalThis.document.dispatchEvent(new Event("visibilitychange"));
+  }
+  assert.match(notices[0], /in the background/);
+  assert.deepEqual(notices.slice(1), [""]);
+});
+
 test("HeadAudio loads its models once if loadModel() is called twice", async () => {
   globalThis.GainNode = class extends AudioNode {
     context = context;
