@@ -24,7 +24,7 @@ async function cachedResponse(request) {
   const cache = await caches.open(VERSION);
   const cached = await cache.match(request, { ignoreSearch: true });
   if (cached) return cached;
-  const response = await fetch(request);
-  if (response.ok) await cache.put(request, response.clone());
+  const response = await fetch(request); // with status 206 for a part of a file, which cannot be cached
+  if (response.status === 200) await cache.put(request, response.clone());
   return response;
 }
