@@ -87,6 +87,42 @@ def texture_of_an_extension(document: dict[str, Any], _binary: bytearray) -> Non
         del texture["source"]
 
 
+def texture_of_an_unknown_extension(document: dict[str, Any], _binary: bytearray) -> None:
+    document["images"].append({"bufferView": 0, "mimeType": "image/ktx2"})
+    other = {"source": len(document["images"]) - 1}
+    for texture in document["textures"]:
+        texture["extensions"] = {"KHR_texture_basisu": other}
+
+
+def several_scenes(document: dict[str, Any], _binary: bytearray) -> None:
+    document["scenes"].insert(0, {"nodes": [len(document["nodes"])]})
+    document["nodes"].append({"name": "empty"})
+    document["scene"] = 1
+
+
+def nothing_to_draw(document: dict[str, Any], _binary: bytearray) -> None:
+    document["meshes"][0]["primitives"].append({"attributes": {}})
+
+
+def sparse_shapes(document: dict[str, Any], binary: bytearray) -> None:
+    """Store only the vertices that a shape moves."""
+    for mesh in document["meshes"]:
+        for target in mesh["primitives"][0].get("targets", []):
+            _, shifts = content(document, binary, target["POSITION"], "<f4")
+            moved = np.flatnonzero(shifts.any(axis=1))
+            views = document["bufferViews"]
+            for data in (moved.astype("<u4").tobytes(), shifts[moved].tobytes()):
+                views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+                binary += data
+            accessor = document["accessors"][target["POSITION"]]
+            del accessor["bufferView"]
+            accessor["sparse"] = {
+                "count": len(moved),
+                "indices": {"bufferView": len(views) - 2, "componentType": 5125},
+                "values": {"bufferView": len(views) - 1},
+            }
+
+
 def null_binds(document: dict[str, Any], _binary: bytearray) -> None:
     groups = [{"name": "happy", "presetName": "joy", "binds": None}]
     document["extensions"] = {"VRM": {"blendShapeMaster": {"blendShapeGroups": groups}}}
@@ -168,6 +204,7 @@ def _replace_by_compressed(
     [
         *(names_in_primitives, names_in_accessors, no_scenes, one_eye_mirrored, lights),
         *(texture_of_an_extension, null_binds, data_uri, draco),
+        *(texture_of_an_unknown_extension, several_scenes, nothing_to_draw, sparse_shapes),
         partial(draco, create_metadata=True),
         partial(compress_with_meshopt, "NONE", "TRIANGLES"),
         partial(compress_with_meshopt, "EXPONENTIAL", "INDICES"),

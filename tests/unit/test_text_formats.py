@@ -211,6 +211,23 @@ def test_a_sentence_may_start_like_a_format_in_lower_case() -> None:
     assert extract_text(sentence) == (sentence, "")
 
 
+@pytest.mark.parametrize("line_end", ["\n", "\r\n", "\r", "\r\r\n"])
+def test_line_ends_do_not_matter(line_end: str) -> None:
+    for name, text in TEXTS.items():
+        changed = text.replace("\r\n", "\n").replace("\n", line_end)
+        assert extract_text(changed) == extract_text(text), name
+
+
+def test_the_frame_rate_of_microdvd_is_not_spoken() -> None:
+    assert extract_text("{1}{1}23.976\n{10}{75}Hello\n")[0] == "Hello\n"
+    assert extract_text("{1}{75}12\n{80}{150}13")[0] == "12\n13"
+
+
+def test_invisible_characters_do_not_divide_a_word() -> None:
+    words = read_transcript("\ufeffre\u00adcord\u200bing", load_inventory("english")).syllables
+    assert [word.text for word in words] == ["recording"]
+
+
 def test_text_next_to_the_times_of_a_cue_is_spoken() -> None:
     cues = "00:00.400 --> 00:01.000 align:start line:80%\nHello\n\n0:01 --> 0:02 Anna: hi\n"
     assert extract_text(cues)[0] == "Hello\nAnna: hi"

@@ -25,6 +25,7 @@ _MAX_LRC_CHARACTERS = 8 << 20  # a short text may repeat a long line thousands o
 _LRC_FIELD = re.compile(r"\[[A-Za-z#]+:[^\]]*\]")
 LYRICS_TIME = r"\[\d+,\d+\]"
 FRAME_NUMBERS = r"(?:\{\d+\}\{\d*\}|\[\d+\]\[\d*\])"
+_FRAME_RATE = re.compile(r"\A\{[01]\}\{[01]\}[\d.]+[ \t]*(?:\n|$)")  # the first line of some files
 
 
 def read_cues(text: str) -> str:
@@ -95,7 +96,7 @@ def read_timed_lyrics(text: str) -> str:
 
 def read_frame_timed_subtitles(text: str) -> str:
     """Extract the text from MicroDVD or MPL2."""
-    words = re.sub(rf"^{FRAME_NUMBERS}", "", text, flags=re.MULTILINE)
+    words = re.sub(rf"^{FRAME_NUMBERS}", "", _FRAME_RATE.sub("", text, 1), flags=re.MULTILINE)
     return _BRACES.sub("", words).replace("|", "\n")
 
 

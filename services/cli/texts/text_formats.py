@@ -19,6 +19,7 @@ _UNSUPPORTED_TEXTS = {  # text files without an extractor, by their first charac
     "\\documentclass": "a LaTeX document",
     "\\version": "a LilyPond file",
 }
+_INVISIBLE = re.compile("[\u00ad\u200b\u2060\ufeff]")  # places where a word may break, or may not
 _LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
 
 
@@ -28,7 +29,8 @@ def extract_text(text: str, *, is_markdown: bool = False) -> tuple[str, str]:
     Raises ``UserError`` if the text has a format whose spoken text cannot be extracted; the message
     names it.
     """
-    text = text.lstrip("\ufeff \t\r\n").replace("\r\n", "\n").replace("\r", "\n")
+    text = _INVISIBLE.sub("", text).lstrip()
+    text = re.sub(r"\r*\n|\r", "\n", text)  # some programs convert line ends twice
     for beginning, name in _UNSUPPORTED_TEXTS.items():
         if text.startswith(beginning):
             raise UserError(f"this is {name}; keep only the spoken text")

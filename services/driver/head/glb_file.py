@@ -229,9 +229,10 @@ class GlbFile:
     def image(self, texture: object) -> bytes:
         """Return the encoded image of a texture, or nothing if it is not in the file."""
         entry = self.item("textures", texture)
-        source = entry.get("source")
-        for extension in entry.get("extensions", {}).values():
-            source = extension.get("source", source)
+        extensions = entry.get("extensions", {}).values()
+        # Most programs read only the plain source, so an extension may have any other format.
+        sources = [item["source"] for item in (entry, *extensions) if "source" in item]
+        source = next(iter(sources), None)
         if source is None:
             return b""
         image = self.item("images", source)

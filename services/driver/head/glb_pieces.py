@@ -42,8 +42,8 @@ def read_pieces(glb: GlbFile) -> list[MeshPiece]:
         mesh = glb.item("meshes", node["mesh"])
         binds = expressions[f"node {number}"] + expressions[f"mesh {node['mesh']}"]
         for primitive in mesh["primitives"]:
-            if primitive.get("mode", 4) < 4:
-                continue  # points and lines
+            if primitive.get("mode", 4) < 4 or "POSITION" not in primitive["attributes"]:
+                continue  # points, lines, or nothing
             count = int(glb.item("accessors", primitive["attributes"]["POSITION"])["count"])
             num_vertices += count
             num_shifts += count * (len(primitive.get("targets", [])) + len(binds))
