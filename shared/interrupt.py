@@ -48,6 +48,22 @@ def catch_interrupt() -> Iterator[None]:
         clear_interrupt()
 
 
+@contextlib.contextmanager
+def delay_interrupt() -> Iterator[None]:
+    """Delay ``KeyboardInterrupt`` by 0.5 s, so that the block can end between two items of work.
+
+    The block calls ``is_interrupted`` after each item, and raises the exception itself.
+    """
+    if not _is_installed():
+        yield
+        return
+    earlier = signal.signal(signal.SIGINT, _start_timer)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, earlier)
+
+
 def _print_error(kind: type[BaseException], *rest: Any) -> None:
     if not issubclass(kind, KeyboardInterrupt):
         sys.__excepthook__(kind, *rest)
@@ -58,8 +74,12 @@ def _print_unraisable(error: Any) -> None:
         sys.__unraisablehook__(error)
 
 
-def _interrupt(*_: object) -> None:
+def _start_timer(*_: object) -> None:
     signal.setitimer(signal.ITIMER_REAL, _REPEAT_S, _REPEAT_S)
+
+
+def _interrupt(*_: object) -> None:
+    _start_timer()
     raise KeyboardInterrupt
 
 

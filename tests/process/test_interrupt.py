@@ -43,6 +43,23 @@ with catch_interrupt():
     signal.raise_signal(signal.SIGINT)
 print(signal.getitimer(signal.ITIMER_REAL))
 """
+INTERRUPT_IN_EXPORTER = """
+from kouxing.services.cli.system.follow import _iter_until_interrupt
+class Frames:
+    has_ended = False
+    def get(self, timeout_s):
+        return "frame"
+frames = []
+for frame in _iter_until_interrupt(Frames(), "s"):
+    frames.append(frame)
+    if len(frames) == 3:
+        signal.raise_signal(signal.SIGINT)
+print(*frames, signal.getitimer(signal.ITIMER_REAL))
+try:
+    signal.raise_signal(signal.SIGINT)
+except KeyboardInterrupt:
+    print("raised while the file is written")
+"""
 # `CTRL_C_COMMAND` runs as the command line, with Ctrl-C in a function that FFmpeg calls.
 INTERRUPT_IN_FFMPEG = """
 import signal
@@ -134,6 +151,13 @@ PREAMBLES = {
 def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) -> None:
     process = start_python("-c", INSTALL + program)
     assert process.communicate(timeout=LIMIT_S) == (printed, "")
+
+
+def test_ctrl_c_while_a_frame_is_exported_keeps_all_frames() -> None:
+    process = start_python("-c", INSTALL + INTERRUPT_IN_EXPORTER)
+    printed, log = process.communicate(timeout=LIMIT_S)
+    assert printed == "frame frame frame (0.0, 0.0)\nraised while the file is written\n"
+    assert log == "following session s\n"
 
 
 @pytest.mark.parametrize("place", PREAMBLES)

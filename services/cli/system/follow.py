@@ -23,12 +23,13 @@ from kouxing.shared.command.terminal import CONSOLE, plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
 from kouxing.shared.face.mouth_shapes import mouth_cues
-from kouxing.shared.interrupt import catch_interrupt
+from kouxing.shared.interrupt import catch_interrupt, delay_interrupt, is_interrupted
 from kouxing.shared.phones import events
 from kouxing.shared.phones.alphabets import Alphabet, respell
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllable_captions import SyllableCaptions
 
+INTERRUPT_POLL_S = 0.1
 OPEN_POLL_S = 0.05  # the services repeat what they published shortly before
 PRINTED_FAPS = (3, 4, 5, 6, 16, 17)  # jaw, lips, lip corner, protrusion
 LEGEND = "columns: time, then FAPs " + ", ".join(f"{n} {FAPS[n - 1].name}" for n in PRINTED_FAPS)
@@ -108,10 +109,20 @@ def _wait_for_session(name: str, client: Client) -> Session:
 
 
 def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
-    """Yield results until the session ends or the user interrupts."""
+    """Yield results until the session ends or the user interrupts.
+
+    An interrupt takes effect between two results, so the caller can write what it has received.
+    """
     print_message(f"following session {session}")
-    with catch_interrupt():
-        yield from results
+    with catch_interrupt(), delay_interrupt():
+        while not is_interrupted():
+            has_ended = results.has_ended
+            result = results.get(INTERRUPT_POLL_S)
+            if result is not None:
+                yield result
+            elif has_ended:
+                return
+        raise KeyboardInterrupt
 
 
 def _syllable_lines(phones: Iterable[events.Phone], inventory: PhoneInventory) -> Iterator[str]:
