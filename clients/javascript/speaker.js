@@ -36,8 +36,9 @@ export class Speaker {
     };
     this.#closed = new Promise((resolve) => {
       socket.onclose = ({ code, reason }) => {
-        if (code === POLICY_VIOLATION) this.#failure = lastError;
-        else if (!this.#isClosing && !NORMAL_CODES.includes(code)) {
+        if (code === POLICY_VIOLATION) {
+          this.#failure = lastError ?? new Error(reason || "the gateway has ended the session; open another one");
+        } else if (!this.#isClosing && !NORMAL_CODES.includes(code)) {
           this.#failure ??= new Error(reason || "the connection to the gateway is lost; open another session");
         }
         onClosed(this.#failure);
@@ -72,9 +73,14 @@ export class Speaker {
         if (type === "opened") resolve(new Speaker(socket, session, encoding, error, closed));
         else reject(new Error(text));
       };
-      // Node 22 reports a failed connection only as an error.
+      // Node 22 reports a failed connection only as an error. A WebSocket does not have the reason.
       socket.onerror = socket.onclose = () => {
-        reject(new Error(`no gateway at ${gateway}; start it with: kouxing run`));
+        reject(
+          new Error(
+            `cannot connect to the gateway at ${gateway}. Start it with: kouxing run. If it is running, it rejects` +
+              " the token, the page's origin (gateway.trusted_origins), or more microphones",
+          ),
+        );
       };
     });
   }

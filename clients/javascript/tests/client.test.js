@@ -89,7 +89,7 @@ test("samples are converted at the services' full scale, also those of another r
 
 test("a rejected session reports the reason", async () => {
   await assert.rejects(Speaker.open(GATEWAY, { sampleRateHz: 1000 }), /sample_rate_hz must be/);
-  await assert.rejects(Speaker.open("http://127.0.0.1:1"), /no gateway at .*kouxing run/);
+  await assert.rejects(Speaker.open("http://127.0.0.1:1"), /cannot connect .*kouxing run.*token/);
 });
 
 test("a session continues after an error, unless the gateway closes the connection", async () => {
@@ -132,6 +132,11 @@ test("a session continues after an error, unless the gateway closes the connecti
     await reopening;
     socket.onclose({ code: 1006, reason: "" }); // the gateway was killed
     assert.equal(texts.at(-1), "the connection to the gateway is lost; open another session");
+    const rejected = Speaker.open(GATEWAY);
+    socket.receive({ type: "opened", session: "voice" });
+    const ending = (await rejected).finish();
+    socket.onclose({ code: 1008, reason: "" });
+    await assert.rejects(ending, /the gateway has ended the session; open another one/);
     const last = Speaker.open(GATEWAY, { closed: (error) => texts.push(error) });
     socket.receive({ type: "opened", session: "voice" });
     (await last).close();
@@ -180,7 +185,7 @@ test("older versions of Node get an error", async () => {
         queueMicrotask(() => this.onerror()); // as in Node 22, without onclose
       }
     };
-    await assert.rejects(Speaker.open(GATEWAY), /no gateway at .*kouxing run/);
+    await assert.rejects(Speaker.open(GATEWAY), /cannot connect .*kouxing run.*token/);
     globalThis.WebSocket = undefined; // as in Node 20
     await assert.rejects(Speaker.open(GATEWAY), /needs Node 22 or newer/);
     assert.throws(() => new Viewer(GATEWAY, {}), /needs Node 22 or newer/);
