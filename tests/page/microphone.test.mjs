@@ -138,6 +138,38 @@ test("the browser's reason has no period of its own", async () => {
   assert.ok(states.some((text) => text.includes("not be found here. Close other programs")));
 });
 
+test("a microphone that cannot be captured is reported and released", async () => {
+  let numClosed = 0;
+  globalThis.AudioContext = class extends globalThis.AudioContext {
+    close() {
+      numClosed++;
+    }
+    createMediaStreamSource = () => {
+      throw new Error("different sample-rate is currently not supported."); // Firefox, above 48 kHz
+    };
+  };
+  const { microphone, states } = makeMicrophone();
+  await microphone.start();
+  assert.ok(!microphone.isActive);
+  assert.equal(states.at(-1), "off");
+  assert.ok(states.some((text) => text.includes("different sample-rate")));
+  assert.equal(numClosed, 1);
+});
+
+test("the end of an abandoned microphone does not stop a newer one", async () => {
+  const track = { stop() {} };
+  navigator.mediaDevices.getUserMedia = async () => ({ getTracks: () => [track] });
+  const { microphone, states } = makeMicrophone();
+  const abandoned = microphone.start();
+  await Promise.resolve();
+  const { onended } = track;
+  const newer = microphone.start();
+  await Promise.all([abandoned, newer]);
+  onended();
+  assert.ok(microphone.isActive);
+  assert.equal(states.at(-1), "starting");
+});
+
 /** Return speech controls, their buttons by id, and a sound that is on. */
 function makeControls() {
   const buttons = {};

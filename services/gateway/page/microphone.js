@@ -50,13 +50,13 @@ export class Microphone {
   }
 
   start() {
-    return this.#startFrom(async (source) => {
+    return this.#startFrom(async (source, run) => {
       if (!navigator.mediaDevices) throw new UserError(translate("microphoneInsecure"));
       source.stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
       });
       for (const track of source.stream.getTracks()) {
-        track.onended = () => this.#fail(translate("microphoneUnplugged"));
+        track.onended = () => this.#run === run && this.#fail(translate("microphoneUnplugged"));
       }
       source.context = await openCaptureContext();
     });
@@ -73,7 +73,7 @@ export class Microphone {
     }, true);
   }
 
-  /** Open a source with open(source) and stream it, unless it is stopped in the meantime. */
+  /** Open a source with open(source, run) and stream it, unless it is stopped in the meantime. */
   async #startFrom(open, isFile = false) {
     this.stop();
     const run = { isFile, hasPlayed: false };
@@ -82,7 +82,8 @@ export class Microphone {
     const source = { stream: null, context: null, fileSpeech: null };
     let problem = null;
     try {
-      await open(source);
+      await open(source, run);
+      if (this.#run === run) this.#capture(source);
     } catch (error) {
       problem = problemText(error);
     }
@@ -93,11 +94,14 @@ export class Microphone {
       return;
     }
     ({ stream: this.#stream, context: this.#context, fileSpeech: this.#fileSpeech } = source);
-    capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
+    this.#connect();
+  }
+
+  #capture({ context, stream }) {
+    capture(context, stream, (chunk, rms, recordedMs) => {
       this.#handlers.level(rms);
       this.#uplink?.send(performance.now(), recordedMs, chunk);
     });
-    this.#connect();
   }
 
   stop() {
