@@ -138,6 +138,20 @@ test("the browser's reason has no period of its own", async () => {
   assert.ok(states.some((text) => text.includes("not be found here. Close other programs")));
 });
 
+test("errors of a file do not mention the microphone", async () => {
+  const { microphone, states } = makeMicrophone();
+  const withBody = (arrayBuffer) => async () => ({ ok: true, headers: new Map(), arrayBuffer });
+  globalThis.fetch = withBody(async () => {
+    throw new TypeError("network error");
+  });
+  await microphone.startFile(FILE);
+  assert.ok(states.includes("Cannot play the file: network error. Try again, or choose another file."));
+  globalThis.fetch = withBody(async () => new ArrayBuffer(0));
+  await microphone.startFile(FILE);
+  FakeWebSocket.newest.onclose();
+  assert.ok(states.includes("The gateway closed the connection. Choose the file again."));
+});
+
 test("a microphone that cannot be captured is reported and released", async () => {
   let numClosed = 0;
   globalThis.AudioContext = class extends globalThis.AudioContext {

@@ -7,7 +7,7 @@ import { errorToChinese, toChinese } from "../../services/gateway/page/gateway-t
 import { isOutOfSync, senderText } from "../../services/gateway/page/senders-panel.js";
 import { GatewayState } from "../../services/gateway/page/gateway-state.js";
 import { PersistentFault } from "../../services/gateway/page/notice.js";
-import { stateKey } from "../../services/gateway/page/status-bar.js";
+import { StatusBar, stateKey } from "../../services/gateway/page/status-bar.js";
 import {
   delayText,
   drawingText,
@@ -126,6 +126,39 @@ test("a hint names the problem and the remedy", () => {
     hintText({ ...well, missing: ["recognizer", "synthesizer"] }),
     /recognizer, synthesizer.*kouxing recognizer; kouxing synthesizer/,
   );
+});
+
+/** Interrupt a source for 2 s; return the hint in the meantime and the toast after it. */
+function interrupt(isFile) {
+  const { performance } = globalThis;
+  const shown = {};
+  const speech = { state: "interrupted", session: "voice", microphone: { isFile } };
+  const bar = new StatusBar({
+    gateway: Object.assign(new GatewayState(), { isConnected: true, session: "voice" }),
+    player: { activity: { isLive: () => false }, lateness: { update() {} }, playout: {}, voiceToImageMs: null },
+    speech,
+    sound: { state: "off" },
+    notice: { showHint: (text) => (shown.hint ||= text), showToast: (text) => (shown.toast = text) },
+    senders: {},
+  });
+  globalThis.document = { getElementById: () => ({ dataset: {} }) };
+  globalThis.location = { hostname: "localhost" };
+  for (const nowMs of [0, 2000, 2100]) {
+    globalThis.performance = { now: () => nowMs };
+    if (nowMs > 2000) speech.state = "on";
+    bar.show();
+  }
+  Object.assign(globalThis, { performance });
+  delete globalThis.document;
+  delete globalThis.location;
+  return shown;
+}
+
+test("the hint about an interruption names its source", () => {
+  assert.match(interrupt(false).hint, /microphone/i);
+  assert.match(interrupt(false).toast, /microphone/i);
+  assert.match(interrupt(true).hint, /The file continues/);
+  assert.equal(interrupt(true).toast, "The file is playing again.");
 });
 
 test("a rejected connection stays rejected until the page connects", () => {

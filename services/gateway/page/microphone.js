@@ -85,7 +85,7 @@ export class Microphone {
       await open(source, run);
       if (this.#run === run) this.#capture(source);
     } catch (error) {
-      problem = problemText(error);
+      problem = problemText(error, isFile);
     }
     if (this.#run !== run || problem !== null) release(source);
     if (this.#run !== run) return;
@@ -173,7 +173,7 @@ export class Microphone {
       this.#handlers.error(refusal);
       this.stop();
     } else {
-      this.#fail(translate("microphoneStopped"));
+      this.#fail(translate(this.isFile ? "fileStopped" : "microphoneStopped"));
     }
   }
 
@@ -183,10 +183,11 @@ export class Microphone {
   }
 }
 
-function problemText(error) {
+function problemText(error, isFile) {
   if (error instanceof UserError) return error.message;
   if (error.name === "NotAllowedError") return translate("microphoneForbidden");
-  return translate("microphoneFailed", { reason: error.message.replace(/\.$/, "") }); // Firefox writes a period
+  const reason = error.message.replace(/\.$/, ""); // Firefox writes a period
+  return translate(isFile ? "fileFailed" : "microphoneFailed", { reason });
 }
 
 function release({ stream, context }) {

@@ -20,7 +20,7 @@ export class StatusBar {
   #parts;
   #wasLive = false; // in the session that is shown
   #fault = new PersistentFault();
-  #microphoneFault = new PersistentFault();
+  #sourceFault = new PersistentFault(); // of the microphone or the file
 
   /** @param parts { gateway, player, speech, sound, notice, senders }: sources of the state */
   constructor(parts) {
@@ -38,9 +38,9 @@ export class StatusBar {
     const nowMs = performance.now();
     const isLive = isConnected && player.activity.isLive(nowMs);
     this.#wasLive ||= isLive;
-    const isMicrophoneInterrupted = speech.state === "interrupted";
+    const isSourceInterrupted = speech.state === "interrupted";
     const isStalled = this.#wasLive && session !== null && session === speech.session;
-    const isInterrupted = isMicrophoneInterrupted || isStalled;
+    const isInterrupted = isSourceInterrupted || isStalled;
     player.lateness.update(nowMs, isLive && session !== null);
     const isBehind = isLive && player.lateness.isBehind;
     const state = stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted });
@@ -61,10 +61,13 @@ export class StatusBar {
     setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
     senders.frameWaitMs = frameMs;
     const fault = this.#fault.update(nowMs, hintText(gateway));
-    const pause = isMicrophoneInterrupted ? translate("microphoneInterrupted") : "";
-    const microphone = this.#microphoneFault.update(nowMs, pause);
+    const { isFile } = speech.microphone;
+    const pause = translate(isFile ? "fileInterrupted" : "microphoneInterrupted");
+    const source = this.#sourceFault.update(nowMs, isSourceInterrupted ? pause : "");
     if (fault.isOver) notice.showToast(translate("recovered"), "hint");
-    if (microphone.isOver && speech.state === "on") notice.showToast(translate("microphoneResumed"), "hint");
-    notice.showHint(fault.hint || microphone.hint);
+    if (source.isOver && speech.state === "on") {
+      notice.showToast(translate(isFile ? "fileResumed" : "microphoneResumed"), "hint");
+    }
+    notice.showHint(fault.hint || source.hint);
   }
 }

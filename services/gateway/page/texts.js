@@ -72,6 +72,11 @@ export const TEXTS = {
     zh: "没有运行：{services}。kouxing run 会自动重启服务；否则请运行：{commands}",
   },
   microphoneInterrupted: { en: "The microphone was interrupted. It resumes by itself.", zh: "麦克风中断，会自动恢复。" },
+  fileInterrupted: {
+    en: "The connection was interrupted. The file continues automatically.",
+    zh: "连接中断，文件会自动继续播放。",
+  },
+  fileResumed: { en: "The file is playing again.", zh: "文件已恢复播放。" },
   microphoneResumed: { en: "The microphone is on again.", zh: "麦克风已恢复。" },
   recovered: { en: "Everything is running again.", zh: "已全部恢复运行。" },
   serviceRestarted: { en: "A service crashed and was restarted. The session continues.", zh: "一个服务崩溃后已重启，会话继续。" },
@@ -104,6 +109,14 @@ export const TEXTS = {
   microphoneStopped: {
     en: "The gateway closed the connection. Press Microphone to try again.",
     zh: "网关关闭了连接。请再按“麦克风”重试。",
+  },
+  fileFailed: {
+    en: "Cannot play the file: {reason}. Try again, or choose another file.",
+    zh: "无法播放文件：{reason}。请重试，或选择其他文件。",
+  },
+  fileStopped: {
+    en: "The gateway closed the connection. Choose the file again.",
+    zh: "网关关闭了连接。请重新选择文件。",
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
   noSpeech: {
