@@ -25,7 +25,7 @@ from kouxing.services.gateway.uploads.upload_handlers import (
     UploadHandler,
 )
 from kouxing.services.gateway.web.access import AccessPolicy
-from kouxing.services.gateway.web.web_application import make_application
+from kouxing.services.gateway.web.web_application import discard_body, make_application
 from tests.process.web_clients import async_test
 
 REVERSE = """
@@ -232,6 +232,37 @@ async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch
         status, data, _ = await post(media_bytes("WAV", SINE), "a.wav")
         assert status == 413
         assert b"larger than" in data
+
+
+@pytest.mark.parametrize(
+    ("limit", "text"),
+    [
+        (
+            "UPLOAD_TIMEOUT_S",
+            "the file did not arrive within 0 s; use a smaller file or a faster connection",
+        ),
+        ("DECODING_TIMEOUT_S", "reading the file took too long; use a shorter file"),
+    ],
+)
+@async_test
+async def test_a_slow_upload_differs_from_slow_decoding(
+    monkeypatch: pytest.MonkeyPatch, limit: str, text: str
+) -> None:
+    monkeypatch.setattr(upload_handlers, limit, 0.0)
+    is_discarded = asyncio.Event()
+
+    async def body() -> AsyncIterator[bytes]:
+        yield b"a"
+        if limit == "UPLOAD_TIMEOUT_S":
+            await is_discarded.wait()
+
+    async def discard(request: web.Request) -> None:
+        is_discarded.set()
+        await discard_body(request)
+
+    monkeypatch.setattr(upload_handlers, "discard_body", discard)
+    async with serve(AudioUploadHandler()) as post:
+        assert await post(body(), "a.wav") == error(408, text)
 
 
 @async_test

@@ -51,6 +51,7 @@ const CHINESE = {
     "{place} 秒附近有无效采样，请重新导出，例如 16 位 PCM",
   "the audio is longer than {hours} h; use a shorter file": "声音长于 {hours} 小时，请用较短的文件",
   "another file is being read; try again in a few seconds": "正在读取另一个文件，请几秒后重试",
+  "the file did not arrive within {limit} s; use a smaller file or a faster connection": "文件未在 {limit} 秒内传完，请用较小的文件或更快的网络",
   "the file is larger than {size} MiB; use a smaller one": "文件大于 {size} MiB，请用较小的文件",
   "this is a big-endian WAV file; export it as wav or flac": "这是大端序的 WAV 文件，请导出为 wav 或 flac",
   "the file cannot be decoded; export it again": "文件无法解码，请重新导出",

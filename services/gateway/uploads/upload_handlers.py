@@ -148,7 +148,16 @@ class AudioUploadHandler(UploadHandler):
         )
         source = folder / "in" / (name or "file")
         source.parent.mkdir()
-        if not await asyncio.wait_for(_store(request, source), UPLOAD_TIMEOUT_S):
+        try:
+            is_complete = await asyncio.wait_for(_store(request, source), UPLOAD_TIMEOUT_S)
+        except TimeoutError:
+            await discard_body(request)
+            return _upload_error(
+                408,
+                f"the file did not arrive within {UPLOAD_TIMEOUT_S:g} s; use a smaller file or a"
+                " faster connection",
+            )
+        if not is_complete:
             await discard_body(request)
             return _upload_error(
                 413, f"the file is larger than {MAX_AUDIO_BYTES >> 20} MiB; use a smaller one"
@@ -196,6 +205,7 @@ class LearnMouthHandler(UploadHandler):
                 413, f"the recording is larger than {MAX_RECORDING_BYTES >> 20} MiB"
             )
         except TimeoutError:
+            await discard_body(request)
             return _upload_error(408, f"the recording did not arrive within {UPLOAD_TIMEOUT_S:g} s")
         try:
             status, profile, messages = await self.run(
