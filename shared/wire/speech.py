@@ -35,7 +35,10 @@ class AcousticModelName(StrEnum):
 
 
 class Acoustic(RegisteredMessage, frozen=True, kw_only=True):
-    """The acoustic model that finds the phones from now on. Repeated when speech starts."""
+    """The acoustic model that finds the phones from now on.
+
+    Repeated when speech starts, and after a move to another recognizer.
+    """
 
     published_at: ClassVar[str] = "phones"
 

@@ -242,6 +242,18 @@ def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
         assert [message["session"] for message in texts(viewer)] == [None]
 
 
+def test_a_session_keeps_its_acoustic_model_when_it_moves() -> None:
+    viewers = make_viewers()
+    with viewers.connect_viewer("", None) as viewer:
+        viewers.add_session("talk", 1, FaceSettings(), "zh")
+        viewers.announce_acoustic_model("talk", "light")
+        viewers.add_session("talk", 2, FaceSettings(), "zh")
+        viewers.remove_session("talk")
+        viewers.add_session("talk", 1, FaceSettings(), "zh")
+        models = [message["acoustic"] for message in texts(viewer) if message.get("session")]
+    assert models == ["full", "light", "full"]
+
+
 @pytest.mark.parametrize(
     ("command", "error"),
     [

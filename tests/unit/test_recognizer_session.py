@@ -156,6 +156,16 @@ def test_reports_the_acoustic_model_in_use() -> None:
     assert reported[1][0] == 8
 
 
+@pytest.mark.parametrize(("epoch", "models"), [(1, []), (2, ["full"])])
+def test_a_recognizer_reports_its_acoustic_model_after_a_move(
+    epoch: int, models: list[str]
+) -> None:
+    silence = Speech(media_time=0, active=False)
+    session = make_session(epoch)
+    published = [message for _ in range(2) for message in session.published_messages([silence])]
+    assert [m.model for m in published if isinstance(m, Acoustic)] == models
+
+
 @pytest.mark.parametrize("acoustic", AcousticModelName)
 def test_the_first_message_after_a_lost_recognizer_is_speech(acoustic: AcousticModelName) -> None:
     start = replace(with_opening(START, sample_rate_hz=16_000), epoch=2, final_until=16_000)

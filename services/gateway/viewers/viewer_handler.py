@@ -86,7 +86,10 @@ class ViewerHandler:
 
     def add_session(self, session: str, epoch: int, face: FaceSettings, language: str) -> None:
         """Announce a session to its viewers, or its new epoch."""
-        self._sessions[session] = _ShownSession(epoch, face, language)
+        known = self._sessions.get(session)
+        self._sessions[session] = shown = _ShownSession(epoch, face, language)
+        if known is not None:  # a recognizer that did not move does not repeat its model
+            shown.acoustic = known.acoustic
         self._notify_viewers()
 
     def change_face(self, session: str, change: FaceSettings) -> None:

@@ -105,7 +105,8 @@ class RecognizerSession:
         self.acknowledged_s = 0.0
         self.speech_time = start.speech_time  # start of the current speech; None: silence
         self.is_laughing = False  # whether the speaker laughs
-        self._published_acoustic = AcousticModelName.FULL
+        # None after a move: the recognizer before may have published another model
+        self._published_acoustic = AcousticModelName.FULL if start.epoch <= 1 else None
         self._sound_messages = SoundMessages(face_delay_s)
         is_checked = opening.encoding == "s16le" and start.epoch <= 1
         self._encoding = EncodingCheck(opening.num_channels) if is_checked else None
