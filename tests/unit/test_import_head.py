@@ -9,6 +9,7 @@ import pytest
 
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.head.import_head import import_head
+from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
 from kouxing.shared.errors import UserError
 from tests import heads
 from tests.glb_writer import write_glb
@@ -155,6 +156,7 @@ def swapped_points(*names: str) -> str:
         ("2.1 0 0", "line 1: expected 'point x y z' or 'point vertex'"),
         ("# good\n2.1 0 0 x", "line 2: .* invalid number"),
         ("2.1 nan 0 0", "line 1: expected"),
+        ("2.1 inf", "line 1: expected"),
         ("99.1 0 0 0", "'99.1' is not an MPEG-4 feature point"),
         ("2.1 0 0 0\n2.1 0 0 0", "line 2: 2.1 occurs twice"),
         ("2.1 1000000", "vertex 1000000, but the last vertex is"),
@@ -182,6 +184,17 @@ PLY = (
 LARGE = "".join(f"v {n} {n % 2} 0\n" for n in range(65_538)) + "".join(
     f"f {n} {n + 1} {n + 2}\n" for n in range(1, 65_538, 3)
 )
+
+
+@pytest.mark.parametrize(
+    "change", [("\n", "\r\n"), ("\n", "\r"), ("v 1", "v \\\n1"), ("", "\ufeff")]
+)
+def test_reads_obj_files_of_other_programs(tmp_path: Path, change: tuple[str, str]) -> None:
+    text, path = f"{TRIANGLE}f 1 2 3\n", tmp_path / "face.obj"
+    path.write_bytes(text.replace(*change, 4 if change[0] else 1).encode())
+    pieces = read_mesh(path)
+    for vertices in (pieces[0].vertices, numbered_vertices(path, pieces)[0]):
+        assert vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ def _parse_lines(path: Path, text: str) -> FeaturePoints:
             raise UserError(f"{where}: {line.strip()!r} contains an invalid number") from None
         if len(values) == 3 and all(map(math.isfinite, values)):
             positions[name] = np.array(values)
-        elif len(values) == 1 and values[0] >= 0 and values[0] == int(values[0]):
+        elif len(values) == 1 and values[0] >= 0 and values[0].is_integer():
             positions[name] = ("", int(values[0]))
         else:
             raise UserError(f"{where}: expected 'point x y z' or 'point vertex'")

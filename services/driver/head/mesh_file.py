@@ -1,5 +1,6 @@
 """Reads the pieces of a user's mesh file (OBJ, PLY or GLB) in common axes."""
 
+import codecs
 import io
 import warnings
 from pathlib import Path
@@ -46,7 +47,7 @@ def read_mesh(path: Path) -> list[MeshPiece]:
 
 def _load_meshes(path: Path, suffix: str) -> list[Any]:
     """Read the meshes of an OBJ or PLY file, with the materials and images that it names."""
-    content = read_file(path, MAX_MESH_BYTES)
+    content = _read_obj(path) if suffix == ".obj" else read_file(path, MAX_MESH_BYTES)
     if content.count(b" ") + content.count(b"\n") > MAX_WORDS:  # trimesh would need minutes
         raise UserError(f"{path} has more than {MAX_WORDS} words; decimate the mesh")
     files = _NamedFiles(str(path))
@@ -58,6 +59,12 @@ def _load_meshes(path: Path, suffix: str) -> list[Any]:
     if files.error is not None:
         raise files.error
     return list(scene.dump())
+
+
+def _read_obj(path: Path) -> bytes:
+    """Return an OBJ file without a byte order mark; each statement is on one line."""
+    content = read_file(path, MAX_MESH_BYTES).removeprefix(codecs.BOM_UTF8)
+    return content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ")
 
 
 class _NamedFiles(trimesh.resolvers.FilePathResolver):
@@ -134,8 +141,7 @@ def numbered_vertices(mesh: Path, pieces: list[MeshPiece]) -> tuple[Float64, dic
         return np.concatenate([p.vertices for p in pieces]), {p.name: p.vertices for p in pieces}
     rows: list[list[float]] = []
     starts: dict[str, int] = {}
-    text = read_file(mesh, MAX_MESH_BYTES).decode("utf-8", "replace")
-    for line in io.StringIO(text, None):
+    for line in _read_obj(mesh).decode("utf-8", "replace").split("\n"):
         words = line.split()
         if words[:1] == ["v"]:
             try:
