@@ -212,4 +212,5 @@ def _usage_text(error: Any) -> str:
     if group and any(option in parameter.opts for parameter in group.command.params):
         path = group.command_path
         return f"{option} is an option of {path}; write {path} {option} {error.ctx.info_name}"
-    return problem and f"{problem[0].lower()}{problem[1:]}; see {command} -h"
+    link = " See" if problem.endswith("?") else "; see"  # click asks "Did you mean ...?"
+    return problem and f"{problem[0].lower()}{problem[1:]}{link} {command} -h"

@@ -72,6 +72,7 @@ def test_a_group_without_a_command_lists_its_commands(group: str) -> None:
     [
         ("train gmm --any-license", "train --any-license gmm"),
         ("listen --as words", "'--as': 'words' is not one of 'faps'"),
+        ("spek a.wav", "no such command 'spek'. Did you mean 'speak'? See "),
     ],
 )
 def test_explains_a_wrong_option(arguments: str, message: str) -> None:
