@@ -29,11 +29,11 @@ class FakeSession:
     is_closed = False
 
     def __init__(self, error: KouxingError | None = None) -> None:
-        self.num_flushes = self.num_packets = 0
+        self.num_flushes = self.num_packets = self.num_skipped = 0
         self._error = error
 
     def skip(self, num_frames: int) -> None:
-        pass
+        self.num_skipped += num_frames
 
     def send(self, pcm: bytes, num_frames: int) -> None:
         if self._error is not None:
@@ -67,7 +67,7 @@ class FakeChannel:
 
 
 class FakePeer:
-    """A connection that ends after a number of packets of 1 s."""
+    """A connection that ends after a number of packets of 1 s; 160 samples are lost before each."""
 
     rate_hz = 16_000
 
@@ -76,7 +76,7 @@ class FakePeer:
 
     async def receive_audio(self) -> AsyncIterator[tuple[int, bytes, int]]:
         for _ in range(self._num_packets):
-            yield 0, bytes(32_000), 16_000
+            yield 160, bytes(32_000), 16_000
 
 
 @pytest.fixture
@@ -111,6 +111,7 @@ async def test_audio_faster_than_real_time_is_dropped_after_a_burst(handler: Whi
     client = _Client(cast("Any", FakePeer(1000)), None)
     await handler._stream(client, session, contextlib.AsyncExitStack())
     assert session.num_packets == BURST_S
+    assert session.num_skipped == 1000 * 160  # media time includes all lost audio
 
 
 @with_fake_time

@@ -152,9 +152,9 @@ class WhipHandler:
             LOG.info("a WebRTC client is streaming", extra={"session": session.name})
             try:
                 async for num_lost, pcm, num_samples in client.peer.receive_audio():
+                    session.skip(num_lost)
                     if not rate_limit.admit(num_samples / client.peer.rate_hz):
                         continue  # a client cannot be slowed down
-                    session.skip(num_lost)
                     session.send(pcm, num_samples)
                     for error in session.take_errors():
                         self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
