@@ -120,8 +120,10 @@ class AudioClient:
         try:
             yield opened
         finally:
-            await opened.finish(LAST_FRAME_TIMEOUT_S)
-            del self._open[opened.name]
+            try:
+                await opened.finish(LAST_FRAME_TIMEOUT_S)
+            finally:  # also if this task is cancelled
+                del self._open[opened.name]
 
     async def close(self) -> None:
         """Disconnect from control."""
