@@ -32,6 +32,9 @@ class EndedProcess:
         self._status = status
         self._was_read = threading.Event()
 
+    def kill(self) -> None:
+        """Do nothing."""
+
     def read_heartbeats(self) -> None:
         """Do nothing."""
 
@@ -74,22 +77,33 @@ def test_a_gateway_that_stops_after_its_start_is_an_error(
         started.page_address("tcp://127.0.0.1:1")
 
 
-def test_a_service_whose_process_cannot_be_started_is_started_again_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("missing", "reason"),
+    [("process", "Resource temporarily un"), ("thread", "can't start new thread")],
+)
+def test_a_service_whose_process_or_thread_cannot_be_started_is_started_again_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str, reason: str
 ) -> None:
     now_s, started = 100.0, list[float]()
+    run_thread = threading.Thread.start
 
     def start_process(*_: object, **__: object) -> EndedProcess:
         started.append(now_s)
-        if len(started) == 2:
+        if len(started) == 2 and missing == "process":
             raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         if len(started) == 1:
             return EndedProcess(1, b"control: an error of the first process\n")
         return EndedProcess(USER_ERROR)
 
+    def start_thread(thread: threading.Thread) -> None:
+        if len(started) == 2 and missing == "thread":
+            raise RuntimeError("can't start new thread")
+        run_thread(thread)
+
     output = io.StringIO()
     watched = Supervisor([], tmp_path, Console(file=output), services=())
     monkeypatch.setattr(supervisor, "ServiceProcess", start_process)
+    monkeypatch.setattr(threading.Thread, "start", start_thread)
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
     watched.start_service("control", {})
     watched.check()
@@ -99,7 +113,7 @@ def test_a_service_whose_process_cannot_be_started_is_started_again_later(
         watched.process("control")
     ended, cannot_start = output.getvalue().splitlines()
     assert ended == "control ended with status 1; restarting control now"
-    assert cannot_start.startswith("control cannot start: Resource temporarily un")
+    assert cannot_start.startswith(f"control cannot start: {reason}")
     now_s += supervisor.MAX_BACKOFF_S
     watched.check()
     assert started == [100.0, 100.0, 100.0 + supervisor.MAX_BACKOFF_S]

@@ -4,6 +4,7 @@ The packages supervisor and honcho are not used, because they do not detect a pr
 """
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -255,7 +256,13 @@ class Supervisor:
         service.log_thread = threading.Thread(
             target=self._copy_log_until_end, args=(service, process), daemon=True
         )
-        service.log_thread.start()
+        try:
+            service.log_thread.start()
+        except RuntimeError as error:  # too many threads
+            process.kill()
+            process.wait()
+            service.process = None
+            raise OSError(errno.EAGAIN, str(error)) from error
 
     def _copy_log_until_end(self, service: _Service, process: ServiceProcess) -> None:
         """Copy a service's log until it ends, then wake the watcher."""
