@@ -81,7 +81,7 @@ test: .venv/installed-dev setup $(COMPILED) $(LIPS_MODELS) \
 	$(STAGES) $(TEST_STAGES)
 
 test-python:
-	$(PYTEST) -n 4 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder
 
 test-page:
 	$(NPM) $(PAGE) test
