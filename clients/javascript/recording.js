@@ -18,7 +18,7 @@ const DAY_S = 86400;
  */
 export function readRecording(content) {
   const text = typeof content === "string" ? content.replace(/^\uFEFF/, "") : decodeText(new Uint8Array(content));
-  const lines = text.split(/\r?\n/).filter((line) => /[^ ,;\t]/.test(line) && !line.startsWith("sep=")); // "sep=" is from Excel
+  const lines = text.split(/\r\n|\r|\n/).filter((line) => /[^ ,;\t]/.test(line) && !line.startsWith("sep=")); // "sep=" is from Excel
   if (lines.length === 0) throw new Error("the recording is empty; record it again");
   const recording = lines[0].startsWith("{") ? readJsonLines(lines) : readCsv(lines.map(removeQuotes));
   if (recording.frames.length === 0) throw new Error("the recording has no frames with a face; record it again");
@@ -62,7 +62,7 @@ function readJsonLines(lines) {
         names = Array.isArray(object[set]) ? null : Object.keys(object[set]);
       }
       const values = names === null ? object[set] : names.map((name) => object[set][name]);
-      return [object.time_s * RATE_HZ, Float32Array.from(values)];
+      return [object.time_s * RATE_HZ, Float32Array.from(values, (value) => value ?? NaN)];
     } catch {
       throw new Error(`line ${number + 1} of the recording is not a frame with time_s and the values of a face; record it again`);
     }
@@ -89,7 +89,7 @@ function readCsv(lines) {
   if (timeColumn < 0) throw new Error("the recording has no times; add a column time_s or Timecode");
   const isTake = titles[timeColumn].toLowerCase() === "timecode";
   const columns = titles.flatMap((title, column) =>
-    column === timeColumn || /^(phone|blendshapecount)$/i.test(title) ? [] : [column],
+    column === timeColumn || /^(|sequence|phone|blendshapecount)$/i.test(title) ? [] : [column],
   );
   const names = columns.map((column) =>
     isTake ? titles[column][0].toLowerCase() + titles[column].slice(1) : titles[column],
