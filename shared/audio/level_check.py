@@ -7,6 +7,7 @@ from kouxing.shared.audio.phase_cancellation import Samples
 _CLIPPED_LEVEL = 0.999
 _CLIPPED_FRACTION = 0.01  # warn if a larger fraction of the samples is clipped
 _OFFSET_FRACTION = 0.1  # warn above this fraction of the power; usual recordings are below 0.001
+_MIN_SAMPLES = 1000  # a shorter recording may be a part of one period, whose mean is not 0
 _INAUDIBLE_OFFSET = 0.001  # never warn up to this offset, which silent recordings may have
 
 
@@ -35,7 +36,8 @@ class LevelCheck:
             )
         offset = self._sum / num_samples
         if (
-            abs(offset) > _INAUDIBLE_OFFSET
+            num_samples >= _MIN_SAMPLES
+            and abs(offset) > _INAUDIBLE_OFFSET
             and offset**2 > _OFFSET_FRACTION * self._squares / num_samples
         ):
             warnings.append(

@@ -105,6 +105,14 @@ def test_warns_about_the_level(
     assert bool(printed) == bool(warning)
 
 
+def test_a_short_sound_has_no_constant_offset(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    soundfile.write(tmp_path / "a.wav", [0.25], 16000)
+    assert len(read_mono_16k(tmp_path / "a.wav")) == 1
+    assert capsys.readouterr().err == ""
+
+
 @pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24"])
 @pytest.mark.parametrize(
     ("riff_bytes", "data_bytes"),
