@@ -48,7 +48,7 @@ def measure_latency(
     json_file: JsonFile = None,
     force: Force = False,
 ) -> None:
-    """Measure latency, CPU time and images per second of the whole pipeline on this machine.
+    """Measure latency, CPU time and frames per second of the whole pipeline on this machine.
 
     If Chromium is installed, the page is also measured. --language applies only to latency.
     """

@@ -147,7 +147,7 @@ class ExportOptions:
     size: str = "1280x720"
     background: str = "studio"
     camera: Framing = Framing.FACE
-    rate_hz: float | None = None  # images per second; None: the default of the motion
+    rate_hz: float | None = None  # frames per second; None: the default of the motion
     at_s: float | None = None  # time of a single picture
     sound: Path | None = None  # sound to add to curves
     captions: CaptionKind | None = None

@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         rate_hz = options.datFrameRate
         if options.exportFormat == "dat" and not 10.0 <= rate_hz <= 100.0:
-            raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 images per second")
+            raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 frames per second")
         _report(options, "start", f"reading {options.input}", file=options.input)
         motion = _animate(options)
         _report(options, "progress", "finished", value=1.0)
@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--language", default=AUTO, help="language of the speech, such as en or zh; not in Rhubarb")
     add("--extendedShapes", default="GHX", help="which of the mouths G, H and X you have drawn")
     add(
-        "--datFrameRate", type=float, default=24.0, help="images per second of dat files, 10 to 100"
+        "--datFrameRate", type=float, default=24.0, help="frames per second of dat files, 10 to 100"
     )
     add(
         "--datUsePrestonBlair",

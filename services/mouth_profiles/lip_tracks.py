@@ -16,7 +16,7 @@ MEASURES = ("opening", "width", "jaw")
 LEVEL_STEP_S = 0.02
 
 _MAX_GAP_S = 0.1  # longer gaps between tracked frames are not interpolated
-_MAX_SLOW_GAP_S = 0.3  # the same for cameras with few images per second
+_MAX_SLOW_GAP_S = 0.3  # the same for cameras with few frames per second
 _JITTER = 1.3  # multiple of the interval between images
 _SIDES = [[MOUTH_FAPS.index(fap), MOUTH_FAPS.index(OTHER_SIDE.get(fap, fap))] for fap in LIP_FAPS]
 _JAW, _UPPER_LIP, _LOWER_LIP, _CORNER = (LIP_FAPS.index(fap) for fap in (3, 4, 5, 6))

@@ -130,7 +130,7 @@ def render(
     rate: Annotated[
         float | None,
         typer.Option(
-            min=1, max=240, help="Images per second. Default: 25, or the rate of the curves."
+            min=1, max=240, help="Frames per second. Default: 25, or the rate of the curves."
         ),
     ] = None,
     captions: Annotated[
