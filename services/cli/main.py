@@ -180,7 +180,7 @@ def main() -> None:
 def _run_command() -> None:
     try:
         if "" in sys.argv[1:]:
-            raise UserError("an argument is empty; check the variables in your command")
+            raise UserError("an argument is empty; perhaps a shell variable is not set")
         # app() would replace sys.excepthook
         status = typer.main.get_command(app)(prog_name="kouxing", standalone_mode=False)
     except UserError as error:

@@ -94,8 +94,8 @@ class Placement:
             required = 100 * min_room * load.cost
             left = 100 * max(0.0, self._max_load - load.expected(now_s))
             text = (
-                f"every {kind} is busy: {required:.0f} % of its time must be free, "
-                f"but only {left:.0f} % is; try again in {RETRY_AFTER_S:g} s"
+                f"every {kind} is busy: a session needs {required:.0f} % of one, "
+                f"but at most {left:.0f} % is free; try again in {RETRY_AFTER_S:g} s"
             )
             raise Rejected(ErrorCode.BUSY, text, RETRY_AFTER_S)
         return best

@@ -204,7 +204,7 @@ test("texts of the gateway are translated with their values", () => {
   assert.equal(
     errorToChinese(
       "busy",
-      "every recognizer is busy: 38 % of its time must be free, but only 5 % is; try again in 2 s",
+      "every recognizer is busy: a session needs 38 % of one, but at most 5 % is free; try again in 2 s",
     ),
     "所有 recognizer 都忙：需要 38% 的空闲时间，只剩 5%；请 2 秒后重试",
   );

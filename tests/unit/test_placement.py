@@ -99,7 +99,7 @@ def test_refuses_a_session_without_room_and_says_when_to_try_again(cluster: Clus
         open_at(cluster, 0.0)
     for instance in WORKERS:
         measure(cluster, instance, 0.75 if "recognizer" in instance else 0.1, 5.0)
-    text = "every recognizer is busy: 38 % of its time must be free, but only 5 % is"
+    text = "every recognizer is busy: a session needs 38 % of one, but at most 5 % is free"
     with pytest.raises(Rejected, match=text) as caught:
         open_at(cluster, 5.0)
     assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
@@ -114,7 +114,7 @@ def test_unpaced_sessions_of_one_key_leave_room_for_another_client(cluster: Clus
     opening, greedy = OpenSession(request="r", paced=False), Peer(b"a", "greedy")
     for _ in range(14):  # seven of the eight for which each recognizer has room
         cluster.sessions.open(opening, greedy, 0.0)
-    with pytest.raises(Rejected, match=r"20 % of its time must be free, but only 10 % is"):
+    with pytest.raises(Rejected, match=r"needs 20 % of one, but at most 10 % is free"):
         cluster.sessions.open(opening, greedy, 0.0)
     assert cluster.sessions.open(opening, Peer(b"b", "other"), 0.0)
 

@@ -72,8 +72,8 @@ def test_finds_no_system_with_other_keys(tmp_path: Path, monkeypatch: pytest.Mon
         assert control_address("") == "tcp://127.0.0.1:1 own"
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "third"))
         text = (
-            "your kouxing is not running on this machine; start it with 'kouxing run'. A system"
-            rf" with other keys runs at .*tcp://127.0.0.1:5550 \(keys: {others}/kouxing\)"
+            "kouxing is not running on this machine for this user; start it with 'kouxing run'. A"
+            rf" system with other keys runs at .*tcp://127.0.0.1:5550 \(keys: {others}/kouxing\)"
             ".*XDG_STATE_HOME.*--control or KOUXING_CONTROL"
         )
         with pytest.raises(UserError, match=text):
@@ -85,7 +85,7 @@ def test_finds_no_system_with_other_keys(tmp_path: Path, monkeypatch: pytest.Mon
     [
         (
             "",
-            r"your kouxing is not running .*, or set --control .*\. Tried: no answer",
+            r"kouxing is not running .*, or set --control .*\. Tried: no answer",
         ),
         ("tcp://127.0.0.1:5550", "^no answer"),
     ],

@@ -79,7 +79,7 @@ def run(
     ] = 1,
     assignments: Assignments = None,
 ) -> None:
-    """Run all services on this machine, and restart any that crashes or hangs."""
+    """Run all services on this machine, and restart any that crash or hang."""
     from kouxing.services.cli.launch.supervisor import Supervisor
 
     if play is None:

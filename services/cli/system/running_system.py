@@ -172,7 +172,7 @@ def running_systems() -> list[RunningSystem]:
 
 
 def _not_running_text(others: Sequence[RunningSystem]) -> str:
-    text = "your kouxing is not running on this machine; start it with 'kouxing run'"
+    text = "kouxing is not running on this machine for this user; start it with 'kouxing run'"
     if not others:
         text += ", or set --control or KOUXING_CONTROL to the address of control"
     else:

@@ -44,7 +44,7 @@ class AudioSession:
         """
         if not self.is_closed and not self._session.try_push(pcm):
             self.skip(num_samples)
-            self._warn("slow_recognizer", "dropped audio: the recognizer is too slow", self.name)
+            self._warn("slow_recognizer", "dropped audio: the recognizer cannot keep up", self.name)
 
     def skip(self, num_samples: int) -> None:
         """Skip audio: media time advances."""

@@ -78,7 +78,7 @@ const CHINESE = {
   "{missing}; {start} (or everything with 'kouxing run')": "{missing}，{start}（或用 kouxing run 启动全部服务）",
   "no {kind} is running": "没有运行 {kind}",
   "start one with 'kouxing {kind}'": "请运行 kouxing {kind}",
-  "every {kind} is busy: {needed} % of its time must be free, but only {left} % is; try again in {wait} s":
+  "every {kind} is busy: a session needs {needed} % of one, but at most {left} % is free; try again in {wait} s":
     "所有 {kind} 都忙：需要 {needed}% 的空闲时间，只剩 {left}%；请 {wait} 秒后重试",
   "{workers} did not start the session in time": "{workers} 没有及时启动会话",
   "the synthesizer is too slow, so the face misses part of the speech": "合成器太慢，因此脸上缺少部分语音",
