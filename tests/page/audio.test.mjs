@@ -47,14 +47,16 @@ function playerWith(anchor) {
   return player;
 }
 
-test("sound is played at its media time, faded in against clicks", () => {
+test("sound is played at its media time, faded in and out against clicks", () => {
   const player = playerWith(1000);
   player.port.onmessage({ data: { mediaTime: 1256, samples: new Int16Array(512).fill(16384) } });
   const output = play(player, 8);
   assert.ok(output.slice(0, 256).every((value) => value === 0));
   assert.equal(output[256], 0.5 / 64);
   assert.ok(output.slice(320, 768).every((value) => value === 0.5));
-  assert.ok(output.slice(768).every((value) => value === 0));
+  assert.equal(output[768], (0.5 * 63) / 64);
+  assert.ok(output.slice(768, 832).every((value, i) => i === 0 || value < output[767 + i]));
+  assert.ok(output.slice(832).every((value) => value === 0));
 });
 
 test("the sound of another session is forgotten", () => {

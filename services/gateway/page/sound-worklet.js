@@ -29,6 +29,7 @@ class SoundPlayer extends AudioWorkletProcessor {
   #anchor = null;
   #target = null; // target of the anchor
   #gain = 0;
+  #value = 0; // the newest sample; held while missing sound fades out
   #numPlayed = 0;
   #reportedAt = 0;
 
@@ -78,8 +79,11 @@ class SoundPlayer extends AudioWorkletProcessor {
       const value = this.#at(currentFrame + i + this.#anchor);
       const isAudible = value !== null && !isJumping;
       this.#gain = isAudible ? Math.min(1, this.#gain + FADE) : Math.max(0, this.#gain - FADE);
-      output[i] = value * this.#gain;
-      if (value !== null) this.#numPlayed++;
+      if (value !== null) {
+        this.#value = value;
+        this.#numPlayed++;
+      }
+      output[i] = this.#value * this.#gain;
     }
     if (currentFrame - this.#reportedAt > sampleRate / 4) {
       this.#reportedAt = currentFrame;
