@@ -154,7 +154,7 @@ class GatewayService(SessionService):
             self._audio_upload.close()
             self._sample.stop()
         is_uploading = self._learn_mouth_handler.is_running or self._audio_upload.is_running
-        is_connected = self._web_sockets or self._whip_handler or self._sample.session
+        is_connected = self._web_sockets or self._whip_handler or self._sample.open_sessions
         return self._closing.done() and not is_uploading and not is_connected
 
     def on_shutdown(self) -> None:
@@ -282,7 +282,7 @@ class GatewayService(SessionService):
             },
             on_new_epoch=lambda: self._restart(session),
         )
-        characters = self._sample.characters if self._sample.session == start.session else ()
+        characters = self._sample.characters if start.session in self._sample.open_sessions else ()
         session.syllables = SyllableCaptions(self._inventory(start), characters)
         return session
 

@@ -161,8 +161,9 @@ class ViewerHandler:
     @property
     def newest_session(self) -> str:
         """The session shown to viewers that requested none; empty if there is no session."""
-        sample = self._sample.session
-        return next((name for name in reversed(self._sessions) if name != sample), sample)
+        samples = self._sample.open_sessions
+        others = (name for name in reversed(self._sessions) if name not in samples)
+        return next(others, samples[-1] if samples else "")
 
     @property
     def shown_sessions(self) -> Iterator[str]:
@@ -230,7 +231,7 @@ class ViewerHandler:
             self._sample.play(lip_model or "", self._on_sample_end)
             viewer.chosen_session = self._sample.session
         elif lip_model:
-            if not self._sample.session or viewer.chosen_session != self._sample.session:
+            if viewer.chosen_session not in self._sample.open_sessions:
                 raise UserError("a viewer can set lip_model only for the sample sentence")
             self._sample.lip_model = lip_model
         elif command.face is not None:
@@ -278,7 +279,8 @@ class ViewerHandler:
                 language=session.language if session else "",
                 acoustic=session.acoustic if session else "",
                 sample=session is not None
-                and name == viewer.chosen_session == self._sample.session,
+                and name == viewer.chosen_session
+                and name in self._sample.open_sessions,
             )
             self._put(viewer, MessageKind.SESSION, message)
 
