@@ -6,6 +6,7 @@ import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { DrawRate, ImageQueue, drawsInSoftware } from "./draw-rate.js";
 import { findJoints, rotateJoints } from "./joints.js";
 import {
+  loadLight,
   physicalMaterial,
   plainMaterial,
   release,
@@ -71,7 +72,7 @@ export class Head {
 
   /** Load a head and replace the current one. */
   async load(url) {
-    const gltf = await new GLTFLoader().loadAsync(url);
+    const [gltf] = await Promise.all([new GLTFLoader().loadAsync(url), loadLight()]);
     if (!gltf.scene.getObjectByName("kouxing")?.userData.kouxing) throw new Error("it is not an exported head");
     if (this.#isSoftware) await coarsen(gltf);
     this.#model?.removeFromParent();

@@ -4,13 +4,14 @@ import { isTokenWrong, socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { element } from "./elements.js";
 import { GatewayState } from "./gateway-state.js";
-import { translate, translateError } from "./language.js";
+import { setLanguage, translate, translateError } from "./language.js";
 import { LearnMouthDialog } from "./learn-mouth.js";
 import { LevelMeter, showLevel } from "./level.js";
 import { Notice } from "./notice.js";
+import { loadOffers } from "./offers.js";
 import { Player } from "./player.js";
 import { SendersPanel } from "./senders-panel.js";
-import { FACE_SETTINGS, Settings } from "./settings.js";
+import { FACE_SETTINGS, Settings, preferredLanguage } from "./settings.js";
 import { Sound } from "./sound.js";
 import { SpeechControls } from "./speech-controls.js";
 import { Stage } from "./stage.js";
@@ -21,10 +22,13 @@ import { ViewerSocket } from "./viewer-socket.js";
 const STATUS_INTERVAL_MS = 250;
 
 const query = new URLSearchParams(location.search);
-const offers = await (await fetch("offers.json")).json();
 const preferences = new Preferences(() => localStorage);
 const mouthProfiles = new MouthProfileStore(() => localStorage);
 const notice = new Notice();
+const offers = await loadOffers(() => {
+  setLanguage(preferredLanguage(preferences));
+  notice.showHint(translate("gatewayStopped"));
+});
 const meter = new LevelMeter();
 const gateway = new GatewayState();
 const settings = new Settings(preferences, offers, {

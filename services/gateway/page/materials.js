@@ -7,10 +7,18 @@ const EYES = ["eye_left", "eye_right"];
 const HAIR = "hair";
 const HAIR_CUTOFF = 0.3; // texels with less alpha are not drawn, as in the driver
 const DEFAULT_SHADING = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // used for files without these values
-const LIGHT = await (await fetch("light.glsl")).text(); // shared with the driver
+
+let lightShader = null; // source code that is shared with the driver; null before loadLight()
+
+/** Load the source code of the light, which all materials need. */
+export async function loadLight() {
+  if (lightShader !== null) return;
+  const response = await fetch("light.glsl");
+  if (!response.ok) throw new Error(`light.glsl: ${response.status} ${response.statusText}`);
+  lightShader = await response.text();
+}
 
 const PLAIN_VERTEX = `
-${LIGHT}
 varying vec2 vUv;
 varying vec3 vLight;
 varying float vHigh;
@@ -34,7 +42,6 @@ void main() {
 }`;
 
 const PLAIN_FRAGMENT = `
-${LIGHT}
 uniform sampler2D map;
 varying vec2 vUv;
 varying vec3 vLight;
@@ -80,8 +87,8 @@ export function plainMaterial(name, gltf, head, cel) {
       turn: { value: head.matrixWorld },
       ...lightUniforms(name, gltf, cel && !isEye),
     },
-    vertexShader: PLAIN_VERTEX,
-    fragmentShader: PLAIN_FRAGMENT,
+    vertexShader: lightShader + PLAIN_VERTEX,
+    fragmentShader: lightShader + PLAIN_FRAGMENT,
     vertexColors: true,
     ...blending(name, gltf),
   });
@@ -119,7 +126,7 @@ export function physicalMaterial(name, gltf) {
   material.onBeforeCompile = (shader) => {
     Object.assign(shader.uniforms, lightUniforms(name, gltf, false));
     shader.fragmentShader =
-      LIGHT +
+      lightShader +
       shader.fragmentShader
         .replace(
           "#include <lights_physical_pars_fragment>",

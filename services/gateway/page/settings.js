@@ -9,6 +9,11 @@ const SLIDERS = ["expressiveness", "feeling"];
 export const FACE_SETTINGS = [...SLIDERS, "still", "eye_contact"]; // also their names in messages
 const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];
 
+/** Return the language that the user has chosen, or the browser's. */
+export function preferredLanguage(preferences) {
+  return preferences.get("language") ?? languageFor(navigator.languages);
+}
+
 export class Settings {
   #preferences;
   #offers;
@@ -70,7 +75,7 @@ export class Settings {
   }
 
   #applyLanguage() {
-    const name = this.#preferences.get("language") ?? languageFor(navigator.languages);
+    const name = preferredLanguage(this.#preferences);
     setLanguage(name);
     element("language").value = name;
     fill("heads", "option", "head", ["", ...this.#offers.heads]);
