@@ -91,7 +91,7 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
         (
             "silent.wav",
             None,
-            "silent.wav: no speech was found; the file is silent. Choose another file",
+            "No speech was found: silent.wav is silent. Choose another file",
             "请选择其他文件",
         ),
     ],

@@ -126,7 +126,7 @@ export class SpeechControls {
   }
 
   #onSession(name) {
-    // Users do not want to hear their own voice late. A file stays audible.
+    // Hearing your own voice with a delay is distracting. A file stays audible.
     if (this.session === null && !this.microphone.isFile) this.#mute();
     else if (this.session === null) this.#wasSoundWanted = this.#sound.isWanted;
     this.session = name;

@@ -56,7 +56,7 @@ export const TEXTS = {
   lowerFrameRate: { en: "Lower the frame rate", zh: "降低帧率" },
   useLightModel: { en: "Use the light model", zh: "使用轻量模型" },
   gatewayStopped: {
-    en: "The gateway has stopped. Start it with “kouxing run”; this page reconnects by itself.",
+    en: "The gateway has stopped. Start it with “kouxing run”; this page will reconnect automatically.",
     zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
   },
   connectionRefused: {
@@ -64,21 +64,21 @@ export const TEXTS = {
     zh: "网关拒绝了连接。请打开 kouxing run 显示的完整地址（包括其中的 #token=…）。",
   },
   controlMissing: {
-    en: "Control is not running. Start it with “kouxing run”; this page reconnects by itself.",
+    en: "Control is not running. Start it with “kouxing run”; this page will reconnect automatically.",
     zh: "控制服务（control）没有运行。请运行 kouxing run，本页会自动重新连接。",
   },
   servicesMissing: {
     en: "Not running: {services}. “kouxing run” restarts services automatically. Otherwise, start them with: {commands}",
     zh: "没有运行：{services}。kouxing run 会自动重启服务；否则请运行：{commands}",
   },
-  microphoneInterrupted: { en: "The microphone was interrupted. It resumes by itself.", zh: "麦克风中断，会自动恢复。" },
+  microphoneInterrupted: { en: "The microphone was interrupted. It reconnects automatically.", zh: "麦克风中断，会自动重新连接。" },
   fileInterrupted: {
     en: "The connection was interrupted. The file continues automatically.",
     zh: "连接中断，文件会自动继续播放。",
   },
   fileResumed: { en: "The file is playing again.", zh: "文件已恢复播放。" },
   microphoneResumed: { en: "The microphone is on again.", zh: "麦克风已恢复。" },
-  recovered: { en: "Everything is running again.", zh: "已全部恢复运行。" },
+  recovered: { en: "All services are back.", zh: "已全部恢复运行。" },
   serviceRestarted: { en: "A service crashed and was restarted. The session continues.", zh: "一个服务崩溃后已重启，会话继续。" },
 
   // Errors
@@ -120,12 +120,12 @@ export const TEXTS = {
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
   noSpeech: {
-    en: "{file}: no speech was found. Choose a recording with a clear voice.",
-    zh: "{file}：没有找到语音。请选择人声清晰的录音。",
+    en: "No speech was found in {file}. Choose a recording with a clear voice.",
+    zh: "{file} 里没有找到语音。请选择人声清晰的录音。",
   },
   noSpeechSilent: {
-    en: "{file}: no speech was found; the file is silent. Choose another file, or record it again with the microphone on.",
-    zh: "{file}：没有找到语音，文件是静音的。请选择其他文件，或打开麦克风重新录音。",
+    en: "No speech was found: {file} is silent. Choose another file, or record it again with the microphone on.",
+    zh: "没有找到语音：{file} 是静音的。请选择其他文件，或打开麦克风重新录音。",
   },
   oldMouthProfile: {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
