@@ -9,7 +9,7 @@ from kouxing.shared.errors import UserError
 COMMAND = re.compile(  # [laughter], [pause:500], [S1], <#0.5#>, <|zh|>, and prosody: #1 to #4
     r"\[/?[A-Za-z_]\w*(?:[ :=]+[\w.]+)?\]|<#[\d.]+#>|<\|[^|<>]*\|>|(?<=[^\0-\x7f])#[1-4](?!\d)"
 )
-MARKDOWN = re.compile(r"^#{1,6} |^```|\]\([^)\s]+\)", re.MULTILINE)
+MARKDOWN = re.compile(r"^#{1,6} |^```|\]\([^])\s]+\)", re.MULTILINE)
 TAG = re.compile(
     r"</?[A-Za-z][\w:.-]*(?:\s[^<>]*)?/?>|<!--|&(?:[A-Za-z]{2,8}|#\d+|#x[0-9A-Fa-f]+);"
 )
