@@ -10,6 +10,7 @@ import soundfile
 from typer.testing import CliRunner
 
 from kouxing.corpora.speech_corpus import RowErrors, may_distribute, read_corpus
+from kouxing.corpora.tables import read_rows
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.forced_path import build_utterance_graph, viterbi_path
 from kouxing.shared.errors import UserError
@@ -91,6 +92,14 @@ def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
     (tmp_path / "manifest.tsv").write_bytes("utt_id\tpath\tpinyin\n你".encode("gb18030"))
     with pytest.raises(UserError, match="not UTF-8 text"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
+    write_manifest(tmp_path, "utt_id path pinyin", ["1\ta.wav\t" + "a" * 200_000])
+    with pytest.raises(UserError, match=r"manifest\.tsv: the file is damaged or is not a table"):
+        read_corpus(tmp_path, RowErrors(), MANDARIN)
+
+
+def test_a_table_may_have_empty_lines(tmp_path: Path) -> None:
+    (tmp_path / "a.tsv").write_text("\n\na\tb\n1\t2\n \n")
+    assert read_rows(tmp_path / "a.tsv", ("a", "b")) == [{"a": "1", "b": "2"}]
 
 
 def test_licenses_that_allow_distribution() -> None:
