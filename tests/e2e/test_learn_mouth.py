@@ -72,6 +72,18 @@ def set_min_rate(browser: Browser, rate_hz: float) -> None:
     browser.evaluate(f"{module}.then((it) => {{ it.FaceRecording.minRateHz = {rate_hz} }})")
 
 
+def slow_down_tracker(browser: Browser) -> None:
+    """Let the tracker run after the reading, and record what the page shows when it runs."""
+    browser.evaluate(
+        "import('/face-tracker.js').then(({ FaceTracker: { prototype } }) => {"
+        " const { find } = prototype; window.images = [];"
+        " prototype.find = async function (image) {"
+        "   images.push([window.kouxing.state.lesson, image.width]);"
+        "   await new Promise((resolve) => setTimeout(resolve, 150));"
+        "   return find.call(this, image); }; })"
+    )
+
+
 def start_recording(browser: Browser) -> None:
     browser.click("learn")
     browser.click("learn-start")
@@ -112,12 +124,17 @@ def lengthen(recording: bytes) -> bytes:
 def test_the_page_learns_keeps_uses_and_forgets_a_mouth(
     control: FakeControl, browser: Browser
 ) -> None:
+    slow_down_tracker(browser)
     browser.evaluate(
         "window.realFetch = fetch; window.fetch = (url, options) => realFetch(url,"
         " { ...options, body: (window.recording = window.longer ?? options.body) });"
     )
     read_aloud(browser)
     assert re.search(REFUSAL, text_of(browser, "learn-problem"))
+    images = browser.evaluate("images")
+    later = images[images.index(["learning", 320]) :]
+    assert later == [["learning", 320]] * len(later)
+    assert len(later) > 1
     browser.evaluate(
         "window.send = fetch; window.fetch = async () => { throw new Error('offline') }"
     )
@@ -178,31 +195,6 @@ def test_a_slow_start_is_explained_from_the_first_moment(browser: Browser) -> No
     assert "On a slow computer" in text_of(browser, "learn-advice")
     browser.click("learn-mouth [data-step=reading] .close")
     browser.evaluate("delete document.body.append")
-
-
-def test_a_slow_tracker_runs_after_the_reading(browser: Browser) -> None:
-    browser.evaluate(
-        "import('/face-tracker.js').then(({ FaceTracker: { prototype } }) => {"
-        " window.find = prototype.find; window.images = [];"
-        " prototype.find = async function (image) {"
-        "   images.push([window.kouxing.state.lesson, image.width]);"
-        "   await new Promise((resolve) => setTimeout(resolve, 150));"
-        "   return find.call(this, image); }; })"
-    )
-    set_min_rate(browser, 0)
-    browser.evaluate("window.kouxing.readingS = 0.1")
-    start_recording(browser)
-    browser.wait_for("window.kouxing.state.lesson === 'problem'", 180)
-    problem, images = text_of(browser, "learn-problem"), browser.evaluate("images")
-    browser.evaluate(
-        "import('/face-tracker.js').then(({ FaceTracker }) => {"
-        " FaceTracker.prototype.find = window.find; })"
-    )
-    browser.click("learn-mouth [data-step=problem] .close")
-    assert re.search(REFUSAL, problem), problem
-    later = images[images.index(["learning", 320]) :]
-    assert later == [["learning", 320]] * len(later)
-    assert len(later) > 1
 
 
 def test_the_page_records_the_same_landmarks(browser: Browser) -> None:

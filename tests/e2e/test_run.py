@@ -159,7 +159,7 @@ def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
 def test_an_interrupted_render_leaves_no_file(tmp_path: Path, speech: Path) -> None:
     program = CTRL_C_AT_FIRST_IMAGE + CTRL_C_COMMAND
     result = subprocess.run(
-        [sys.executable, "-c", program, "render", speech, "face.mp4"],
+        [sys.executable, "-c", program, "render", speech, "face.mp4", "--size", "64x48"],
         env=child_environment(),
         cwd=tmp_path,
         capture_output=True,
