@@ -116,5 +116,7 @@ if __name__ == "__main__":
         asyncio.run(main(address))
     except aiohttp.WSServerHandshakeError as error:
         sys.exit(f"{address} rejected the connection ({error.status}); copy the page's token")
+    except aiohttp.ClientConnectorCertificateError:
+        sys.exit(f"the certificate of {address} is not trusted; set SSL_CERT_FILE to its file")
     except (aiohttp.ClientError, OSError):
         sys.exit(f"cannot reach the gateway at {address}; start it with: kouxing run")

@@ -188,6 +188,7 @@ def test_the_example_in_the_readme_follows_a_face(system: System) -> None:
 
 FOLDER = ROOT / "examples" / "subscribe"
 STREAM = ROOT / "examples" / "unity" / "KouxingStream.cs"
+ASSISTANT = [sys.executable, str(ROOT / "examples" / "voice-assistant" / "assistant.py")]
 SAMPLES = samples_of_file(VOWELS_FILE)
 
 
@@ -235,19 +236,27 @@ def test_without_a_server_each_program_prints_one_line(
 ) -> None:
     load_user_key()  # creates it, if no system has started
     address = f"tcp://127.0.0.1:{free_port()}"
-    assistant = [sys.executable, str(ROOT / "examples" / "voice-assistant" / "assistant.py")]
     running = [
         subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for command in [
             *([*program, "", address] for program in programs),
             [*client, str(VOWELS_FILE), address],
-            [*assistant, address.replace("tcp", "ws")],
+            [*ASSISTANT, address.replace("tcp", "ws")],
         ]
     ]
     for process in running:
         (line,) = process.communicate(timeout=60)[1].splitlines()
         assert "kouxing run" in line
         assert process.returncode == 1
+
+
+def test_the_assistant_reports_a_certificate_that_is_not_trusted(tmp_path: Path) -> None:
+    with FakeControl() as control:
+        gateway = Gateway(control.address, https=str(tmp_path / "kouxing.pem"))
+        command = [*ASSISTANT, gateway.page.replace("https", "wss")]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S)
+        assert "is not trusted; set SSL_CERT_FILE" in result.stderr
+        assert gateway.stop() == 0
 
 
 def test_follow_a_session_that_moves_to_its_end(
