@@ -19,6 +19,7 @@ from kouxing.services.driver.config import Framing
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.glb_head import read_glb
 from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.heads import page_heads_folder
 from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -146,6 +147,25 @@ def test_live_frames_are_those_of_the_live_pipeline(vowels: Path, tmp_path: Path
     frames = pipeline.accept_waveform(samples) + pipeline.input_finished()
     written = read_fap(tmp_path / "live.fap").faps[:, 2:]
     np.testing.assert_allclose(written, [faps[2:] for _, faps in frames], rtol=1e-6, atol=1e-6)
+
+
+def test_releases_the_renderer_of_each_file_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[Renderer] = []
+    close = Renderer.close
+
+    def record_close(renderer: Renderer) -> None:
+        closed.append(renderer)
+        close(renderer)
+
+    monkeypatch.setattr(Renderer, "close", record_close)
+    sources = [tmp_path / name for name in ("a.fap", "b.fap", "c.fap")]
+    for source in sources:
+        source.write_text("damaged", encoding="utf-8")
+    with pytest.raises(UserError, match="3 of 3 files failed"):
+        render_files(sources, size="64x48")
+    assert len(closed) == 3
 
 
 def test_renders_lip_models_side_by_side(vowels: Path, tmp_path: Path) -> None:

@@ -220,6 +220,8 @@ def test_refuses_more_videos_than_the_limit(harness: DriverHarness) -> None:
     assert refusal.code == "busy"
     assert "max_videos" in refusal.text
     harness.start("unrecorded")
+    harness.publish("film-0", 0, 100.0)
+    harness.wait_for_frames(1)
     harness.end("film-0")
     harness.step_until(lambda: len(harness.events("recorded")) == 1)
     harness.start("one-more", record=True)

@@ -12,10 +12,16 @@ from rich.progress import Progress
 
 from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenFormat
 from kouxing.services.cli.recordings.animation import FaceMotion
-from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, FrameRow, FrameStream
+from kouxing.services.cli.recordings.curve_exporters import (
+    CURVE_EXPORTERS,
+    FrameRow,
+    FrameStream,
+    GlbExporter,
+)
 from kouxing.services.cli.recordings.exporters import open_exporter
 from kouxing.services.cli.system.follow import follow
 from kouxing.services.driver.config import Framing
+from kouxing.services.driver.head.glb_file import GlbFile
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import NUM_FAPS
@@ -108,3 +114,14 @@ def test_options_are_checked_before_the_work(
 ) -> None:
     with pytest.raises(UserError, match=message):
         open_exporter(tmp_path / output, ExportOptions(**options))
+
+
+def test_the_times_of_an_animation_increase_although_media_time_stops(tmp_path: Path) -> None:
+    frame = np.zeros(NUM_FAPS, np.float32)
+    times_s = (0.0, 0.02, 0.02, 0.02, 0.04)
+    live = FrameStream([(time_s, n, frame) for n, time_s in enumerate(times_s)], is_live=True)
+    output = tmp_path / "face.glb"
+    assert GlbExporter(output, ExportOptions()).write(live) == 3
+    glb = GlbFile(output)
+    times = glb.accessor(glb.json["animations"][0]["samplers"][0]["input"])
+    np.testing.assert_allclose(times.ravel(), [0.0, 0.02, 0.04])

@@ -55,6 +55,19 @@ def test_a_system_that_ends_during_the_search_is_not_an_error(
         assert newest_control_endpoint() == "tcp://127.0.0.1:1"
 
 
+def test_a_search_does_not_hide_a_system_that_is_starting(monkeypatch: pytest.MonkeyPatch) -> None:
+    lock = fcntl.flock
+
+    def search_before_lock(file: int, operation: int) -> None:
+        if operation == fcntl.LOCK_EX:
+            newest_control_endpoint()
+        lock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", search_before_lock)
+    with announce_system("tcp://127.0.0.1:1"):
+        assert newest_control_endpoint() == "tcp://127.0.0.1:1"
+
+
 def control_address(address: str) -> str:
     with open_control_address(address) as endpoint:
         return endpoint

@@ -228,6 +228,22 @@ def test_invisible_characters_do_not_divide_a_word() -> None:
     assert [word.text for word in words] == ["recording"]
 
 
+@pytest.mark.parametrize("words", ["2008\n", "It was\n2008\n"])
+def test_a_cue_without_a_number_may_end_with_a_spoken_number(words: str) -> None:
+    cues = f"WEBVTT\n\n0:01.0 --> 0:02.0\n{words}\n0:03.0 --> 0:04.0\nHello\n"
+    assert extract_text(cues)[0] == f"{words}Hello"
+
+
+def test_the_number_of_a_cue_is_not_spoken_in_a_file_with_doubled_lines() -> None:
+    cues = "1\n\n0:01.0 --> 0:02.0\n\nHello\n\n\n\n2\n\n0:03.0 --> 0:04.0\n\nAnna\n"
+    assert extract_text(cues)[0] == "Hello\nAnna"
+
+
+def test_a_reading_aid_ends_with_its_ruby() -> None:
+    page = "<body><ruby>汉<rp>(<rt>hàn<rp>)</ruby><ruby>字<rt>zì</ruby>很好</body>"
+    assert extract_text(page)[0] == "汉字很好"
+
+
 def test_text_next_to_the_times_of_a_cue_is_spoken() -> None:
     cues = "00:00.400 --> 00:01.000 align:start line:80%\nHello\n\n0:01 --> 0:02 Anna: hi\n"
     assert extract_text(cues)[0] == "Hello\nAnna: hi"

@@ -205,6 +205,15 @@ def frame(value: float) -> np.ndarray:
     return faps
 
 
+def test_a_video_without_frames_is_not_written(renderer: Renderer, tmp_path: Path) -> None:
+    recording = VideoRenderer(tmp_path / "a.mp4", renderer, 25.0)
+    recording.add_audio(0, np.zeros(8000, np.float32))
+    with pytest.raises(UserError, match="no frame arrived"):
+        recording.close()
+    recording.discard()
+    assert not any(tmp_path.iterdir())
+
+
 def test_fills_missing_sound_and_drops_repeated_sound(renderer: Renderer, tmp_path: Path) -> None:
     recording = VideoRenderer(tmp_path / "a.mp4", renderer, 25.0)
     loud = np.full(8000, 0.5, np.float32)

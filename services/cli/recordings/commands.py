@@ -1,5 +1,6 @@
 """The commands that need no running services: files in, files out."""
 
+from contextlib import closing
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -200,8 +201,7 @@ def render(
             )  # fmt: skip
         elif sound is not None:
             raise UserError(f"--sound applies to curves; {source} has its own audio")
-        exporter = open_exporter(target, options)
-        with open_progress() as progress:
+        with closing(open_exporter(target, options)) as exporter, open_progress() as progress:
             if has_motion(source):
                 motion = read_motion(source, sound)
             else:

@@ -101,6 +101,9 @@ class CurveExporter(ABC):
         Raises ``UserError`` if the file cannot be written.
         """
 
+    def close(self) -> None:  # noqa: B027 - not abstract: there is nothing to do
+        """Release what the exporter keeps; an exporter of curves keeps nothing."""
+
 
 class CsvExporter(CurveExporter):
     """Writes comma-separated values, with a column for each FAP or shape."""
@@ -164,7 +167,10 @@ class GlbExporter(CurveExporter):
         from kouxing.services.driver.head.glb_export import export_glb  # noqa: PLC0415 - slow
         from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
 
-        frames = [(time_s, faps) for time_s, _, faps in curves.rows]
+        frames: list[tuple[float, Values]] = []
+        for time_s, _, faps in curves.rows:
+            if not frames or time_s > frames[-1][0]:  # media time stops while no audio arrives
+                frames.append((time_s, faps))
         is_arkit = self._curve_format is CurveFormat.ARKIT
         export_glb(load_head(self._head), self._output, frames, as_arkit=is_arkit)
         return len(frames)

@@ -1,6 +1,5 @@
 """The output formats of ``kouxing render``. The suffix of the file chooses the class."""
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -49,14 +48,14 @@ class PictureExporter:
 
         Raises ``UserError`` if a file cannot be written.
         """
-        with contextlib.closing(self._renderer):
-            return self._draw(motion, progress)
-
-    def _draw(self, motion: FaceMotion, progress: Progress) -> int:
         captions = make_captions(self._options.captions, motion, self._size_px)
         at_s = self._options.at_s or 0.0
         film.render_picture(motion.frames, self._output, self._renderer, at_s, captions)
         return 1
+
+    def close(self) -> None:
+        """Release the renderer."""
+        self._renderer.close()
 
 
 class VideoExporter(PictureExporter):
@@ -68,7 +67,8 @@ class VideoExporter(PictureExporter):
         check_name(output)
         super().__init__(output, options)
 
-    def _draw(self, motion: FaceMotion, progress: Progress) -> int:
+    def export(self, motion: FaceMotion, progress: Progress) -> int:
+        """Draw a motion and return the number of images; raises as ``PictureExporter.export``."""
         task = progress.add_task("drawing", total=1.0)
         motion = slow_down(motion, self._options.speed)
         return film.render_video(

@@ -167,7 +167,8 @@ def running_systems() -> list[RunningSystem]:
                     started_s = os.fstat(file.fileno()).st_mtime
                     systems.append((started_s, RunningSystem(control, keys)))
                 continue
-            path.unlink()  # the system has ended
+            if file.read():  # otherwise a starting system has not locked it yet
+                path.unlink()  # the system has ended
     return [system for _, system in sorted(systems, reverse=True)]
 
 

@@ -23,6 +23,7 @@ _UNSPOKEN_ELEMENTS = {
     *("script", "style", "title", "template", "rt", "rp"),
     *("metadata", "desc", "copyright", "lexicon", "styling", "layout"),
 }
+_ANNOTATIONS = {"rt", "rp"}  # they also end with their <ruby>
 _LINE_ELEMENTS = {"br", "div", "h1", "h2", "h3", "h4", "li", "p", "s", "td", "text", "tr"}
 _MAX_OPEN = 100  # nested elements; each end tag searches all of them
 
@@ -69,8 +70,9 @@ def read_markup(text: str) -> str:
 def _handle_tag(tag: re.Match[str], spoken: list[str], unspoken: list[str]) -> None:
     name = tag["tag"].lower().rpartition(":")[2]
     if tag["end"]:
-        if name in unspoken:
-            del unspoken[unspoken.index(name) :]
+        ended = _ANNOTATIONS if name == "ruby" else {name}
+        first = next((n for n, element in enumerate(unspoken) if element in ended), len(unspoken))
+        del unspoken[first:]
         return
     if name in _LINE_ELEMENTS:
         spoken.append("\n")

@@ -16,7 +16,9 @@ CLOCK = r"(?:\d{1,3}[:：])?\d{1,2}[:：]\d{2}(?:[.,:]\d{1,3})?"  # 0:05, 00:00:
 _CUE = rf"[ \t]*{CLOCK}[ \t]*-->[ \t]*{CLOCK}"
 _SETTINGS = r"(?:[ \t]+(?:vertical|line|position|size|align|region|[XY][12]):\S+)*"
 CUE_TIMES = re.compile(rf"^{_CUE}{_SETTINGS}", re.MULTILINE)
-_CUE_NUMBER = re.compile(rf"^[ \t]*\d+\s*\n(?={_CUE})", re.MULTILINE)
+_CUE_NUMBER = re.compile(  # directly above the times, or in a paragraph of its own
+    rf"(?:^[ \t]*\d+[ \t]*\n|(?:\A|(?<=\n\n))[ \t]*\d+\s*\n)(?={_CUE})", re.MULTILINE
+)
 _SOUND_NAME = re.compile(r"\[[^][\n]*\]|【[^【】\n]*】|[♪♫]")
 _BRACES = re.compile(r"\{[^{}]*\}")
 SBV_TIMES = re.compile(r"^\d+:\d{2}:\d{2}\.\d{3},\d+:\d{2}:\d{2}\.\d{3}[ \t]*$", re.MULTILINE)

@@ -108,7 +108,12 @@ class VideoRenderer:
         return True
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file.
+
+        Raises ``UserError`` if the video has no image, or the file cannot be written.
+        """
+        if not self.num_images:
+            raise UserError("no frame arrived, so the video is empty; send audio and record again")
         self.path = self._writer.close()
 
     def discard(self) -> None:
