@@ -332,6 +332,40 @@ def test_a_request_of_another_thread_fails_while_the_client_ends(
     assert "closed" in str(answer.exception())
 
 
+def test_values_of_numpy_do_not_end_the_client(control: FakeControl, client: Client) -> None:
+    session = client.open_session("s")
+    with pytest.raises(TypeError, match="numpy"):
+        session.set_face(expressiveness=np.float32(1.5))  # type: ignore[arg-type]
+    session.skip(np.int64(1600))  # type: ignore[arg-type]
+    session.push(CHUNK)
+    wait_until(lambda: control.audio_messages)
+    assert control.audio_messages[0].media_time == 1600
+    assert not client.is_closed
+
+
+@pytest.mark.parametrize("is_async", [False, True])
+def test_a_failed_subscription_receives_nothing(control: FakeControl, *, is_async: bool) -> None:
+    async def subscribe() -> None:
+        async with AsyncClient(control.address, insecure=True) as client:
+            session = await client.open_session("s")
+            control.refuse = True
+            with pytest.raises(Refused):
+                await session.shapes("vrm")
+            await client.status()  # the thread has ended the subscription
+            assert not session._core._subscriptions
+
+    if is_async:
+        asyncio.run(subscribe())
+        return
+    with Client(control.address, insecure=True) as client:
+        session = client.open_session("s")
+        control.refuse = True
+        with pytest.raises(Refused):
+            session.shapes("vrm")
+        client.status()
+        assert not session._core._subscriptions
+
+
 def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeControl) -> None:
     published = [frame(number) for number in range(1, 4 * MAX_UNREAD_RESULTS)]
 

@@ -139,10 +139,14 @@ class AsyncSession(BaseSession):
         inbox, close, joined = self._subscribe(classes, shape_set, keep_all)
         try:
             await asyncio.wait_for(asyncio.wrap_future(joined), self._thread.timeout_s)
+            if added := self._request_shapes(shape_set):
+                await asyncio.wrap_future(added)
         except asyncio.TimeoutError:  # noqa: UP041 - another class in Python 3.10
+            close()
             raise self._join_error() from None
-        if added := self._request_shapes(shape_set):
-            await asyncio.wrap_future(added)
+        except BaseException:  # also a cancellation
+            close()
+            raise
         return AsyncResults(inbox, close)
 
 

@@ -149,10 +149,11 @@ class BaseSession:
 
     def skip(self, num_frames: int) -> None:
         """Advance media time by ``num_frames`` samples per channel without sending audio."""
+        num_samples = int(num_frames)  # NumPy integers cannot be encoded
 
         def skip() -> None:
             if self._core.stream is not None:
-                self._core.stream.skip(num_frames)
+                self._core.stream.skip(num_samples)
 
         self._thread.call(skip)
 

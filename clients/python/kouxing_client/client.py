@@ -199,10 +199,14 @@ class Session(BaseSession):
         inbox, close, joined = self._subscribe(classes, shape_set, keep_all, on_result)
         try:
             joined.result(self._thread.timeout_s)
+            if added := self._request_shapes(shape_set):
+                added.result()
         except FutureTimeout:
+            close()
             raise self._join_error() from None
-        if added := self._request_shapes(shape_set):
-            added.result()
+        except BaseException:  # also Ctrl-C
+            close()
+            raise
         return Results(inbox, close)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-from kouxing_client.core import ClientCore, map_future
+from kouxing_client.core import ClientCore, forward_errors, map_future
 from kouxing_client.errors import KouxingError
 from kouxing_client.inbox import new_future
 from kouxing_client.keys import Key
@@ -83,7 +83,8 @@ class ClientThread:
         answer = new_future()
 
         def run() -> None:
-            map_future(function(self.core), lambda result: result, answer)
+            with forward_errors(answer):  # such as a field that cannot be encoded
+                map_future(function(self.core), lambda result: result, answer)
 
         self.call(run)
         return answer
