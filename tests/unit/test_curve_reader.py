@@ -73,6 +73,15 @@ def test_a_live_link_take_keeps_its_rate(tmp_path: Path) -> None:
     assert not path.exists()
 
 
+@pytest.mark.parametrize("rate_hz", [24.0, 30.0, 60.0, 120.0])
+def test_a_table_with_times_in_milliseconds_keeps_its_rate(tmp_path: Path, rate_hz: float) -> None:
+    path, faps = tmp_path / "face.csv", np.zeros(NUM_FAPS, np.float32)
+    write(path, FrameStream([(number / rate_hz, number, faps) for number in range(240)]))
+    animation = read_table(path)
+    assert animation.frame_rate_hz == pytest.approx(rate_hz, rel=1e-3)
+    assert len(animation.faps) == 240
+
+
 def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:
     path = tmp_path / "take.csv"
     write(path, face_curves(), CurveFormat.LIVELINK)

@@ -73,6 +73,14 @@ def test_fap_has_the_frame_rate_of_the_motion_or_of_the_times(tmp_path: Path) ->
         np.testing.assert_allclose(animation.faps[:, 2], [0, 100, 200, 300, 400], atol=0.01)
 
 
+def test_fap_stays_in_time_if_frames_are_missing(tmp_path: Path) -> None:
+    path = tmp_path / "live.fap"
+    exporter = CURVE_EXPORTERS[".fap"](path, ExportOptions())
+    first, second, _, _, last = rows()
+    exporter.write(FrameStream([first, second, last], RATE_HZ, is_live=True))
+    np.testing.assert_allclose(read_fap(path).faps[:, 2], [0, 100, 100, 100, 400], atol=0.01)
+
+
 def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
     for name in ("face.yaml", "face.txt", "face.avi"):
         output = tmp_path / name

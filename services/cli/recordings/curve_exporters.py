@@ -145,13 +145,17 @@ class FapExporter(CurveExporter):
     formats = (CurveFormat.FAPS,)
 
     def write(self, curves: FrameStream) -> int:
-        """Write the frames when the last one has arrived."""
+        """Write the frames when the last one has arrived. The last face fills a gap in time."""
         frames, frame_rate_hz = list(curves.rows), curves.frame_rate_hz
+        times_s = np.array([time_s for time_s, _, _ in frames])
         if frame_rate_hz is None:
-            steps_s = np.diff([time_s for time_s, _, _ in frames])
+            steps_s = np.diff(times_s)
             steps_s = steps_s[steps_s > 0]
             frame_rate_hz = float(1.0 / np.median(steps_s)) if len(steps_s) else 50.0
         faps = np.array([values for _, _, values in frames], np.float32).reshape(-1, NUM_FAPS)
+        if len(frames):
+            numbers = np.rint((times_s - times_s[0]) * frame_rate_hz)
+            faps = faps[np.searchsorted(numbers, np.arange(numbers[-1] + 1), side="right") - 1]
         write_fap(self._output, FapAnimation(self._output.stem, frame_rate_hz, faps))
         return len(frames)
 

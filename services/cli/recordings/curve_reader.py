@@ -35,6 +35,7 @@ _MAX_WEIGHT = 10.0  # limit for the weight of a shape; percentages are larger
 _TIME_CODE = re.compile(r"(\d+):(\d+):(\d+)[:;](\d+(?:\.\d+)?)")  # ";" if frames are dropped
 _TIME_CODE_RATES_HZ = (24, 25, 30, 48, 50, 60, 100, 120)  # the app's default is 60
 _DAY_S = 86400.0
+_ROUNDING_S = 0.0015  # steps between times in whole milliseconds differ by up to 1 ms
 _OTHER_COLUMNS = {"", "time_s", "sequence", "phone", "timecode", "blendshapecount"}
 _OTHER_COLUMNS |= {angle.lower() for angle in ANGLES}
 _HEAD_FAPS = dict(zip(ANGLES, ("head_yaw", "head_pitch", "head_roll"), strict=False))
@@ -204,10 +205,17 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
             " sort the frames by time"
         )
     times_s, first = np.unique(times_s - times_s[0], return_index=True)
-    rate_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 1 else 50.0
+    rate_hz = _frame_rate_hz(np.diff(times_s)) if len(times_s) > 1 else 50.0
     num_frames = round(times_s[-1] * rate_hz) + 1
     if not 1.0 <= rate_hz <= 1000.0 or num_frames > 10 * len(times_s) + 1000:
         raise UserError(f"{path}: the times must match a rate of 1 to 1000 frames per second")
     grid_s = np.arange(num_frames) / rate_hz
     columns = [np.interp(grid_s, times_s, column) for column in faps[first].T]
     return FapAnimation(path.stem, rate_hz, np.stack(columns, axis=1).astype(np.float32))
+
+
+def _frame_rate_hz(steps_s: Float64) -> float:
+    """Return the median frame rate. The mean of equal steps removes the rounding of their times."""
+    median_s = np.median(steps_s)
+    usual = np.abs(steps_s - median_s) < _ROUNDING_S
+    return 1.0 / float(steps_s[usual].mean())
