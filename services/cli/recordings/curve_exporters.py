@@ -153,7 +153,7 @@ class FapExporter(CurveExporter):
             steps_s = steps_s[steps_s > 0]
             frame_rate_hz = float(1.0 / np.median(steps_s)) if len(steps_s) else 50.0
         faps = np.array([values for _, _, values in frames], np.float32).reshape(-1, NUM_FAPS)
-        if len(frames):
+        if frames:
             numbers = np.rint((times_s - times_s[0]) * frame_rate_hz)
             faps = faps[np.searchsorted(numbers, np.arange(numbers[-1] + 1), side="right") - 1]
         write_fap(self._output, FapAnimation(self._output.stem, frame_rate_hz, faps))
