@@ -15,7 +15,7 @@ from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 from kouxing.training.encoder import batches, lip_teacher, recipe, targets, trainer
-from kouxing.training.encoder.batches import BatchSource, draw_batch, network_inputs
+from kouxing.training.encoder.batches import BatchSource, draw_batch, draw_excerpts, network_inputs
 from kouxing.training.encoder.export import export_onnx, rebuild_encoder, save_encoder
 from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
 from kouxing.training.encoder.recipe import refine_encoder, train_encoder
@@ -65,6 +65,19 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     lips = rows[0, 100, COLUMNS.lips].reshape(-1, NUM_OUTPUTS)[:, 0] - rows[0, 100, PITCH]
     # A position's audio ends 45 ms after its start, and the target of row 0 is at 20 ms.
     np.testing.assert_allclose(lips, (0.045 - np.array(LIP_DELAYS_S)) / 0.02 - 1, atol=0.51)
+
+
+@pytest.mark.parametrize("babble_only_prob", [0.0, 1.0])
+def test_voices_in_the_background_only_are_no_voice(
+    babble_only_prob: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "NUM_EXCERPTS", 1)
+    monkeypatch.setattr(batches, "disturb", lambda sound, _: sound)
+    silence = np.zeros(16_000, np.int16)
+    batch_source = BatchSource([piece(HELLO)], [silence], COLUMNS, 1.0, babble_only_prob)
+    (excerpt,) = draw_excerpts(batch_source, 0)
+    assert bool((np.abs(excerpt.disturbed) > 0.001).any()) is (babble_only_prob == 1.0)
+    assert (excerpt.targets[:, VOICE] == VoiceKind.NONE).all()
 
 
 def test_exported_steps_follow_pytorch() -> None:

@@ -44,6 +44,7 @@ _MIDDLE = 0.875  # middle of a position's frames, positions after its first samp
 _KNOWN = 2.25  # end of the audio that the network has received, likewise
 _CLEAN_PROB, _BACKGROUND_PROB = 0.15, 0.65
 _VOICES_PROB, _MAX_VOICES = 0.35, 6  # for a background with other speakers
+_MIN_BABBLE = 4  # voices of a background without a near voice
 _MIN_SNR_DB, _MAX_SNR_DB = 0.0, 25.0
 _MIN_PITCH, _MAX_PITCH = 0.75, 1.33  # for music and noise
 _TINY = 1e-9
@@ -57,6 +58,7 @@ class BatchSource:
     backgrounds: Sequence[Samples]  # music and noise
     columns: TargetColumns
     background_only_prob: float = 0.08  # of an excerpt without speech
+    babble_only_prob: float = 0.0  # of voices in the background of such an excerpt
 
     def draw(self, rng: np.random.Generator, probs: NDArray[np.float64]) -> Piece:
         """Draw a piece; ``probs`` are the cumulative probabilities."""
@@ -113,10 +115,12 @@ def _draw_excerpt(
     if is_only_background:
         targets[:] = np.nan
         targets[:, VOICE] = VoiceKind.NONE
-        sound = _add_background(sound, batch_source, rng, 0.0, with_voices=False) - sound
+        others = _background(batch_source, rng, batch_source.babble_only_prob, _MIN_BABBLE)
+        sound = add_sounds(sound, others, 0.0, rng) - sound
     elif not is_clean and rng.random() < _BACKGROUND_PROB:
         snr_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
-        sound = _add_background(sound, batch_source, rng, snr_db, with_voices=True)
+        others = _background(batch_source, rng, _VOICES_PROB, 1)
+        sound = add_sounds(sound, others, snr_db, rng)
     if not is_clean:
         sound = disturb(sound, rng)
     return Excerpt(clean, scale_level(sound.astype(np.float32), rng), targets, speed)
@@ -171,22 +175,16 @@ def _speech(
     return np.concatenate([*sounds, spare]), np.concatenate(rows)
 
 
-def _add_background(
-    sound: Sound,
-    batch_source: BatchSource,
-    rng: np.random.Generator,
-    snr_db: float,
-    *,
-    with_voices: bool,
-) -> Sound:
-    """Add music, noise or other voices, ``snr_db`` below a sound."""
-    if with_voices and rng.random() < _VOICES_PROB:
-        numbers = rng.integers(len(batch_source.pieces), size=int(rng.integers(1, _MAX_VOICES + 1)))
-        others = [batch_source.pieces[number].samples for number in numbers]
-    else:
-        background = batch_source.backgrounds[int(rng.integers(len(batch_source.backgrounds)))]
-        others = [_change_pitch(background, rng)]
-    return add_sounds(sound, others, snr_db, rng)
+def _background(
+    batch_source: BatchSource, rng: np.random.Generator, voices_prob: float, min_voices: int
+) -> list[Samples]:
+    """Draw other voices with a probability, otherwise music or noise at a random pitch."""
+    if rng.random() < voices_prob:
+        num_voices = int(rng.integers(min_voices, _MAX_VOICES + 1))
+        numbers = rng.integers(len(batch_source.pieces), size=num_voices)
+        return [batch_source.pieces[number].samples for number in numbers]
+    number = int(rng.integers(len(batch_source.backgrounds)))
+    return [_change_pitch(batch_source.backgrounds[number], rng)]
 
 
 def _change_pitch(samples: Samples, rng: np.random.Generator) -> Samples:

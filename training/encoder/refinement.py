@@ -8,7 +8,7 @@ same audio with a background, so no other teacher is needed:
 
 E, H and the outputs are those of :mod:`kouxing.training.encoder.network`; the targets are the
 teacher's outputs. The voiced parts of sung copies count as sung. Breath, and a background alone,
-count as no voice.
+count as no voice; the background may be several voices at once.
 
 The result is a weighted mean of the weights before and after. It is better than both: it keeps the
 lips in clean audio, and its lips are closer to those in clean audio if there is music or babble.
@@ -69,7 +69,7 @@ from kouxing.training.encoder.trainer import train_on_batches
 from kouxing.training.seed import SEED
 
 _LEARNING_RATE, _WARM_UP_STEPS, _DECAY_FRACTION = 5e-4, 60, 0.6
-_BACKGROUND_ONLY_PROB = 0.17
+_BACKGROUND_ONLY_PROB, _BABBLE_ONLY_PROB = 0.2, 0.15
 _NUM_SUNG_COPIES, _SUNG_WEIGHT = 900, 0.4  # sung copies; their total weight, relative to speech
 # chosen on held-out sounds: weight of the refined weights in the mean with the first ones, and the
 # number added to the logit of a sung voice
@@ -96,7 +96,9 @@ def refine(
     """
     saved = load_or_compute(samples_path, partial(_read_samples, recordings, errors))
     pieces = _pieces_of(saved)
-    batch_source = BatchSource(pieces, backgrounds, TargetColumns(0), _BACKGROUND_ONLY_PROB)
+    batch_source = BatchSource(
+        pieces, backgrounds, TargetColumns(0), _BACKGROUND_ONLY_PROB, _BABBLE_ONLY_PROB
+    )
     student = deepcopy(teacher).to(DEVICE)
     teacher.to(DEVICE)
     _, clean, _ = draw_refining_batch(batch_source, 0)
