@@ -97,14 +97,19 @@ function readCsv(lines) {
   const countColumn = titles.findIndex((title) => /^blendshapecount$/i.test(title));
   const rows = cells.filter((row) => row[countColumn]?.trim() !== "0");
   const times = rows.map((row) => row[timeColumn]);
-  const timesS = isTake ? readTimeCodes(times) : times.map(Number);
+  const timesS = isTake ? readTimeCodes(times) : times.map(readNumber);
   return {
     names: names[0] === "viseme" ? null : names,
     frames: rows.map((row, number) => [
       timesS[number] * RATE_HZ,
-      Float32Array.from(columns, (column) => (row[column] ? Number(row[column]) : NaN)),
+      Float32Array.from(columns, (column) => readNumber(row[column])),
     ]),
   };
+}
+
+/** Return the number in a cell; NaN for an empty or missing cell. */
+function readNumber(cell) {
+  return cell?.trim() ? Number(cell) : NaN;
 }
 
 /** Return the seconds since the first of the time codes HH:MM:SS:FF.fff, or HH:MM:SS;FF.fff if frames are dropped. */

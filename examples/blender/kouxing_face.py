@@ -177,15 +177,15 @@ def read_live_link(packet):
 
 def read_recording(path):
     """Return the times in seconds, the set and the weights by name of a .csv or .jsonl file."""
-    with Path(path).open(encoding="utf-8") as file:
-        if path.endswith(".csv"):
+    with Path(path).open(encoding="utf-8-sig") as file:
+        if path.lower().endswith(".csv"):
             rows = frames = list(csv.DictReader(file))
         else:
             frames = [json.loads(line) for line in file]
-            rows = [next(frame[name] for name in SETS if name in frame) for frame in frames]
+            rows = [next((frame[name] for name in SETS if name in frame), {}) for frame in frames]
     for set_name, entries in SETS.items():
         names = [shape for shape, _, _ in entries]
-        if rows[0].keys() >= set(names):
+        if rows and rows[0].keys() >= set(names):
             times_s = [float(frame["time_s"]) for frame in frames]
             return times_s, set_name, {name: [float(row[name]) for row in rows] for name in names}
     raise ValueError("its columns are not the shapes of ARKit, Oculus or VRM")
@@ -269,7 +269,7 @@ class KOUXING_OT_insert(bpy.types.Operator, ImportHelper):
         """Set a key frame for every frame of the file."""
         try:
             times_s, set_name, weights = read_recording(self.filepath)
-        except (OSError, KeyError, ValueError, IndexError, StopIteration) as error:
+        except (OSError, KeyError, ValueError, TypeError) as error:
             self.report({"ERROR"}, f"{self.filepath} is not a file of weights: {error}")
             return {"CANCELLED"}
         if text := find_problem(set_name):

@@ -27,7 +27,9 @@ test("reads recordings in JSON lines and CSV, with FAPs or shapes", () => {
   assert.deepEqual(readRecording(take + noFace), readRecording(take));
   assert.throws(() => readRecording(take.split("\n")[0] + "\n" + noFace), /no frames with a face/);
   assert.throws(() => readRecording("frame,jawOpen\n0,0.5\n"), /no times; add a column time_s/);
-  assert.throws(() => readRecording("time_s,jawOpen\n0,\n"), /frame 1 of the recording/);
+  for (const row of ["0,", "0, ", ",0.5", " ,0.5"]) {
+    assert.throws(() => readRecording(`time_s,jawOpen\n${row}\n`), /frame 1 of the recording: a value is missing/);
+  }
 });
 
 test("speech returns as frames, shapes, phones and sound", async () => {
