@@ -34,7 +34,7 @@ export class LipSync extends EventTarget {
   #ownsContext;
   #session = 0; // number of the newest
   #track = new FrameTrack(LIVE_TRACK_S);
-  #source = null; // { node, release() }
+  #source = null; // { node, notice: about the source, or "", release() }
   #choice = 0; // number of the newest choice of a source, or of none
   #startS = null; // start of the session on the context's clock; null before the first sound, and for push()
   #isPlayed = false; // whether the page plays the sound
@@ -95,12 +95,13 @@ export class LipSync extends EventTarget {
     };
     try {
       this.#check(choice);
-      if (track.getSettings().sampleRate <= TELEPHONE_HZ) this.#report(TEXTS.telephone);
+      const notice = track.getSettings().sampleRate <= TELEPHONE_HZ ? TEXTS.telephone : "";
+      if (notice) this.#report(notice);
       track.onended = () => {
         this.stop();
         this.#report(TEXTS.unplugged);
       };
-      await this.#follow(stream, choice, end);
+      await this.#follow(stream, choice, end, notice);
     } catch (error) {
       end();
       throw error;
@@ -190,8 +191,8 @@ export class LipSync extends EventTarget {
     if (this.#ownsContext) this.#context?.close();
   }
 
-  /** Follow the source of a choice. onRelease is called when it is no longer followed. */
-  async #follow(source, choice, onRelease = () => {}) {
+  /** Follow the source of a choice. onRelease is called when it is no longer followed. The notice is about the source. */
+  async #follow(source, choice, onRelease = () => {}, notice = "") {
     this.#checkOpen();
     const context = this.context;
     if (context.state === "closed") throw new Error("the audio context is closed; create lip sync with an open one");
@@ -211,6 +212,7 @@ export class LipSync extends EventTarget {
     if (output) changeFollowers(output, 1);
     this.#source = {
       node,
+      notice,
       release() {
         input.port.postMessage(null);
         node.disconnect(input);
@@ -318,7 +320,7 @@ export class LipSync extends EventTarget {
   #onContextState = () => {
     if (this.#source === null) return;
     if (this.#context.state === "interrupted") this.#report(TEXTS.interrupted);
-    else if (this.#context.state === "running") this.#report("");
+    else if (this.#context.state === "running") this.#report(this.#source.notice);
   };
 
   #onVisibility = () => {

@@ -36,6 +36,8 @@ def test_an_unknown_keyword_is_rejected_with_the_nearest(options: Any, hint: str
         ({"sample_rate_hz": 16000.0}, "must be an integer from 8000 to 48000, not 16000.0"),
         ({"num_channels": 3}, "num_channels must be an integer from 1 to 2, not 3"),
         ({"encoding": "mp3"}, "encoding must be one of s16le, f32le, not 'mp3'"),
+        ({"shapes": "arkit"}, r"shapes must be a list of sets, such as \['arkit'\]"),
+        ({"face": {"shapes": "vrm"}}, r"shapes must be a list of sets, such as \['vrm'\]"),
     ],
 )
 def test_wrong_values_are_rejected(options: Any, text: str) -> None:

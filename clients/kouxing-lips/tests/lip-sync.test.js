@@ -219,6 +219,21 @@ async function followMicrophone(lips) {
   await listening;
 }
 
+test("the notice about a telephone's sample rate stays when the sound starts, and when the tab is visible again", async () => {
+  stream.track.getSettings = () => ({ sampleRate: 8000 });
+  const lips = await LipSync.create({ context });
+  const notices = [];
+  lips.addEventListener("notice", ({ detail }) => notices.push(detail));
+  await followMicrophone(lips);
+  context.dispatchEvent(new Event("statechange"));
+  assert.match(notices.at(-1), /the microphone sends 8 kHz/);
+  for (globalThis.document.hidden of [true, false]) globalThis.document.dispatchEvent(new Event("visibilitychange"));
+  assert.match(notices.at(-1), /the microphone sends 8 kHz/);
+  await followWith(lips, new AudioBuffer());
+  context.dispatchEvent(new Event("statechange"));
+  assert.equal(notices.at(-1), "");
+});
+
 test("stop() releases the microphone", async () => {
   const lips = await LipSync.create({ context });
   await followMicrophone(lips);

@@ -72,7 +72,7 @@ def open_fields(name: str, options: SessionOptions) -> Fields:
     TypeError
         If a keyword is unknown.
     KouxingError
-        If the name is not valid, or the audio format is not supported.
+        If the name is not valid, the audio format is not supported, or ``shapes`` is a text.
     """
     _check_keywords("open_session", options, SessionOptions.__annotations__)
     check_name(name)
@@ -91,6 +91,7 @@ def open_fields(name: str, options: SessionOptions) -> Fields:
     _check_integer("num_channels", fields["num_channels"], 1, MAX_CHANNELS)
     face = face_fields(fields.get("face", {}))
     if shapes := fields.pop("shapes", ()):
+        _check_shapes(shapes)
         face["shapes"] = list(shapes)
     if face:
         fields["face"] = face
@@ -98,8 +99,12 @@ def open_fields(name: str, options: SessionOptions) -> Fields:
 
 
 def face_fields(settings: FaceSettings) -> Fields:
-    """Return the settings of a face as a dictionary. Raises ``TypeError`` for unknown keywords."""
+    """Return the settings of a face as a dictionary.
+
+    Raises ``TypeError`` for unknown keywords, and ``KouxingError`` if ``shapes`` is a text.
+    """
     _check_keywords("set_face", settings, FaceSettings.__annotations__)
+    _check_shapes(settings.get("shapes", ()))
     return {**settings}
 
 
@@ -131,6 +136,11 @@ def _check_keywords(function: str, given: Mapping[str, object], known: Collectio
             if "face" in known and name in FaceSettings.__annotations__:
                 hint = f"write face={{{name!r}: ...}}"
             raise TypeError(f"{function}() has no keyword {name!r}; {hint}")
+
+
+def _check_shapes(shapes: Sequence[str]) -> None:
+    if isinstance(shapes, str):  # a text is also a sequence of texts
+        raise KouxingError(f"shapes must be a list of sets, such as [{shapes!r}]")
 
 
 def _check_integer(name: str, value: object, lowest: int, highest: int) -> None:
