@@ -92,11 +92,11 @@ class EncodingCheck:
 
     def _judge(self, data: NDArray[np.uint8]) -> None:
         channels = (data.view("<i2") / FULL_SCALE).reshape(-1, self._num_channels).T
-        measures = [_measure(channel) for channel in channels]
-        flatness, correlation, rms = max(measures, key=lambda measure: measure.rms)
-        if rms < _SILENCE:
+        if channels.std(axis=1).max() < _SILENCE:
             self._packet_starts.clear()
             return
+        measures = [_measure(channel) for channel in channels]
+        flatness, correlation, rms = max(measures, key=lambda measure: measure.rms)
         self._num_blocks += 1
         self._is_done = self._num_blocks >= _MAX_BLOCKS
         white = [
