@@ -73,7 +73,7 @@ def test_rejects_a_text_that_does_not_fit(
     (tmp_path / "wrong.txt").write_text("今天是2024年10月1日，Mike走了", encoding="utf-8")
     output = tmp_path / "said.csv"
     with pytest.raises(typer.Exit) as ended:
-        align(DEMO / "hello-female.wav", str(tmp_path / "wrong.txt"), output=output)
+        align(VOWELS_FILE, str(tmp_path / "wrong.txt"), output=output)
     assert ended.value.exit_code == 1
     errors = capsys.readouterr().err
     assert "ignored: 'Mike'" in errors
