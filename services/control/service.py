@@ -130,7 +130,7 @@ class ControlService(Service):
     def on_tick(self, now_s: float) -> float:
         """Check for lost services, sessions that wait too long, and changed keys."""
         pause_s = self._tick_stall.check(now_s, expected_s=self._sleep_s)
-        self._registry.exclude_pause(pause_s - MAX_TICK_DELAY_S)
+        self._registry.exclude_pause(pause_s - MAX_TICK_DELAY_S, now_s)
         if self.bus.zap is not None:
             self.bus.zap.refresh()
             if self.bus.zap.version != self._keys_version:

@@ -258,9 +258,13 @@ class ServiceRegistry:
         if instance not in self._services:
             self._loads.pop(instance, None)
 
-    def exclude_pause(self, pause_s: float) -> None:
-        """Exclude a pause of control itself from the age of heartbeats."""
-        self._paused_s += max(0.0, pause_s)
+    def exclude_pause(self, pause_s: float, now_s: float) -> None:
+        """Exclude a pause of control itself, before ``now_s``, from the age of heartbeats."""
+        if pause_s <= 0.0:
+            return
+        self._paused_s += pause_s
+        for record in self._services.values():  # a heartbeat may have arrived after the pause
+            record.heartbeat_s = min(record.heartbeat_s, now_s - self._paused_s)
 
     def adapt_timeout(self, after_s: float, now_s: float) -> None:
         """Increase the heartbeat timeout if a service that was declared lost was only late.

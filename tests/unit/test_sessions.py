@@ -263,9 +263,18 @@ def test_services_become_silent_in_the_order_of_their_heartbeats(cluster: Cluste
     cluster.add(worker("recognizer", "recognizer-1"), now_s=2.0)
     assert cluster.registry.overdue_services(2.9) == []
     assert cluster.registry.overdue_services(3.5) == ["synthesizer-1"]
-    cluster.registry.exclude_pause(1.0)
+    cluster.registry.exclude_pause(1.0, 3.5)
     assert cluster.registry.overdue_services(3.5) == [], "control did not run"
     assert cluster.registry.overdue_services(6.5) == ["synthesizer-1", "recognizer-1"]
+
+
+def test_a_heartbeat_that_arrives_after_a_pause_of_control_is_not_from_the_future(
+    cluster: Cluster,
+) -> None:
+    cluster.add(worker("recognizer", "recognizer-1"), now_s=60.0)  # handled before the tick
+    cluster.registry.exclude_pause(58.0, 60.0)
+    assert cluster.registry.age_s("recognizer-1", 60.0) == 0.0
+    assert "recognizer-1" in cluster.registry.overdue_services(63.5)
 
 
 def test_waits_longer_for_heartbeats_after_a_service_was_late(cluster: Cluster) -> None:
