@@ -16,6 +16,7 @@ from kouxing.shared.face.shapes import ARKIT
 from tests.lips import phone
 
 RATE_HZ = 50.0
+HUGE = 10**400  # not a float
 JAW = FAP_NUMBER["open_jaw"] - 1
 ARKIT_JAW_HALF_OPEN = np.where(np.array(ARKIT.names) == "jawOpen", 0.5, 0.0)
 HEAD_YAW = FAP_NUMBER["head_yaw"] - 1
@@ -181,6 +182,9 @@ def test_reads_the_names_of_other_programs(
         ("a.csv", "time_s,jawOpen\n0,0.1\n0.02\n", "frame 2: a value is missing"),
         ("a.csv", "time_s,jawOpen\n0.1,0\n0,0\n", "frame 2: its time is earlier"),
         ("a.csv", "time_s,jawOpen\nnow,0\n", "every line needs a time in seconds"),
+        ("a.jsonl", '{"time_s": 0, "arkit": {"jawOpen": [0.1]}}', "frame 1: a value is missing"),
+        ("a.jsonl", f'{{"time_s": 0, "arkit": {{"jawOpen": {HUGE}}}}}', "frame 1: a value is"),
+        ("a.jsonl", f'{{"time_s": {HUGE}, "arkit": {{"jawOpen": 0}}}}', "a time in seconds"),
         ("a.csv", "time_s,jawOpen\n0,0\n40,0\n", "1 to 1000 frames per second"),
         ("a.csv", "Timecode,JawOpen\n00:01,0\n", "every line needs a time code"),
         ("a.csv", "", "the file is empty"),

@@ -244,6 +244,11 @@ def test_a_reading_aid_ends_with_its_ruby() -> None:
     assert extract_text(page)[0] == "汉字很好"
 
 
+def test_a_transcript_in_xml_may_contain_escaped_html() -> None:
+    transcript = '<transcript><text start="0">it&amp;#39;s &amp;lt;me&amp;gt;</text></transcript>'
+    assert extract_text(transcript)[0].strip() == "it's <me>"
+
+
 def test_text_next_to_the_times_of_a_cue_is_spoken() -> None:
     cues = "00:00.400 --> 00:01.000 align:start line:80%\nHello\n\n0:01 --> 0:02 Anna: hi\n"
     assert extract_text(cues)[0] == "Hello\nAnna: hi"

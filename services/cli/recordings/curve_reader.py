@@ -76,8 +76,9 @@ def read_table(path: Path) -> FapAnimation:
         try:
             times.append(row[names.index(time_name)])
             values.append(np.array([row[column] for column in columns], np.float64))
-            is_valid = len(row) == len(names) and (np.abs(values[-1]) <= _MAX_FAP).all()
-        except (ValueError, TypeError, IndexError):
+            is_whole = len(row) == len(names) and values[-1].ndim == 1
+            is_valid = is_whole and (np.abs(values[-1]) <= _MAX_FAP).all()
+        except (ValueError, TypeError, IndexError, OverflowError):
             is_valid = False
         if not is_valid:
             raise UserError(f"{path}, frame {number}: a value is missing or not a number")
@@ -183,7 +184,7 @@ def _parse_times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float
         fields = np.array(values, np.float64)
         if len(fields.T) == 0 or not np.isfinite(fields).all():
             raise ValueError
-    except ValueError:
+    except (ValueError, OverflowError):
         form = "a time code HH:MM:SS:FF.fff" if is_time_code else "a time in seconds"
         raise UserError(f"{path}: every line needs {form}") from None
     if not is_time_code:

@@ -67,6 +67,11 @@ def read_markup(text: str) -> str:
     return "".join(spoken)
 
 
+def read_escaped_markup(text: str) -> str:
+    """Extract the text from XML that contains HTML, such as ``it&amp;#39;s`` of YouTube."""
+    return html.unescape(read_markup(text))
+
+
 def _handle_tag(tag: re.Match[str], spoken: list[str], unspoken: list[str]) -> None:
     name = tag["tag"].lower().rpartition(":")[2]
     if tag["end"]:

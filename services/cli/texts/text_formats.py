@@ -92,7 +92,7 @@ _FORMATS: tuple[tuple[str, Callable[[str], object], Callable[[str], str]], ...] 
     ("SSML", _has_tag("speak"), markup.read_markup),
     ("TTML", _has_tag(r"(\w+:)?tt"), markup.read_markup),
     ("SAMI", _has_tag("sami"), markup.read_markup),
-    ("a transcript in XML", _has_tag("transcript|timedtext"), markup.read_markup),
+    ("a transcript in XML", _has_tag("transcript|timedtext"), markup.read_escaped_markup),
     ("HTML", _has_tag("!DOCTYPE html|html|body"), markup.read_markup),
     ("XML", _starts_with(r"<\?xml"), markup.reject_xml),
     ("Markdown", markup.MARKDOWN.search, markup.read_markdown),
