@@ -52,6 +52,7 @@ class FapAnimation:
     faps: NDArray[np.float32]  # (num_frames, 68), FAP units; FAP 1 and 2 hold the first selection
     visemes: NDArray[np.int64] | None = None  # (num_frames, 4), the numbers of FAP 1; None if unset
     expressions: NDArray[np.int64] | None = None  # (num_frames, 6), the numbers of FAP 2
+    start_s: float = 0.0  # time of the first frame in the session
 
 
 def read_fap(path: Path) -> FapAnimation:

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 
 from kouxing.services.cli.options import CurveFormat, ExportOptions
+from kouxing.services.cli.recordings.animation import read_motion
 from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, FrameStream
 from kouxing.services.cli.recordings.curve_reader import read_table
 from kouxing.shared.errors import UserError
@@ -81,6 +83,16 @@ def test_a_table_with_times_in_milliseconds_keeps_its_rate(tmp_path: Path, rate_
     animation = read_table(path)
     assert animation.frame_rate_hz == pytest.approx(rate_hz, rel=1e-3)
     assert len(animation.faps) == 240
+
+
+def test_the_times_of_a_table_are_those_of_its_sound(tmp_path: Path) -> None:
+    table, sound, faps = tmp_path / "face.csv", tmp_path / "s.wav", np.zeros(NUM_FAPS, np.float32)
+    write(table, FrameStream([(12.0 + number / RATE_HZ, number, faps) for number in range(3)]))
+    assert read_motion(table, None).frames[0][0] == 0.0
+    for duration_s, start_s in ((13, 12.0), (11, 0.0)):
+        soundfile.write(sound, np.zeros(16_000 * duration_s), 16_000)
+        times_s = [time_s for time_s, _ in read_motion(table, sound).frames]
+        assert times_s == pytest.approx([start_s, start_s + 0.02, start_s + 0.04])
 
 
 def test_live_link_table_has_the_columns_of_the_app(tmp_path: Path) -> None:

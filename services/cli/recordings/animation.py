@@ -28,6 +28,7 @@ from kouxing.services.recognizer.offline.offline_recognition import recognize_re
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
@@ -81,13 +82,20 @@ def has_motion(source: Path) -> bool:
 
 
 def read_motion(source: Path, sound: Path | None) -> FaceMotion:
-    """Read a ``.fap`` file or a table, with its sound, if any."""
+    """Read a ``.fap`` file or a table, with its sound, if any.
+
+    The times of a table are those of its sound. Without sound, or if the first time is not within
+    the sound, the motion starts at 0.
+    """
     animation = read_fap(source) if source.suffix.lower() == ".fap" else read_table(source)
+    samples = None if sound is None else read_mono_16k(sound)
+    sound_s = 0.0 if samples is None else len(samples) / MEDIA_RATE_HZ
+    start_s = animation.start_s if 0.0 <= animation.start_s < sound_s else 0.0
     return FaceMotion(
-        film.expand_frames(animation),
+        [(start_s + time_s, faps) for time_s, faps in film.expand_frames(animation)],
         animation.frame_rate_hz,
         min(animation.frame_rate_hz, _MAX_IMAGE_RATE_HZ),
-        None if sound is None else read_mono_16k(sound),
+        samples,
         source=sound or source,
     )
 

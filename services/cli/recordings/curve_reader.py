@@ -14,6 +14,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +92,10 @@ def read_table(path: Path) -> FapAnimation:
             raise UserError(f"{path}: the table has more than {MAX_FRAMES} frames; split it")
     if not times:
         raise UserError(f"{path}: the table has no frames with a face; record it again")
-    times_s = _parse_times_s(path, times, is_time_code=time_name == "timecode")
-    return _resample(path, times_s, np.array(values) @ basis)
+    is_time_code = time_name == "timecode"
+    times_s = _parse_times_s(path, times, is_time_code=is_time_code)
+    animation = _resample(path, times_s, np.array(values) @ basis)
+    return animation if is_time_code else replace(animation, start_s=float(times_s[0]))
 
 
 def _hint(column: str) -> str:
