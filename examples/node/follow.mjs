@@ -8,9 +8,10 @@
 // proto/PROTOCOL.md describes all messages and lists the names of the weights.
 
 import { setTimeout as sleep } from "node:timers/promises";
-import { ask, connectControl, read, subscribe } from "./kouxing.mjs";
+import { ask, connectControl, fail, read, subscribe } from "./kouxing.mjs";
 
 const JAW_OPEN = 24; // index in ARKit's names
+const LAST_FRAMES_MS = 500; // time for the last frames of a session that control has closed
 const [sessionName = "", controlAddress] = process.argv.slice(2);
 
 /** Return whether a frame is newer than another. After a move some frames arrive twice. */
@@ -54,15 +55,19 @@ const control = connectControl(controlAddress);
 const { session, session_id: sessionId, endpoints } = await findSession(control);
 const [, { services }] = await ask(control, "status-request", "");
 const { events } = services.find(({ service }) => service === "control").endpoints;
-const moves = subscribe(events, session, ["session-moved"]);
+const changes = subscribe(events, session, ["session-moved", "event"]);
 
 let epoch = 0;
 let newest = { media_time: -1, sequence: 0 };
 let publisher = endpoints.faps;
 follow(publisher);
-for await (const message of moves) {
-  const [, moved] = read(message);
-  if (moved.session_id !== sessionId) continue; // of an earlier session with this name
-  ({ epoch } = moved);
-  if (moved.faps !== publisher) follow(publisher = moved.faps);
+for await (const message of changes) {
+  const [kind, change] = read(message);
+  if (change.session_id !== sessionId) continue; // of an earlier session with this name
+  if (kind === "event") {
+    if (change.name === "session-closed") setTimeout(fail, LAST_FRAMES_MS, `control has closed the session: ${change.detail}`);
+    continue;
+  }
+  ({ epoch } = change);
+  if (change.faps !== publisher) follow(publisher = change.faps);
 }

@@ -20,6 +20,7 @@
 
 enum { KEY_LENGTH = 40, MAX_NAME = 64, MAX_ID = 128, MAX_ENDPOINT = 256 };
 enum { NUM_WEIGHTS = 52, JAW_OPEN = 24 }; /* index in ARKit's names */
+enum { LAST_FRAMES_MS = 500 }; /* time for the last frames of a session that control has closed */
 
 static void fail(const char *what) {
   fprintf(stderr, "follow: %s\n", what);
@@ -263,16 +264,19 @@ int main(int num_arguments, char **arguments) {
   void *face = zmq_socket(context, ZMQ_SUB);
   connect_to(face, endpoint, &key);
   set_subscription(face, ZMQ_SUBSCRIBE, "session-moved", name);
+  set_subscription(face, ZMQ_SUBSCRIBE, "event", name);
   set_subscription(face, ZMQ_SUBSCRIBE, "fap-frame", name);
   set_subscription(face, ZMQ_SUBSCRIBE, "end-of-faps", name);
   set_subscription(face, ZMQ_SUBSCRIBE, "joined", name); /* last, so no frame is missed */
 
   double epoch = 0, newest = -1, newest_number = 0; /* of the frames shown */
-  bool following = false;
+  bool following = false, is_closed = false;
   zmq_msg_t body;
   zmq_msg_init(&body);
   for (;;) {
-    char topic[MAX_NAME + 32];
+    char topic[MAX_NAME + 32], event[MAX_ID + 1];
+    zmq_pollitem_t arrival = {.socket = face, .events = ZMQ_POLLIN};
+    if (is_closed && zmq_poll(&arrival, 1, LAST_FRAMES_MS) == 0) fail("control has closed the session");
     Bytes message = receive(face, topic, sizeof topic, &body), shapes, at;
     double time = find_number(message, "media_time"), number = find_number(message, "sequence");
     if (!strncmp(topic, "end-of-faps/", 12) && find_number(message, "epoch") >= epoch) break;
@@ -291,6 +295,8 @@ int main(int num_arguments, char **arguments) {
       connect_to(face, endpoint, &key);
       set_subscription(face, ZMQ_UNSUBSCRIBE, "joined", name);
       set_subscription(face, ZMQ_SUBSCRIBE, "joined", name); /* after joining, the newest frames arrive again */
+    } else if (!strncmp(topic, "event/", 6)) {
+      is_closed |= find_text(message, "name", event, sizeof event) && !strcmp(event, "session-closed") && is_about(message, id);
     } else if (find(message, "shapes", &shapes) && find(shapes, "arkit", &at) &&
                (time > newest || (time == newest && number > newest_number))) {
       newest = time, newest_number = number;

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Collection
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import soundfile
 import zmq
 from kouxing_client import Client
 from kouxing_client.keys import Key
-from kouxing_client.messages import EndOfFaps, SessionState
+from kouxing_client.messages import EndOfFaps, Event, SessionState
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.fast_record import replace
@@ -321,7 +321,7 @@ class NamesakeControl(FakeControl):
             facts=FACTS,
         )
         report = super()._status(request)
-        control = replace(report.services[0], endpoints={"events": faps})
+        control = replace(report.services[0], service="control", endpoints={"events": faps})
         return replace(report, services=[control], sessions=[state])
 
 
@@ -341,6 +341,32 @@ def test_the_c_program_ignores_the_move_of_an_earlier_session(programs: list[lis
                 assert program.wait(LIMIT_S) == 0
             finally:
                 program.kill()
+
+
+@pytest.mark.usefixtures("new_keys")
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_program_ends_if_control_closes_the_session(
+    programs: list[list[str]], number: int
+) -> None:
+    with NamesakeControl() as control:
+        closed = Event(session="s", session_id="new", name="session-closed", detail="idle")
+        command = [*programs[number], "s", control.address]
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as program:
+            assert program.stdout is not None
+            assert program.stderr is not None
+            assert program.stdout.readline() == "following s\n"
+            control.publish(control.faps, replace(closed, session_id="old"))
+            try:
+                for _ in range(round(LIMIT_S)):  # until the subscription is in effect
+                    control.publish(control.faps, closed)
+                    with suppress(subprocess.TimeoutExpired):
+                        program.wait(1.0)
+                        break
+            finally:
+                program.kill()
+            assert program.returncode == 1
+            assert "control has closed the session" in program.stderr.read()
 
 
 @pytest.fixture(scope="module")
