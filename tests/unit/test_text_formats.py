@@ -244,6 +244,11 @@ def test_a_reading_aid_ends_with_its_ruby() -> None:
     assert extract_text(page)[0] == "汉字很好"
 
 
+def test_the_value_of_an_attribute_is_not_spoken() -> None:
+    page = """<body><p title="1 > 2">one <a href='x>y'>two <b id=o'clock>three</b></a></body>"""
+    assert extract_text(page)[0].strip() == "one two three"
+
+
 def test_a_transcript_in_xml_may_contain_escaped_html() -> None:
     transcript = '<transcript><text start="0">it&amp;#39;s &amp;lt;me&amp;gt;</text></transcript>'
     assert extract_text(transcript)[0].strip() == "it's <me>"
@@ -464,6 +469,9 @@ def test_reads_pinyin_with_any_punctuation(text: str) -> None:
     ("text", "spoken"),
     [
         ("<html>" + "<a " * 500_000, "<a " * 500_000),
+        ("<html></" + "a:" * 500_000, "</" + "a:" * 500_000),
+        ("<html>" + "<a '\"" * 200_000, "<a '\"" * 200_000),
+        ("[Events]\nDialogue: 0,0:00:00.00,0:00:01.00,D,,0,0,0,," + "{" * 500_000, "{" * 500_000),
         ("<html>" + "<![CDATA[" * 500_000, ""),
         ("<html>" + "<!--" * 500_000, ""),
         ("<html>" + "<title>" * 200_000 + "</x>" * 200_000, ""),

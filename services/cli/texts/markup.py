@@ -15,7 +15,9 @@ TAG = re.compile(
 )
 TIME_TAG = re.compile(r"<\d{1,3}:[\d:.]+>")
 _MARKUP = re.compile(  # matches in linear time
-    r"<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*)(?P<rest>[^<>]*)>|<[!?/][^<>]*>"
+    r"<(?P<end>/?)(?P<tag>[A-Za-z][\w:.-]*+)"
+    r"""(?P<rest>(?:[^<>"']|"[^"<]*"|'[^'<]*')*+(?=>)|[^<>]*)>"""  # a value may contain ">"
+    r"|<[!?/][^<>]*>"
     r"|(?P<data><?[^<]+|<)"
 )
 _ALIAS = re.compile(r"""\balias\s*=\s*(["'])(.*?)\1""", re.DOTALL)

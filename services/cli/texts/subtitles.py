@@ -113,7 +113,7 @@ def read_ass_dialogue(text: str) -> str:
         if kind.strip() == "Dialogue":
             values = dict(zip(fields, rest.strip().split(",", len(fields) - 1), strict=False))
             spoken = values.get("text", "")
-            if not re.search(r"\{[^}]*\\p[1-9]", spoken):  # a drawing
+            if not re.search(r"\{[^{}]*\\p[1-9]", spoken):  # a drawing
                 start = [float(part) for part in values.get("start", "0").split(":")]
                 events.append((start, re.sub(r"\\[Nnh]", "\n", _BRACES.sub("", spoken))))
     return "\n".join(spoken for _, spoken in sorted(events, key=lambda event: event[0]))
