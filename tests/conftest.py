@@ -49,7 +49,7 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_teardown(item: pytest.Item) -> None:
-    """After a failed test, end all fixtures, which it may have left in another state.
+    """After a failed test, tear down all fixtures: their state may have changed.
 
     The next test gets new services and pages, so one fault makes only one test fail.
     """

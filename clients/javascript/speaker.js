@@ -37,7 +37,7 @@ export class Speaker {
     this.#closed = new Promise((resolve) => {
       socket.onclose = ({ code, reason }) => {
         if (code === POLICY_VIOLATION) {
-          this.#failure = lastError ?? new Error(reason || "the gateway has ended the session; open another one");
+          this.#failure = lastError ?? new Error(reason || "the gateway has ended the session; open a new one");
         } else if (!this.#isClosing && !NORMAL_CODES.includes(code)) {
           this.#failure ??= new Error(reason || "the connection to the gateway is lost; open another session");
         }
@@ -73,7 +73,7 @@ export class Speaker {
         if (type === "opened") resolve(new Speaker(socket, session, encoding, error, closed));
         else reject(new Error(text));
       };
-      // Node 22 reports a failed connection only as an error. A WebSocket does not have the reason.
+      // Node 22 reports a failed connection only as an error. A WebSocket does not give the reason.
       socket.onerror = socket.onclose = () => {
         reject(
           new Error(
@@ -131,7 +131,7 @@ export class Speaker {
 
   #checkOpen() {
     if (this.#failure) throw this.#failure;
-    if (!this.#isOpen) throw new Error("the session has ended; open another one");
+    if (!this.#isOpen) throw new Error("the session has ended; open a new one");
   }
 }
 

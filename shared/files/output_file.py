@@ -123,7 +123,7 @@ def write_private(path: Path, content: bytes) -> None:
 
 
 def path_as_text(path: Path | str) -> str:
-    """Return a path as text that a file can contain. Bytes that are not UTF-8 are replaced."""
+    """Return a path as valid UTF-8 text. Bytes that are not UTF-8 are replaced."""
     return os.fsencode(path).decode("utf-8", "replace")
 
 

@@ -251,7 +251,7 @@ def test_results_may_be_read_in_several_event_loops(control: FakeControl) -> Non
 
 
 class ContendedQueue(deque[FapFrame]):
-    """A queue whose first message another reader takes first."""
+    """A queue whose first message is taken by another reader."""
 
     is_contended = True
 

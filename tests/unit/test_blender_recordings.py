@@ -1,4 +1,4 @@
-"""The Blender add-on reads recordings, without Blender: a fake of its modules is imported."""
+"""The Blender add-on reads recordings without Blender: fakes of its modules are imported."""
 
 import importlib.util
 import sys

@@ -138,7 +138,7 @@ test("a session continues after an error, unless the gateway closes the connecti
     socket.receive({ type: "opened", session: "voice" });
     const ending = (await rejected).finish();
     socket.onclose({ code: 1008, reason: "" });
-    await assert.rejects(ending, /the gateway has ended the session; open another one/);
+    await assert.rejects(ending, /the gateway has ended the session; open a new one/);
     const last = Speaker.open(GATEWAY, { closed: (error) => texts.push(error) });
     socket.receive({ type: "opened", session: "voice" });
     (await last).close();

@@ -198,7 +198,7 @@ def head_environment(settings: Settings, option: str, out: Path) -> dict[str, st
 
 
 def token_environment(settings: Settings) -> dict[str, str]:
-    """Return the environment in which a gateway keeps the page's token when it is restarted."""
+    """Return the environment that keeps the page's token when the gateway restarts."""
     gateway = settings.load(GatewayConfig)
     if gateway.token or not gateway.is_encrypted:
         return {}

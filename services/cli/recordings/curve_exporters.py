@@ -102,7 +102,7 @@ class CurveExporter(ABC):
         """
 
     def close(self) -> None:  # noqa: B027 - not abstract: there is nothing to do
-        """Release what the exporter keeps; an exporter of curves keeps nothing."""
+        """Release the exporter's resources; a curve exporter has none."""
 
 
 class CsvExporter(CurveExporter):
@@ -145,7 +145,7 @@ class FapExporter(CurveExporter):
     formats = (CurveFormat.FAPS,)
 
     def write(self, curves: FrameStream) -> int:
-        """Write the frames when the last one has arrived. The last face fills a gap in time."""
+        """Write the frames when the last one has arrived. Gaps repeat the face before them."""
         frames, frame_rate_hz = list(curves.rows), curves.frame_rate_hz
         times_s = np.array([time_s for time_s, _, _ in frames])
         if frame_rate_hz is None:

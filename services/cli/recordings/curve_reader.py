@@ -219,7 +219,7 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
 
 
 def _frame_rate_hz(steps_s: Float64) -> float:
-    """Return the median frame rate. The mean of equal steps removes the rounding of their times."""
+    """Return the median frame rate. Averaging equal steps cancels the rounding of their times."""
     median_s = np.median(steps_s)
     usual = np.abs(steps_s - median_s) < _ROUNDING_S
     return 1.0 / float(steps_s[usual].mean())
