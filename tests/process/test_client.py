@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ from kouxing_client import (
     KouxingError,
     Phone,
     Refused,
+    Result,
     Shapes,
     aio,
     find_key,
@@ -341,6 +342,20 @@ def test_values_of_numpy_do_not_end_the_client(control: FakeControl, client: Cli
     wait_until(lambda: control.audio_messages)
     assert control.audio_messages[0].media_time == 1600
     assert not client.is_closed
+
+
+class Odd(Result, frozen=True, kw_only=True):
+    """A message that no service publishes."""
+
+    kind: ClassVar[str] = "odd"
+    published_at: ClassVar[str] = "elsewhere"
+
+
+def test_results_that_the_session_does_not_publish_do_not_end_the_client(client: Client) -> None:
+    session = client.open_session("s")
+    with pytest.raises(KouxingError, match="session s has no endpoint 'elsewhere'"):
+        session.results(Odd)
+    assert session.frames()
 
 
 @pytest.mark.parametrize("is_async", [False, True])

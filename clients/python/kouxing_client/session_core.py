@@ -248,8 +248,12 @@ class SessionCore:
         if self.is_over:
             subscription.end(self.failure or KouxingError("the session is closed"))
             return
-        self._subscriptions.append(subscription)
-        subscription.start()
+        try:
+            subscription.start()
+        except KouxingError as error:  # such as an endpoint that the session does not have
+            subscription.end(error)
+        else:
+            self._subscriptions.append(subscription)
 
     def unsubscribe(self, subscription: Subscription) -> None:
         """End a subscription."""
