@@ -13,6 +13,7 @@ export class HeadAudio extends GainNode {
   #lips = null;
   #loading = null; // a promise
   #weights = []; // last reported weights
+  #isSpeaking = false; // last reported state
 
   /** @param context audio context of the sound */
   constructor(context) {
@@ -32,6 +33,8 @@ export class HeadAudio extends GainNode {
   async #load() {
     this.#lips = await LipSync.create({ context: this.context, shapes: ["oculus"] });
     this.#lips.addEventListener("voice", ({ detail: { timeS: t, isSpeaking } }) => {
+      if (isSpeaking === this.#isSpeaking) return; // the laughter has changed
+      this.#isSpeaking = isSpeaking;
       if (isSpeaking) this.onstarted?.({ event: "started", t });
       else this.onended?.({ event: "ended", t });
     });

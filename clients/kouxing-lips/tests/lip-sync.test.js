@@ -449,3 +449,23 @@ test("HeadAudio loads its models once if loadModel() is called twice", async () 
   await Promise.all(loading);
   assert.equal(FakeWorker.count, 1);
 });
+
+test("HeadAudio reports each start and end of speech once, whatever the laughter", async () => {
+  globalThis.GainNode = class extends AudioNode {
+    context = context;
+    connect() {}
+  };
+  const { HeadAudio } = await import("../headaudio.js");
+  const head = new HeadAudio(context);
+  const events = [];
+  head.onstarted = head.onended = ({ event }) => events.push(event);
+  const loading = head.loadModel();
+  await open();
+  await loading;
+  const { session } = FakeWorker.newest.messages.findLast(({ type }) => type === "open");
+  for (const [isSpeaking, isLaughing] of [[false, true], [true, true], [true, false], [false, false]]) {
+    const frames = [{ timeS: events.length, isSpeaking, isLaughing }];
+    FakeWorker.newest.onmessage({ data: { type: "frames", session, frames, phones: [], startS: 0 } });
+  }
+  assert.deepEqual(events, ["started", "ended"]);
+});
