@@ -45,7 +45,12 @@ export async function createWLipSyncNode(context, profile = null) {
   const lips = await LipSync.create({ context, shapes: ["vrm"] });
   const names = profile?.mfccs?.map(({ name }) => name) ?? Object.keys(VOWELS);
   const node = new WLipSyncAudioNode(context, lips, [...new Set(names)]);
-  await lips.listenTo(node);
+  try {
+    await lips.listenTo(node);
+  } catch (error) {
+    lips.close();
+    throw error;
+  }
   return node;
 }
 

@@ -450,6 +450,18 @@ test("HeadAudio loads its models once if loadModel() is called twice", async () 
   assert.equal(FakeWorker.count, 1);
 });
 
+test("a node of wLipSync that cannot follow the sound ends the worker", async () => {
+  globalThis.GainNode = class extends AudioNode {
+    context = context;
+  };
+  context.audioWorklet.addModule = async () => {
+    throw new Error("blocked");
+  };
+  const { createWLipSyncNode } = await import("../wlipsync.js");
+  await assert.rejects(createWLipSyncNode(context), /blocked/);
+  assert.ok(FakeWorker.newest.isTerminated);
+});
+
 test("HeadAudio reports each start and end of speech once, whatever the laughter", async () => {
   globalThis.GainNode = class extends AudioNode {
     context = context;
