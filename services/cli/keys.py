@@ -8,6 +8,7 @@ import typer
 from kouxing.services.service_kinds import KINDS
 from kouxing.shared.command.terminal import Force, check_output, print_message, print_table
 from kouxing.shared.errors import UserError
+from kouxing.shared.name_rules import NAME_RULE, is_name
 from kouxing.shared.settings.keys import (
     CLIENT,
     add_key,
@@ -47,6 +48,8 @@ def add(
     force: Force = False,
 ) -> None:
     """Create a key for another machine, and allow it immediately."""
+    if not is_name(name):
+        raise UserError(f"{name!r} is not a valid name; {NAME_RULE}")
     roles = roles or [CLIENT]
     path = output or Path(f"{name}.key")
     check_output(path, force=force)

@@ -180,6 +180,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("head export . --head ada", "leave out --head"),
         ("train --any-license heads --parts . -o .", "--any-license does not apply to heads"),
         ("keys add tablet", "tablet.key exists; add --force"),
+        ("keys add host/1", "'host/1' is not a valid name"),
         ("keys add host --role service:recogniser", "no service 'recogniser'; choose one of"),
         ("evaluate schemes --from-csv . --videos .", "add --videos FOLDER and --clips"),
         ("evaluate lips --clips . --from-csv . --delay-ms 9", "--delay-ms applies to lip models"),
