@@ -165,8 +165,13 @@ class DatagramConnection(TargetConnection):
         udp = socket.socket(family, kind, protocol)
         try:
             udp.setblocking(False)
-            udp.connect(address)
-            is_this_machine = udp.getsockname()[0] == udp.getpeername()[0]
+            try:
+                udp.connect(address)
+                is_this_machine = udp.getsockname()[0] == udp.getpeername()[0]
+            except PermissionError:  # a broadcast address, which includes this machine
+                udp.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+                udp.connect(address)
+                is_this_machine = True
             tracker_address = self.target.tracker_address
             if is_this_machine and tracker_address and tracker_address[1] == self.target.port:
                 raise TrackerPortError(self.target.port)  # packets would circulate forever

@@ -140,11 +140,20 @@ def test_an_error_that_ends_a_connection_is_reported(
     wait_until(lambda: "the connection ended: ValueError('no')" in str(reports))
 
 
+def test_a_broadcast_address_reaches_all_machines_of_a_network(senders: SenderPool) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("", 0))
+        receiver.settimeout(LIMIT_S)
+        senders.start(parse_target(f"osc://127.255.255.255:{receiver.getsockname()[1]}"))
+        assert receiver.recv(4096).startswith(b"#bundle")
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "127.255.255.255"])
 def test_a_tracker_must_not_receive_what_it_sends(
-    senders: SenderPool, monkeypatch: pytest.MonkeyPatch
+    senders: SenderPool, monkeypatch: pytest.MonkeyPatch, address: str
 ) -> None:
     resolve = socket.getaddrinfo
-    monkeypatch.setattr(socket, "getaddrinfo", lambda _, *args: resolve("127.0.0.1", *args))
+    monkeypatch.setattr(socket, "getaddrinfo", lambda _, *args: resolve(address, *args))
     port = free_udp_port()
     url = f"vmc://pc.local:{port}?camera=0.0.0.0:{port}"
     senders.start(parse_target(url))
