@@ -144,6 +144,10 @@ def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) ->
         pair_outputs(sources, tmp_path / "one.csv", ".csv")
 
 
+def test_the_output_of_standard_input_has_a_name_that_is_no_option() -> None:
+    assert pair_outputs([Path("-")], None, ".mp4") == [(Path("-"), Path("stdin.mp4"))]
+
+
 def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str]) -> None:
     done = []
 

@@ -17,8 +17,9 @@ def pair_outputs(
     """Return each source with its output, whose name ends in ``suffix``.
 
     ``output`` is the file for a single source, or a folder, which is created. None: the outputs are
-    next to their sources. Raises ``UserError`` if several sources need a folder, the folder cannot
-    be created, or two sources would have the same output.
+    next to their sources. The output of standard input is named ``stdin``. Raises ``UserError`` if
+    several sources need a folder, the folder cannot be created, or two sources would have the same
+    output.
     """
     if output is not None and len(sources) == 1 and not output.is_dir():
         return [(sources[0], output)]
@@ -33,7 +34,8 @@ def pair_outputs(
             raise write_error(output, error) from None
     pairs: dict[Path, tuple[Path, Path]] = {}  # key: resolved path of the output
     for source in sources:
-        target = (output or source.parent) / source.with_suffix(suffix).name
+        name = "stdin" if source == Path("-") else source.stem
+        target = (output or source.parent) / f"{name}{suffix}"
         if other := pairs.get(target.resolve()):
             raise UserError(
                 f"{other[0]} and {source} would both be written to {target}; rename one"

@@ -102,7 +102,7 @@ class CurveExporter(ABC):
         """
 
     def close(self) -> None:  # noqa: B027 - not abstract: there is nothing to do
-        """Release the exporter's resources; a curve exporter has none."""
+        """Release the exporter's resources. A curve exporter has no resources."""
 
 
 class CsvExporter(CurveExporter):
