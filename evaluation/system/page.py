@@ -43,7 +43,8 @@ def measure(path: Path, console: Console) -> dict[str, Drawing]:
 
     Raises ``UserError`` if the file is not audio, or the services or Chromium cannot start.
     """
-    with tempfile.TemporaryDirectory() as name:
+    # Processes of Chromium may still write to the profile after it has ended.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
         write_wav(folder / "voice.wav", *read_audio(path))
         with LocalSystem(folder, console) as system:
