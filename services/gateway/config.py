@@ -1,6 +1,7 @@
 """The gateway's configuration."""
 
 import re
+import secrets
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -86,6 +87,10 @@ class GatewayConfig(HeadConfig):
     def is_encrypted(self) -> bool:
         """Whether traffic from other machines is encrypted, here or by a proxy."""
         return bool(self.https)
+
+    def page_token(self) -> str:
+        """Return the configured token, a new one if traffic is encrypted, or else an empty one."""
+        return self.token or (secrets.token_urlsafe(16) if self.is_encrypted else "")
 
     @property
     def is_behind_proxy(self) -> bool:

@@ -83,7 +83,7 @@ def test_latency(speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_load_also_plots(speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(load, "SETTLE_S", 1.0)
     figures, picture = tmp_path / "load.json", tmp_path / "load.png"
-    arguments = ["load", str(speech), "--sessions", "2", "--seconds", "1", "--language", "zh"]
+    arguments = ["load", str(speech), "--sessions", "2", "--seconds", "1", "--language", "auto"]
     result = CliRunner().invoke(
         app, [*arguments, "--json", str(figures), "--picture", str(picture)]
     )

@@ -85,6 +85,14 @@ def test_a_table_with_times_in_milliseconds_keeps_its_rate(tmp_path: Path, rate_
     assert len(animation.faps) == 240
 
 
+def test_the_rate_of_a_table_with_two_different_steps_is_that_of_one_of_them(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "face.csv"
+    path.write_text("time_s,jawOpen\n0,0\n0.01,0.1\n0.06,0.2\n")
+    assert read_table(path).frame_rate_hz == pytest.approx(100.0)
+
+
 def test_the_times_of_a_table_are_those_of_its_sound(tmp_path: Path) -> None:
     table, sound, faps = tmp_path / "face.csv", tmp_path / "s.wav", np.zeros(NUM_FAPS, np.float32)
     write(table, FrameStream([(12.0 + number / RATE_HZ, number, faps) for number in range(3)]))

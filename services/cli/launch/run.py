@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import signal
 import sys
 import webbrowser
@@ -200,9 +199,9 @@ def head_environment(settings: Settings, option: str, out: Path) -> dict[str, st
 def token_environment(settings: Settings) -> dict[str, str]:
     """Return the environment that keeps the page's token when the gateway restarts."""
     gateway = settings.load(GatewayConfig)
-    if gateway.token or not gateway.is_encrypted:
+    if gateway.token or not (token := gateway.page_token()):
         return {}
-    return {variable_name("gateway", "token"): secrets.token_urlsafe(16)}
+    return {variable_name("gateway", "token"): token}
 
 
 def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:

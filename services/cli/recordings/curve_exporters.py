@@ -21,6 +21,7 @@ from rich.progress import Progress
 
 from kouxing.services.cli.options import CurveFormat, ExportOptions
 from kouxing.services.cli.recordings.cue_files import CUE_FORMATS, CUE_KINDS, format_cues
+from kouxing.services.cli.recordings.curve_reader import median_rate_hz
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -149,9 +150,7 @@ class FapExporter(CurveExporter):
         frames, frame_rate_hz = list(curves.rows), curves.frame_rate_hz
         times_s = np.array([time_s for time_s, _, _ in frames])
         if frame_rate_hz is None:
-            steps_s = np.diff(times_s)
-            steps_s = steps_s[steps_s > 0]
-            frame_rate_hz = float(1.0 / np.median(steps_s)) if len(steps_s) else 50.0
+            frame_rate_hz = median_rate_hz(times_s)
         faps = np.array([values for _, _, values in frames], np.float32).reshape(-1, NUM_FAPS)
         if frames:
             numbers = np.rint((times_s - times_s[0]) * frame_rate_hz)

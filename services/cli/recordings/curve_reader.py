@@ -209,7 +209,7 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
             " sort the frames by time"
         )
     times_s, first = np.unique(times_s - times_s[0], return_index=True)
-    rate_hz = _frame_rate_hz(np.diff(times_s)) if len(times_s) > 1 else 50.0
+    rate_hz = median_rate_hz(times_s)
     num_frames = round(times_s[-1] * rate_hz) + 1
     if not 1.0 <= rate_hz <= 1000.0 or num_frames > 10 * len(times_s) + 1000:
         raise UserError(f"{path}: the times must match a rate of 1 to 1000 frames per second")
@@ -218,8 +218,12 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
     return FapAnimation(path.stem, rate_hz, np.stack(columns, axis=1).astype(np.float32))
 
 
-def _frame_rate_hz(steps_s: Float64) -> float:
+def median_rate_hz(times_s: Float64) -> float:
     """Return the median frame rate. Averaging equal steps cancels the rounding of their times."""
-    median_s = np.median(steps_s)
+    steps_s = np.diff(times_s)
+    steps_s = steps_s[steps_s > 0]
+    if not len(steps_s):
+        return 50.0
+    median_s = np.quantile(steps_s, 0.5, method="lower")  # one of the steps
     usual = np.abs(steps_s - median_s) < _ROUNDING_S
     return 1.0 / float(steps_s[usual].mean())

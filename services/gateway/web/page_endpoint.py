@@ -1,6 +1,5 @@
 """Determines the page's URL, certificate and access policy from the configuration."""
 
-import secrets
 import socket
 import ssl
 from dataclasses import dataclass
@@ -32,7 +31,7 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     for the messages in which the gateway reports it.
     """
     host = config.advertise or (config.advertised_host if config.host in WILDCARDS else config.host)
-    token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
+    token = config.page_token()
     local_name = socket.gethostname().removesuffix(".local")  # macOS includes it
     own_names = (host, local_name, f"{local_name}.local", *config.names)
     names = {name.lower() for name in own_names}  # as `AccessPolicy` gets a request's host
