@@ -1,7 +1,7 @@
 // Plays the session that is shown: it keeps sound and image in sync and computes the face that is due.
 
 import { Lateness } from "./lateness.js";
-import { FapTrack, Playout } from "./playout.js";
+import { FapTrack, HOLD_AFTER_MS, Playout } from "./playout.js";
 import { SlidingWindow } from "./sliding-window.js";
 import { StreamActivity } from "./stream-activity.js";
 
@@ -59,6 +59,7 @@ export class Player {
     const nowMs = performance.now();
     this.playout.soundArrived(nowMs, mediaTime, samples.length);
     this.#sync(nowMs); // nothing else calls it while the page is hidden
+    setTimeout(() => this.#sync(performance.now()), HOLD_AFTER_MS);
     this.activity.soundArrived(nowMs);
     this.#sound.push(mediaTime, samples);
   }

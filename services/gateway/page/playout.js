@@ -26,6 +26,9 @@ const BURST_GAP_MS = 100; // if frames arrive later than this after a burst, the
 const RESTART_EARLY_WITH_LONG_CHUNKS_MS = 3000; // longer than a chunk, whose end is early
 const START_MS = 300; // time at the start in which the earliest arrivals set the offset
 const MAX_BEHIND_MS = 3000; // restart immediately if media time jumps ahead by more than this
+export const HOLD_AFTER_MS = 30; // sound waits for late sound after this time; most bursts of delayed sound are shorter
+const HOLD_MS = 1000; // … until no sound has been late for this long
+const ON_TIME_MS = 100; // sound that is later than the earliest by less than this is on time
 const MAX_FRAMES = 1000;
 
 /** Measures how long a condition has held. Time is injected. */
@@ -58,12 +61,15 @@ class Streak {
  * stall, the delayed data arrives in a burst. The burst is not measured, so the page is live when it ends.
  * If nothing arrives between bursts, the sender sends long chunks. Then all data is measured, and the offset
  * is that of the start of a chunk, which arrives latest.
+ *
+ * If the sender pauses, all later sound is late. Late sound therefore raises the offset at first, so that
+ * it is played. The offset falls again when sound is on time: then only the network or the machine was slow.
  */
 export class Playout {
   isAudible = true;
   outputLatencyMs = 0; // time from the audio thread to the loudspeaker; sound is played earlier by this
   imageDelayMs = 0; // time from computing a face until its image is visible; it is drawn earlier by this
-  offsetMs = null; // read only
+  #offsetMs = null; // without late sound
   #startMs = 0; // when the first offset was set
   #firstFrameMs; // the offset for the earliest frame
   #firstSoundMs; // the offset for the earliest sound
@@ -77,6 +83,10 @@ export class Playout {
   #numBursts = 0; // with nothing between them
   #burstEndMs = 0; // end of the last one
   #hasLongChunks = false;
+  #lateSounds = new SlidingWindow(HOLD_MS); // offsets at which late sound is played completely
+  #holding = new Streak(); // while there is late sound
+  #heldMs = null; // the offset for late sound
+  #usual = null; // { waitMs: of the latest sound until it is played, onTimeMs: maximum lateness of sound on time }
 
   constructor() {
     this.reset();
@@ -87,12 +97,14 @@ export class Playout {
     this.#burst = null;
     this.#numBursts = 0;
     this.#hasLongChunks = false;
+    this.#usual = null;
+    this.#release();
     this.#restart();
   }
 
   /** Start again after a pause of the stream. */
   #restart() {
-    this.offsetMs = null;
+    this.#offsetMs = null;
     this.#firstFrameMs = this.#firstSoundMs = Infinity;
     this.#targetMs = null;
     this.#lateFrames = new Streak();
@@ -108,28 +120,33 @@ export class Playout {
     this.soundEnds = new SlidingWindow(WINDOW_MS);
   }
 
+  /** Media time m is shown and audible at m + offset on the page's clock, ms; null before the first arrival. */
+  get offsetMs() {
+    return this.#offsetMs === null ? null : Math.max(this.#offsetMs, this.#heldMs ?? -Infinity);
+  }
+
   /** How long sound waits for its image, ms; null before any sound. */
   get delayMs() {
-    if (this.offsetMs === null || this.soundEnds.count === 0) return null;
+    if (this.#offsetMs === null || this.soundEnds.count === 0) return null;
     return this.offsetMs - this.soundEnds.percentile(0.05);
   }
 
   /** How long after its arrival a frame is visible, ms; null before any frame. */
   get frameWaitMs() {
-    if (this.offsetMs === null || this.frames.count === 0) return null;
+    if (this.#offsetMs === null || this.frames.count === 0) return null;
     return this.offsetMs - this.frames.percentile(0.5);
   }
 
   /** Media time that is due at a time, samples; null before the first arrival. */
   mediaAt(nowMs) {
-    return this.offsetMs === null ? null : (nowMs - this.offsetMs) * SAMPLES_PER_MS;
+    return this.#offsetMs === null ? null : (nowMs - this.offsetMs) * SAMPLES_PER_MS;
   }
 
   /** Record the arrival of a frame. Its media time must be greater than the previous frame's. */
   frameArrived(nowMs, mediaTime) {
     const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const outputMs = Math.max(this.imageDelayMs, this.outputLatencyMs);
-    const isEarly = this.offsetMs !== null && latenessMs + outputMs < this.offsetMs - RESTART_ERROR_MS;
+    const isEarly = this.#offsetMs !== null && latenessMs + outputMs < this.#offsetMs - RESTART_ERROR_MS;
     const maxEarlyMs = this.#hasLongChunks ? RESTART_EARLY_WITH_LONG_CHUNKS_MS : RESTART_EARLY_FOR_MS;
     if (this.#earlyFrames.update(nowMs, isEarly) > maxEarlyMs) this.#restart(); // the others were delayed
     this.#countBursts(nowMs, latenessMs);
@@ -142,6 +159,7 @@ export class Playout {
   soundArrived(nowMs, mediaTime, numSamples) {
     const startMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const endMs = startMs - numSamples / SAMPLES_PER_MS;
+    this.#holdLateSound(nowMs, startMs, endMs);
     if (this.#isLate(nowMs, endMs, this.#lateSound)) return;
     this.#start(nowMs, Infinity, endMs + FIRST_SOUND_DELAY_MS);
     this.soundStarts.add(nowMs, startMs);
@@ -151,7 +169,8 @@ export class Playout {
   /** Move the offset toward its target. Call it for every image. */
   adjust(nowMs) {
     this.#glide(nowMs);
-    if (this.offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
+    this.#updateHold(nowMs);
+    if (this.#offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
     if (this.frames.count < MIN_FRAMES) return;
     this.#adjustedMs = nowMs;
     const { percentile, marginMs, jumpMs } = this.isAudible || this.#hasLongChunks ? WITH_SOUND : WITHOUT_SOUND;
@@ -162,16 +181,43 @@ export class Playout {
       latestMs = Math.max(latestMs, soundMs);
     }
     this.#targetMs = latestMs + marginMs;
-    const errorMs = this.#targetMs - this.offsetMs;
-    if (Math.abs(errorMs) > jumpMs) this.offsetMs += errorMs / 2;
+    const errorMs = this.#targetMs - this.#offsetMs;
+    if (Math.abs(errorMs) > jumpMs) this.#offsetMs += errorMs / 2;
+    if (!this.#holding.holds && this.soundStarts.count) {
+      const waitMs = Math.max(0, this.#offsetMs - this.soundStarts.percentile(percentile));
+      this.#usual = { waitMs, onTimeMs: this.soundEnds.percentile(0.05) + ON_TIME_MS };
+    }
+  }
+
+  /** Raise the offset for late sound, until sound is on time. */
+  #holdLateSound(nowMs, startMs, endMs) {
+    if (this.#usual === null || this.#offsetMs === null || !this.isAudible) return;
+    if (endMs <= this.#usual.onTimeMs) this.#release();
+    else if (startMs + this.outputLatencyMs > this.#offsetMs) {
+      this.#lateSounds.add(nowMs, startMs + this.#usual.waitMs);
+    }
+  }
+
+  #updateHold(nowMs) {
+    const heldMs = this.#lateSounds.maxAt(nowMs);
+    const forMs = this.#holding.update(nowMs, heldMs !== null);
+    // No sound was on time, so the sender paused: keep the offset.
+    if (heldMs === null && this.#heldMs !== null) this.#offsetMs = Math.max(this.#offsetMs, this.#heldMs);
+    this.#heldMs = forMs < HOLD_AFTER_MS ? null : heldMs;
+  }
+
+  #release() {
+    this.#lateSounds.reset();
+    this.#holding = new Streak();
+    this.#heldMs = null;
   }
 
   #glide(nowMs) {
     const maxMs = MAX_GLIDE * (nowMs - this.#glidedMs);
     this.#glidedMs = nowMs;
     if (this.#targetMs === null) return;
-    const errorMs = this.#targetMs - this.offsetMs;
-    this.offsetMs += Math.max(-maxMs, Math.min(maxMs, errorMs));
+    const errorMs = this.#targetMs - this.#offsetMs;
+    this.#offsetMs += Math.max(-maxMs, Math.min(maxMs, errorMs));
   }
 
   /**
@@ -180,7 +226,7 @@ export class Playout {
    * can arrive long after its sound.
    */
   #start(nowMs, frameOffsetMs, soundOffsetMs) {
-    if (this.offsetMs === null) this.#startMs = nowMs;
+    if (this.#offsetMs === null) this.#startMs = nowMs;
     else if (nowMs - this.#startMs > START_MS) return;
     const choose = (first, next) => (this.#hasLongChunks && first < Infinity ? first : Math.min(first, next));
     const frameMs = choose(this.#firstFrameMs, frameOffsetMs);
@@ -189,8 +235,8 @@ export class Playout {
     this.#firstFrameMs = frameMs;
     this.#firstSoundMs = soundMs;
     const offsetMs = Math.max(...[this.#firstFrameMs, this.#firstSoundMs].filter(Number.isFinite));
-    if (offsetMs === this.offsetMs) return;
-    this.offsetMs = offsetMs;
+    if (offsetMs === this.#offsetMs) return;
+    this.#offsetMs = offsetMs;
     this.#forgetArrivals();
   }
 
@@ -207,8 +253,8 @@ export class Playout {
       }
       if (this.#numBursts >= NUM_BURSTS) this.#hasLongChunks = true;
       if (hasEnded || nowMs - this.#burst.sinceMs > BURST_MS) this.#burst = null;
-    } else if (this.offsetMs !== null && latenessMs > this.offsetMs + RESTART_ERROR_MS) {
-      this.#burst = { sinceMs: nowMs, offsetMs: this.offsetMs };
+    } else if (this.#offsetMs !== null && latenessMs > this.#offsetMs + RESTART_ERROR_MS) {
+      this.#burst = { sinceMs: nowMs, offsetMs: this.#offsetMs };
     } else if (nowMs - this.#burstEndMs > BURST_GAP_MS) {
       this.#numBursts = 0;
     }
@@ -220,12 +266,12 @@ export class Playout {
    * sender paused. Start again after a pause, or if media time jumped ahead.
    */
   #isLate(nowMs, latenessMs, streak) {
-    if (this.offsetMs === null) return false;
-    const lateMs = latenessMs - this.offsetMs;
+    if (this.#offsetMs === null) return false;
+    const lateMs = latenessMs - this.#offsetMs;
     const lateForMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : RESTART_ERROR_MS));
     const isPaused = lateForMs > RESTART_LATE_FOR_MS || (streak.holds && this.#hasLongChunks);
     if (isPaused || lateMs < -MAX_BEHIND_MS) this.#restart();
-    return this.offsetMs !== null && streak.holds;
+    return this.#offsetMs !== null && streak.holds;
   }
 }
 

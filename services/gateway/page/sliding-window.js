@@ -36,6 +36,12 @@ export class SlidingWindow {
     return this.percentile(0.5);
   }
 
+  /** Return the maximum of the values that are not too old at a time; null without values. */
+  maxAt(nowMs) {
+    this.#dropOld(nowMs);
+    return this.percentile(1);
+  }
+
   /** Return a percentile, given as a fraction from 0 to 1; null without values. */
   percentile(fraction) {
     if (this.#entries.length === 0) return null;
