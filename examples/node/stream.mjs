@@ -53,6 +53,7 @@ await faps.receive(); // joined: no later frame is missed
 
 async function speak() {
   const audio = connectDealer(opened.audio);
+  audio.receive().then((answer) => fail(read(answer)[1].text)); // only rejected audio is answered
   const rate = format.sample_rate_hz;
   const numFrames = Math.floor(pcm.length / frameBytes);
   const step = Math.floor(rate / 50); // 20 ms
@@ -80,3 +81,4 @@ for await (const message of faps) {
 
 await speaking;
 await ask(control, "close-session", session, { token });
+process.exit(); // the audio socket is still receiving

@@ -24,12 +24,12 @@ def export_web(
     """Write the models for lip sync in a browser, without a server."""
     from kouxing.services.cli.web_model import web_model
 
-    contents = web_model()
-    check_output(*(folder / name for name in contents if folder.is_dir()), force=force)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise write_error(folder, error) from error
+    contents = web_model()
+    check_output(*(folder / name for name in contents), force=force)
     for name, content in contents.items():
         with open_output(folder / name) as file:
             file.write(content)

@@ -20,7 +20,7 @@ from kouxing.services.cli.recordings.animation import FaceMotion, animate
 from kouxing.services.cli.recordings.cue_files import format_cues
 from kouxing.services.cli.texts.spoken_text import MAX_TEXT_BYTES
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.command.terminal import write_text
+from kouxing.shared.command.terminal import check_output, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.mouth_shapes import REST, Cue, mouth_cues
@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rate_hz = options.datFrameRate
         if options.exportFormat == "dat" and not 10.0 <= rate_hz <= 100.0:
             raise UserError(f"--datFrameRate {rate_hz:g}: choose 10 to 100 frames per second")
+        check_output(options.output, inputs=[Path(options.input), options.dialogFile], force=True)
         _report(options, "start", f"reading {options.input}", file=options.input)
         motion = _animate(options)
         _report(options, "progress", "finished", value=1.0)

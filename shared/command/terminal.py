@@ -158,6 +158,8 @@ def check_output(
             if not (sys.stdin.isatty() and CONSOLE.is_terminal):
                 raise UserError(f"{exists}; add --force to overwrite {them}")
             typer.confirm(f"{exists}. Overwrite {them}?", abort=True, err=True)
+        if path.is_fifo():  # its reader would see the end of the file
+            continue
         try:
             with path.open("a"):
                 pass

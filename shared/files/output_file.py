@@ -139,5 +139,8 @@ def write_error(path: Path, error: Any) -> UserError:
             f"cannot write {path}: the file is larger than 'ulimit -f' or the file system allows;"
             " raise the limit, or choose another disk"
         )
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        file = next(parent for parent in (path, *path.parents) if parent.exists())
+        return UserError(f"cannot write {path}: {file} is not a folder; choose another folder")
     remedy = "; choose another folder" if isinstance(error, PermissionError) else ""
     return UserError(f"cannot write {path}: {error.strerror or error}{remedy}")

@@ -231,6 +231,17 @@ def test_the_client_streams_wav_files(
     assert max(jaw) - min(jaw) > 100
 
 
+def test_the_client_ends_if_its_audio_is_rejected(
+    system: System, tmp_path: Path, client: list[str]
+) -> None:
+    samples = np.full(16000, np.nan, np.float32)
+    soundfile.write(tmp_path / "broken.wav", samples, 16000, "FLOAT")
+    arguments = [*client, str(tmp_path / "broken.wav"), system.control.partition(" ")[0]]
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as program:
+        assert "NaN" in program.communicate(timeout=LIMIT_S)[1]
+    assert program.returncode == 1
+
+
 def test_without_a_server_each_program_prints_one_line(
     programs: list[list[str]], client: list[str]
 ) -> None:

@@ -121,6 +121,17 @@ def test_a_service_whose_process_or_thread_cannot_be_started_is_started_again_la
         watched.check()
 
 
+def test_a_first_process_that_cannot_be_started_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start_process(*_: object, **__: object) -> EndedProcess:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(supervisor, "ServiceProcess", start_process)
+    with pytest.raises(UserError, match=r"cannot start control: .*; close other programs, or"):
+        Supervisor([], tmp_path, Console(), services=("control",)).start()
+
+
 def test_a_wrong_configuration_at_a_restart_is_reported_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -163,8 +163,13 @@ def test_errors_equal_rhubarbs(tmp_path: Path, capsys: pytest.CaptureFixture[str
     [
         (["-f", "dat", "--datFrameRate", "5"], ["--datFrameRate 5: choose 10 to 100"]),
         (["--logFile", "no/log.txt"], ["no/log.txt", "no such file"]),
+        (["-o", "no/mouths.tsv"], ["cannot write no/mouths.tsv: the folder does not exist"]),
     ],
-    ids=["a wrong frame rate, before the recording is read", "a log that cannot be written"],
+    ids=[
+        "a wrong frame rate, before the recording is read",
+        "a log that cannot be written",
+        "an output that cannot be written, before the recording is read",
+    ],
 )
 def test_each_problem_is_reported(
     capsys: pytest.CaptureFixture[str], options: list[str], problems: list[str]

@@ -3,6 +3,7 @@
 import errno
 import os
 import resource
+import select
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -220,6 +221,13 @@ def test_a_file_without_permission_has_a_remedy() -> None:
     assert str(write_error(Path("out/a.csv"), denied)) == text
 
 
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "new"):
+        error = CliRunner().invoke(app, ["export", "web", str(folder)]).exception
+        assert f"cannot write {folder}: {tmp_path / 'file'} is not a folder;" in str(error)
+
+
 def test_a_failed_export_keeps_the_older_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,6 +303,16 @@ def test_links_and_pipes_are_written_directly(tmp_path: Path) -> None:
     with os.fdopen(reader, encoding="utf-8") as text:
         write_text(pipe, "new")
         assert (pipe.is_fifo(), text.read()) == (True, "new")
+
+
+def test_the_check_of_a_pipe_does_not_end_its_reader(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)) as reader:
+        poll = select.poll()
+        poll.register(reader)
+        check_output(pipe)
+        assert poll.poll(0) == []
 
 
 def test_an_error_removes_neither_a_link_nor_its_target(tmp_path: Path) -> None:

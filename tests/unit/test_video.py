@@ -1,5 +1,6 @@
 """Videos and pictures, read back: pictures, sound, transparency and colors."""
 
+import os
 import resource
 import shutil
 import signal
@@ -178,6 +179,12 @@ def test_a_limit_of_the_file_size_leaves_no_file(tmp_path: Path) -> None:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
             signal.signal(signal.SIGXFSZ, handler)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_video_does_not_replace_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "out.mp4")
+    with pytest.raises(UserError, match="it is a pipe or device; use another name"):
+        VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, None)
 
 
 def test_a_folder_deleted_in_between_is_reported(tmp_path: Path) -> None:

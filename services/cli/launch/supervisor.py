@@ -103,9 +103,18 @@ class Supervisor:
             self.start_service(name, additions)
 
     def start_service(self, name: str, additions: Mapping[str, str]) -> None:
-        """Start a service, or start it again, with additions to the environment."""
+        """Start a service, or start it again, with additions to the environment.
+
+        Raises ``UserError`` if the system allows no more processes, threads or open files.
+        """
         service = self._services[name] = _Service(name, self._log_path(name), additions)
-        self._start(service)
+        try:
+            self._start(service)
+        except OSError as error:
+            raise UserError(
+                f"cannot start {name}: {error.strerror}; close other programs, or raise the limits"
+                " 'ulimit -u' and 'ulimit -n'"
+            ) from None
 
     def wait_ready(self, control: str) -> None:
         """Wait until all services have registered with control.

@@ -166,7 +166,7 @@ class GlbExporter(CurveExporter):
     formats = (CurveFormat.FAPS, CurveFormat.ARKIT)
 
     def write(self, curves: FrameStream) -> int:
-        """Write the frames when the last one has arrived."""
+        """Write the frames when the last one has arrived. The first live frame is at 0 s."""
         from kouxing.services.driver.head.glb_export import export_glb  # noqa: PLC0415 - slow
         from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
 
@@ -174,6 +174,8 @@ class GlbExporter(CurveExporter):
         for time_s, _, faps in curves.rows:
             if not frames or time_s > frames[-1][0]:  # media time stops while no audio arrives
                 frames.append((time_s, faps))
+        if frames and curves.is_live:
+            frames = [(time_s - frames[0][0], faps) for time_s, faps in frames]
         is_arkit = self._curve_format is CurveFormat.ARKIT
         export_glb(load_head(self._head), self._output, frames, as_arkit=is_arkit)
         return len(frames)

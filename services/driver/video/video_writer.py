@@ -185,8 +185,9 @@ class VideoWriter:
         self._sample_rate_hz = sample_rate_hz
         self._num_images = self._num_samples = 0
         try:
-            if self._path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, "it is a folder")
+            if self._path.exists() and not self._path.is_file():
+                kind = "folder" if self._path.is_dir() else "pipe or device"
+                raise OSError(errno.EINVAL, f"it is a {kind}; use another name")
             remove_unfinished(self._path.parent)
             self._unfinished = UnfinishedFile(self._path)
             container = suffix.removeprefix(".") or "mp4"
