@@ -1,13 +1,12 @@
 """The built-in heads, the configuration key ``head``, and the files of heads for the page."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BeforeValidator
-
 from kouxing.shared.face.config import FaceConfig
-from kouxing.shared.settings.config import KnownNames
+from kouxing.shared.settings.config import Check, KnownNames
 
 HEAD_NAMES = tuple(
     sorted(path.stem for path in (Path(__file__).parent / "driver/head/assets").glob("*.npz"))
@@ -29,12 +28,13 @@ def page_heads_folder() -> Path:
     return cache / "kouxing" / "heads"
 
 
+@dataclass(frozen=True, kw_only=True)
 class HeadConfig(FaceConfig):
     """The keys of services that show a head."""
 
     head: Annotated[
         str,
-        BeforeValidator(lambda name: name or DEFAULT_HEAD),  # gateway.head was once empty
+        Check(lambda name: name or DEFAULT_HEAD),  # gateway.head was once empty
         KnownNames(lambda: HEAD_NAMES, r".*\.\w+", ", or a file (.glb, .gltf, .vrm or .npz)"),
     ] = DEFAULT_HEAD
     """Head in windows, videos and the page: built in, or an avatar. A gateway without 'kouxing run'

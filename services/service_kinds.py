@@ -6,6 +6,7 @@ import secrets
 import socket
 import sys
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from kouxing.services.heads import HeadConfig
@@ -59,6 +60,7 @@ KINDS: dict[str, ServiceKind] = {  # in order of start
 }
 
 
+@dataclass(frozen=True, kw_only=True)
 class CommonConfig(HeadConfig, LiveConfig):
     """The keys of the table ``[common]``."""
 

@@ -1,8 +1,9 @@
 """Control's configuration."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import Field
+from msgspec import Meta
 
 from kouxing.shared.settings.config import BoundEndpoint, ServiceConfig
 from kouxing.shared.settings.endpoints import (
@@ -15,6 +16,7 @@ from kouxing.shared.settings.endpoints import (
 )
 
 
+@dataclass(frozen=True, kw_only=True)
 class ControlConfig(ServiceConfig):
     """The settings of control."""
 
@@ -23,15 +25,15 @@ class ControlConfig(ServiceConfig):
     control binds all addresses of its host."""
     events: BoundEndpoint = "tcp://127.0.0.1:5551"
     """Address that control binds to publish events."""
-    max_sessions: Annotated[int, Field(ge=1, le=1_000_000)] = 64
+    max_sessions: Annotated[int, Meta(ge=1, le=1_000_000)] = 64
     """Maximum number of open sessions. One key can open at most three quarters of them."""
-    max_load: Annotated[float, Field(ge=0.1, le=1000)] = 0.8
+    max_load: Annotated[float, Meta(ge=0.1, le=1000)] = 0.8
     """Control rejects new sessions that would keep a worker busy for more than this fraction of the
     time. The rest is reserved for sessions that move from another worker. 1000 admits all
     sessions."""
-    idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
+    idle_limit_s: Annotated[float, Meta(ge=1, le=86400)] = 60.0
     """Seconds without audio after which control closes a session."""
-    lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9
+    lost_after_s: Annotated[float, Meta(ge=0.5, le=3600)] = 0.9
     """Seconds without a heartbeat after which control declares a service lost. For drivers,
     gateways and workers without sessions, the limit is 0.75 s longer."""
 

@@ -1,14 +1,15 @@
 """The driver's configuration."""
 
 import re
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from msgspec import Meta
 
 from kouxing.services.heads import HeadConfig
 from kouxing.shared.name_rules import NAME
-from kouxing.shared.settings.config import KnownNames, Switch, ValueHint
+from kouxing.shared.settings.config import Check, KnownNames, ValueHint
 
 COLORS = {
     "black": "#000000", "white": "#ffffff", "gray": "#808080", "green": "#00b140",
@@ -50,6 +51,7 @@ def _check_size(text: str) -> str:
     return text
 
 
+@dataclass(frozen=True, kw_only=True)
 class DriverConfig(HeadConfig):
     """The driver's configuration keys."""
 
@@ -57,13 +59,13 @@ class DriverConfig(HeadConfig):
     """Whether to open a window. auto opens one if a display is available."""
     session: Annotated[
         str,
-        Field(pattern=f"^{NAME}$"),
+        Meta(pattern=rf"^{NAME}\Z"),
         ValueHint("newest, or the name of a session (up to 64 letters, digits, '-' and '_')"),
     ] = "newest"
     """Session to show. "newest" shows the session that was opened last."""
     out: str = "out"
     """Folder for recorded videos."""
-    max_videos: Annotated[int, Field(ge=1, le=1000)] = 8
+    max_videos: Annotated[int, Meta(ge=1, le=1000)] = 8
     """Maximum number of videos that are written at the same time. One key can use at most three
     quarters."""
     background: Annotated[
@@ -73,13 +75,13 @@ class DriverConfig(HeadConfig):
     camera: Framing = Framing.FACE
     """What fills the picture: the face, the head or the mouth. side shows the head at 60
     degrees."""
-    virtual_camera: Switch = False
+    virtual_camera: bool = False
     """Whether to offer the picture to other programs as a camera."""
     size: Annotated[
-        str, AfterValidator(_check_size), ValueHint("an even WIDTHxHEIGHT from 16x16 to 7680x4320")
+        str, Check(_check_size), ValueHint("an even WIDTHxHEIGHT from 16x16 to 7680x4320")
     ] = "1280x720"
     """Size of the window and of videos, in pixels."""
-    frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 25.0
+    frame_rate_hz: Annotated[float, Meta(ge=10, le=240)] = 25.0
     """Frames per second in videos and of the virtual camera. A window uses the display's refresh
     rate."""
 

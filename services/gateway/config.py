@@ -2,14 +2,13 @@
 
 import re
 import secrets
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import AfterValidator
-
 from kouxing.services.heads import HeadConfig
 from kouxing.shared.errors import UserError
-from kouxing.shared.settings.config import SPLIT_TEXT, BoundHost, BoundPort, HostNames, ValueHint
+from kouxing.shared.settings.config import BoundHost, BoundPort, Check, HostNames, ValueHint
 
 ADDRESS_SHARE = 0.75  # maximum fraction of each quota for one address, which may be a proxy
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
@@ -40,17 +39,16 @@ def _check_target(url: str) -> str:
 
 
 Origins = Annotated[
-    tuple[Annotated[str, AfterValidator(_check_origin)], ...],
-    SPLIT_TEXT,
+    tuple[Annotated[str, Check(_check_origin)], ...],
     ValueHint("a list of origins such as https://example.org"),
 ]
 Targets = Annotated[
-    tuple[Annotated[str, AfterValidator(_check_target)], ...],
-    SPLIT_TEXT,
+    tuple[Annotated[str, Check(_check_target)], ...],
     ValueHint("a list of addresses such as vmc://127.0.0.1:39540"),
 ]
 
 
+@dataclass(frozen=True, kw_only=True)
 class GatewayConfig(HeadConfig):
     """Configuration keys of the gateway."""
 
@@ -65,7 +63,7 @@ class GatewayConfig(HeadConfig):
     """Port at which the page is served; 0 uses any free port."""
     https: Annotated[
         str,
-        AfterValidator(_check_https),
+        Check(_check_https),
         ValueHint("empty, proxy, or the path of a PEM file such as kouxing.pem"),
     ] = ""
     """Path of a PEM file with a certificate and its private key. If the file does not exist, the

@@ -1,22 +1,22 @@
 """The recognizer's configuration."""
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated
 
-from pydantic import Field
+from msgspec import Meta
 
 from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRuleConfig
 from kouxing.shared.face.config import LiveConfig
-from kouxing.shared.settings.config import BoundEndpoint, KnownNames
+from kouxing.shared.settings.config import BoundEndpoint, KnownNames, derived_default
 
 MODEL_NAMES = ("blocks", "light", "gmm", "universal")
 
 
-def _rule_of_model(values: Mapping[str, Any]) -> OutputRuleConfig:
-    """Return the default output rule for the values of earlier keys."""
-    return MODEL_RULES.get(values.get("acoustic", ""), OutputRuleConfig())
+def _default_rule(config: "RecognizerConfig") -> OutputRuleConfig:
+    return MODEL_RULES.get(config.acoustic, OutputRuleConfig())
 
 
+@dataclass(frozen=True, kw_only=True)
 class RecognizerConfig(LiveConfig):
     """The keys of the recognizer."""
 
@@ -32,14 +32,14 @@ class RecognizerConfig(LiveConfig):
     ] = "blocks"
     """Acoustic model: blocks has the fewest errors, light suits weak machines, and universal has
     the phones of all languages."""
-    num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
-        default_factory=lambda values: _rule_of_model(values).num_stable_frames
+    num_stable_frames: Annotated[int, Meta(ge=1, le=20)] = derived_default(
+        lambda config: _default_rule(config).num_stable_frames
     )
     """Number of consecutive frames that must agree before a phone is emitted (N in Li 2011, where
     it is 3). More frames give fewer wrong phones, but later ones. The default is 1 if acoustic is
     light or gmm."""
-    min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
-        default_factory=lambda values: _rule_of_model(values).min_confidence
+    min_confidence: Annotated[float, Meta(ge=0, le=1)] = derived_default(
+        lambda config: _default_rule(config).min_confidence
     )
     """Confidence that the phone must reach in each of these frames. 0 is the rule of Li 2011. The
     default is 0.9 if acoustic is light or gmm."""

@@ -5,13 +5,14 @@ services. The environment variable of a key is ``KOUXING_<SERVICE>_<KEY>``, or `
 for all services. Within one source, a value for one service overrides a value for all services. An
 unknown key, table or variable is an error that names the nearest known one.
 
-Each service declares its keys as a subclass of ``ServiceConfig`` in its ``config.py``. pydantic
-checks types and ranges. pydantic-settings is not used: it has no table of common keys, ignores
-unknown variables, and does not report where a value came from. It would replace only the call to
-tomllib and the selection of variables by prefix.
+Each service declares its keys as a subclass of ``ServiceConfig`` in its ``config.py``. Types and
+ranges are checked with msgspec. The import of pydantic would take a quarter of the startup time of
+a service. The package pydantic-settings also has no table of common keys, ignores unknown
+variables, and does not report where a value came from.
 """
 
 import ast
+import dataclasses
 import difflib
 import inspect
 import itertools
@@ -26,18 +27,8 @@ from enum import Enum, StrEnum, auto
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from annotated_types import Ge, Le
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    ValidationError,
-)
-from pydantic.fields import FieldInfo
-from pydantic_core import core_schema
+import msgspec
+from msgspec import Meta
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content, read_text
@@ -49,6 +40,7 @@ from kouxing.shared.settings.endpoints import (
     with_host,
 )
 
+Mark = TypeVar("Mark")
 PREFIX = "KOUXING_"
 _MAX_FILE_BYTES = 64 << 10
 _MAX_DOTS = 1000  # per line; tomllib's memory grows with the square of a key's parts
@@ -72,6 +64,16 @@ class ValueHint:
 
 
 @dataclass(frozen=True, slots=True)
+class Check:
+    """Converts a value; raises ``ValueError`` if the value is not allowed.
+
+    The checks of a key run in their order, after its type and range are checked.
+    """
+
+    convert: Callable[[Any], Any]
+
+
+@dataclass(frozen=True, slots=True)
 class KnownNames:
     """Restricts a text to names, or texts that match ``pattern``, which ``others`` describes."""
 
@@ -82,11 +84,8 @@ class KnownNames:
     def __str__(self) -> str:
         return f"one of {', '.join(self.names())}{self.others}"
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        """Add the check to pydantic's schema of the key."""
-        return core_schema.no_info_after_validator_function(self._check, handler(source))
-
-    def _check(self, text: str) -> str:
+    def convert(self, text: str) -> str:
+        """Return a known name in its own case, or the text; raises as ``Check``."""
         name = text.strip()
         for known in (name, name.lower()):
             if known in self.names():
@@ -118,42 +117,36 @@ def _check_metrics(value: str) -> str:
     return value
 
 
-def _check_boolean(value: object) -> object:
-    # pydantic would also accept "yes", "on" and others
-    if isinstance(value, str) and value.lower() not in {"true", "false", "1", "0"}:
-        raise ValueError
-    return value
-
-
-def _split_text(value: object) -> object:
-    return tuple(value.split()) if isinstance(value, str) else value
-
-
-Switch = Annotated[bool, BeforeValidator(_check_boolean)]
-Endpoint = Annotated[
-    str, AfterValidator(_check_endpoint), ValueHint("an endpoint, tcp://HOST:PORT")
-]
+Endpoint = Annotated[str, Check(_check_endpoint), ValueHint("an endpoint, tcp://HOST:PORT")]
 BoundEndpoint = Annotated[Endpoint, BindAddress.ENDPOINT]
 Host = Annotated[
     str,
-    AfterValidator(_check_host),
+    Check(_check_host),
     ValueHint("a host name of at most 190 characters, or an address"),
 ]
 BoundHost = Annotated[Host, BindAddress.HOST]
-BoundPort = Annotated[int, Field(ge=0, le=65535), BindAddress.PORT]
-InstanceName = Annotated[str, Field(max_length=128), ValueHint("up to 128 characters")]
-LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(str.lower)]
-SPLIT_TEXT = BeforeValidator(_split_text)
-"""Marks a list: an array in a TOML file; elsewhere a text with spaces between the items."""
-HostNames = Annotated[tuple[Host, ...], SPLIT_TEXT, ValueHint("a list of host names")]
+BoundPort = Annotated[int, Meta(ge=0, le=65535), BindAddress.PORT]
+InstanceName = Annotated[str, Meta(max_length=128), ValueHint("up to 128 characters")]
+LOG_LEVELS = ("debug", "info", "warning", "error")
+HostNames = Annotated[tuple[Host, ...], ValueHint("a list of host names")]
 
 
-class ServiceConfig(BaseModel):
-    """The keys that every service has."""
+@dataclass(frozen=True, slots=True)
+class _DerivedDefault:
+    compute: Callable[[Any], Any]
 
-    # Checks are built on first use, and docstrings are read by ``_meanings``: this saves each start
-    # a third of its processor time.
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+def derived_default(compute: Callable[[Any], Any]) -> Any:
+    """Return a default that is computed from the configuration, which has the other keys."""
+    return dataclasses.field(default=_DerivedDefault(compute))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServiceConfig:
+    """The keys that every service has.
+
+    ``Settings`` checks the values; the constructor does not.
+    """
 
     safe_alternative: ClassVar[str] = "bind a loopback address"
     """Alternative to an unencrypted address that other machines can reach, for errors."""
@@ -164,18 +157,23 @@ class ServiceConfig(BaseModel):
     advertise: Host = ""
     """Host name or address at which others reach this service, for example behind NAT. If empty,
     the bound address is used; for 0.0.0.0, the address from which this host reaches control."""
-    insecure: Switch = False
+    insecure: bool = False
     """Accept unencrypted connections from anyone. docs/security.md describes the risks."""
-    log_level: LogLevel = "info"
+    log_level: Annotated[str, KnownNames(lambda: LOG_LEVELS)] = "info"
     """Lowest level of log messages to write."""
     instance: InstanceName = ""
     """Name of this process, different for each process. If empty, a name is generated."""
     metrics: Annotated[
-        str, AfterValidator(_check_metrics), ValueHint("HOST:PORT such as 127.0.0.1:9100, or empty")
+        str, Check(_check_metrics), ValueHint("HOST:PORT such as 127.0.0.1:9100, or empty")
     ] = ""
     """Address to bind for Prometheus metrics (/metrics) and the health check (/healthz), over plain
     HTTP. Empty turns both off. Services on one machine need different ports. With 0.0.0.0, other
     machines can read them."""
+
+    def __post_init__(self) -> None:
+        for key, value in vars(self).items():
+            if isinstance(value, _DerivedDefault):
+                object.__setattr__(self, key, value.compute(self))
 
     @property
     def advertised_host(self) -> str:
@@ -193,6 +191,79 @@ class ServiceConfig(BaseModel):
     def is_encrypted(self) -> bool:
         """Whether connections to the bound hosts are encrypted."""
         return False
+
+
+@dataclass(frozen=True, slots=True)
+class KeyType:
+    """The type of a key, and the marks of its annotation."""
+
+    kind: Any
+    marks: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, annotation: Any) -> "KeyType":
+        """Return the type that an annotation describes."""
+        if typing.get_origin(annotation) is Annotated:
+            return cls(annotation.__origin__, annotation.__metadata__)
+        return cls(annotation, ())
+
+    def mark(self, kind: type[Mark]) -> Mark | None:
+        """Return the mark of a type, or None."""
+        return next((mark for mark in self.marks if isinstance(mark, kind)), None)
+
+    @property
+    def is_list(self) -> bool:
+        """Whether it is a list: an array in a TOML file; elsewhere a text with spaces."""
+        return typing.get_origin(self.kind) is tuple
+
+    @property
+    def names(self) -> list[str]:
+        """The names that it allows; empty if it is not restricted to names."""
+        if known := self.mark(KnownNames):
+            return list(known.names())
+        if typing.get_origin(self.kind) is Literal:
+            return list(typing.get_args(self.kind))
+        is_enum = isinstance(self.kind, type) and issubclass(self.kind, StrEnum)
+        return list(self.kind) if is_enum else []
+
+    @property
+    def allowed(self) -> str:
+        """The allowed values in words, such as "an integer from 1 to 20"."""
+        if hint := self.mark(ValueHint):
+            return hint.text
+        if known := self.mark(KnownNames):
+            return str(known)
+        if self.names:
+            return f"one of {', '.join(self.names)}"
+        if self.kind is bool:
+            return "true or false"
+        limits = self.mark(Meta)
+        if limits is None:
+            return "text"
+        number = "a number" if self.kind is float else "an integer"
+        return f"{number} from {limits.ge} to {limits.le}"
+
+    def parse(self, text: str) -> Any:
+        """Return the value of a text; raises ``ValueError`` if it is not allowed."""
+        if self.is_list:
+            item = KeyType.of(typing.get_args(self.kind)[0])
+            return tuple(item.parse(part) for part in text.split())
+        limits = self.mark(Meta)
+        kind = Annotated[self.kind, limits] if limits else self.kind
+        value = msgspec.convert(text if kind is str else text.strip(), kind, strict=False)
+        for mark in self.marks:
+            if isinstance(mark, Check | KnownNames):
+                value = mark.convert(value)
+        return value
+
+
+def key_types(config_type: type[ServiceConfig], table: str = "") -> dict[str, KeyType]:
+    """Return the types of a table's keys. ``[common]`` has no ``instance``: names must differ."""
+    return {
+        field.name: KeyType.of(field.type)
+        for field in dataclasses.fields(config_type)
+        if (table, field.name) != (COMMON, "instance")
+    }
 
 
 Config = TypeVar("Config", bound=ServiceConfig)
@@ -281,34 +352,37 @@ class Settings:
                 value=getattr(config, key),
                 origin=values[key].origin if key in values else _DEFAULT,
                 default=getattr(defaults, key),
-                allowed=describe_allowed_values(field),
+                allowed=kind.allowed,
                 meaning=meanings[key],
             )
-            for key, field in _fields(self._table(config_type), config_type).items()
+            for key, kind in key_types(config_type, self._table(config_type)).items()
         ]
 
     def _resolve(self, config_type: type[Config]) -> tuple[Config, dict[str, _RawValue]]:
         table = self._table(config_type)
+        kinds = key_types(config_type)
         values = {
             key: layer[name, key]
             for layer in self._layers
             for name in (COMMON, table)
-            for key in config_type.model_fields
+            for key in kinds
             if (name, key) in layer
         }
-        try:
-            config = config_type.model_validate_strings({k: g.text for k, g in values.items()})
-        except ValidationError as error:
-            key = str(error.errors()[0]["loc"][0])
-            raise self._value_error((table, key), values[key]) from None
+        parsed = {}
+        for key, value in values.items():
+            try:
+                parsed[key] = kinds[key].parse(value.text)
+            except ValueError:
+                raise self._value_error((table, key), value) from None
+        config = config_type(**parsed)
         _check_hosts(table, config)
         return config, values
 
     def _table(self, config_type: type[ServiceConfig]) -> str:
         return next((n for n, known in self._tables.items() if known is config_type), COMMON)
 
-    def _keys(self, table: str) -> Mapping[str, FieldInfo]:
-        return _fields(table, self._tables[table])
+    def _keys(self, table: str) -> dict[str, KeyType]:
+        return key_types(self._tables[table], table)
 
     def _read_file(self, file: Path) -> Layer:
         text = read_text(file, _MAX_FILE_BYTES)
@@ -328,34 +402,27 @@ class Settings:
         layer = _make_layer({n: _as_text(v) for n, v in values.items()}, self._names, str(file))
         for name, value in values.items():
             table, key = address = self._names[name]
-            is_list = _is_list(self._keys(table)[key])
+            is_list = self._keys(table)[key].is_list
             if not isinstance(value, list if is_list else str | int | float):
                 raise self._value_error(address, layer[address])
         return layer
 
     def _value_error(self, address: Address, value: _RawValue) -> UserError:
         table, key = address
-        field = self._keys(table)[key]
-        similar = difflib.get_close_matches(value.text, _names(field), n=1, cutoff=0.5)
+        kind = self._keys(table)[key]
+        similar = difflib.get_close_matches(value.text, kind.names, n=1, cutoff=0.5)
         hint = f"; did you mean {similar[0]}?" if similar else ""
-        if _is_list(field):
+        if kind.is_list:
             hint = '; write ["A", "B"] in a file, and "A B" elsewhere'
         return UserError(
-            f"{table}.{key}: {value.text!r} (from {value.origin}) is not"
-            f" {describe_allowed_values(field)}{hint}"
+            f"{table}.{key}: {value.text!r} (from {value.origin}) is not {kind.allowed}{hint}"
         )
-
-
-def _fields(table: str, config_type: type[ServiceConfig]) -> Mapping[str, FieldInfo]:
-    """Return the keys of a table. ``[common]`` has no ``instance``: names must differ."""
-    fields = config_type.model_fields
-    return {key: fields[key] for key in fields if (table, key) != (COMMON, "instance")}
 
 
 def _meanings(config_type: type[ServiceConfig]) -> dict[str, str]:
     """Return the docstring of each key, on one line."""
     meanings = {}
-    for part in reversed(config_type.__mro__[: config_type.__mro__.index(BaseModel)]):
+    for part in reversed(config_type.__mro__[:-1]):
         tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
         for key, docstring in itertools.pairwise(ast.iter_child_nodes(tree.body[0])):
             match key, docstring:
@@ -364,51 +431,17 @@ def _meanings(config_type: type[ServiceConfig]) -> dict[str, str]:
     return meanings
 
 
-def _is_list(field: FieldInfo) -> bool:
-    return typing.get_origin(field.annotation) is tuple
-
-
 def variable_name(table: str, key: str) -> str:
     """Return the environment variable of a service's key, or of a common key for all services."""
     return PREFIX + (key if table == COMMON else f"{table}_{key}").upper()
-
-
-def describe_allowed_values(field: FieldInfo) -> str:
-    """Describe the allowed values of a key, such as "an integer from 1 to 20"."""
-    kind = field.annotation
-    marks: dict[type, Any] = {type(mark): mark for mark in field.metadata}
-    if ValueHint in marks:
-        return str(marks[ValueHint].text)
-    if KnownNames in marks:
-        return str(marks[KnownNames])
-    if names := _names(field):
-        return f"one of {', '.join(names)}"
-    if kind is bool:
-        return "true or false"
-    if kind is str:
-        return "text"
-    number = "a number" if kind is float else "an integer"
-    return f"{number} from {marks[Ge].ge} to {marks[Le].le}"
-
-
-def _names(field: FieldInfo) -> list[str]:
-    """Return the names that a key allows; empty if it is not restricted to names."""
-    kind = field.annotation
-    for mark in field.metadata:
-        if isinstance(mark, KnownNames):
-            return list(mark.names())
-    if typing.get_origin(kind) is Literal:
-        return list(typing.get_args(kind))
-    return list(kind) if isinstance(kind, type) and issubclass(kind, StrEnum) else []
 
 
 def bound_keys(config_type: type[ServiceConfig]) -> dict[str, BindAddress]:
     """Return the keys that are addresses which a service binds."""
     return {
         key: mark
-        for key, field in config_type.model_fields.items()
-        for mark in field.metadata
-        if isinstance(mark, BindAddress)
+        for key, kind in key_types(config_type).items()
+        if (mark := kind.mark(BindAddress))
     }
 
 

@@ -40,7 +40,7 @@ def test_ctrl_c_during_startup_prints_no_traceback() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "slow_import"),
-    [((*SERVICE, "recognizer"), "pydantic"), (("-m", "kouxing"), "typer")],
+    [((*SERVICE, "recognizer"), "msgspec"), (("-m", "kouxing"), "typer")],
 )
 def test_ctrl_c_in_imports_prints_nothing(
     tmp_path: Path, arguments: tuple[str, ...], slow_import: str

@@ -2,10 +2,8 @@
 
 import re
 from pathlib import Path
-from typing import Annotated
 
 import pytest
-from pydantic import TypeAdapter
 
 from kouxing.services.cli.configuration import config, markdown_page
 from kouxing.services.control.config import ControlConfig
@@ -133,11 +131,8 @@ def test_an_error_names_key_value_origin_and_what_is_allowed(
 
 
 def test_names_may_have_capitals() -> None:
-    known = TypeAdapter(Annotated[str, KnownNames(lambda: ("MyLips", "ferguson"))])
-    assert [known.validate_python(text) for text in ("MyLips", "Ferguson")] == [
-        "MyLips",
-        "ferguson",
-    ]
+    known = KnownNames(lambda: ("MyLips", "ferguson"))
+    assert [*map(known.convert, ("MyLips", "Ferguson"))] == ["MyLips", "ferguson"]
     assert settings(driver__background="Green").load(DriverConfig).background == "green"
     assert settings(driver__background="grey").load(DriverConfig).background == "grey"
     assert settings(gateway__https="Proxy").load(GatewayConfig).is_behind_proxy

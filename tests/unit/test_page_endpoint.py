@@ -6,8 +6,10 @@ from kouxing_client.messages import Message
 
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.web.page_endpoint import make_page_endpoint
+from kouxing.services.service_kinds import CONFIG_TYPES
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
+from kouxing.shared.settings.config import Settings
 from kouxing.shared.wire.codec import decode, encode
 from tests.samples import SAMPLES
 
@@ -53,5 +55,6 @@ def test_host_names_may_have_capital_letters(
 
 
 def test_trusted_origins_may_have_capital_letters() -> None:
-    config = GatewayConfig(trusted_origins=("https://Face.example.org:8443",))
+    assignments = {"gateway.trusted_origins": "https://Face.example.org:8443"}
+    config = Settings(CONFIG_TYPES, environment={}, assignments=assignments).load(GatewayConfig)
     assert config.trusted_origins == ("https://face.example.org:8443",)

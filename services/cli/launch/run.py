@@ -41,7 +41,13 @@ from kouxing.services.service_kinds import (
 from kouxing.shared.command.terminal import CONSOLE, command_name, plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.interrupt import clear_interrupt, install_interrupt_handler
-from kouxing.shared.settings.config import COMMON, Settings, parse_assignments, variable_name
+from kouxing.shared.settings.config import (
+    COMMON,
+    Settings,
+    key_types,
+    parse_assignments,
+    variable_name,
+)
 from kouxing.shared.settings.endpoints import WILDCARDS, split_endpoint, with_host
 from kouxing.shared.settings.keys import check_keys, control_endpoint
 
@@ -210,7 +216,7 @@ def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
     for name, value in assignments.items():
         table, _, key = name.partition(".")
         for service, config_type in CONFIG_TYPES.items():
-            if service == table or (table == COMMON and key in config_type.model_fields):
+            if service == table or (table == COMMON and key in key_types(config_type)):
                 environment[variable_name(service, key)] = value
     return environment
 
