@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from onnx import TensorProto, helper
 
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind, load_encoder
@@ -25,6 +26,7 @@ from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
 from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import EncoderShape
+from kouxing.training.networks.onnx_graph import Graph
 from tests.corpora import write_noises, write_speech
 from tests.lip_clips import clip_name_for, write_training_clip
 from tests.system import HELLO
@@ -78,6 +80,20 @@ def test_voices_in_the_background_only_are_no_voice(
     (excerpt,) = draw_excerpts(batch_source, 0)
     assert bool((np.abs(excerpt.disturbed) > 0.001).any()) is (babble_only_prob == 1.0)
     assert (excerpt.targets[:, VOICE] == VoiceKind.NONE).all()
+
+
+def test_integer_products_are_exact_on_every_processor() -> None:
+    graph = Graph()
+    weights = {"sum.weight": np.ones((3, 64), np.float32), "sum.bias": np.zeros(3, np.float32)}
+    graph.node("Identity", [graph.product("rows", weights, "sum")], "sums")
+    file = graph.file(
+        "sums",
+        [helper.make_tensor_value_info("rows", TensorProto.FLOAT, [2, 64])],
+        [helper.make_tensor_value_info("sums", TensorProto.FLOAT, [2, 3])],
+    )
+    session = create_inference_session(file.tobytes())
+    (sums,) = session.run(None, {"rows": np.ones((2, 64), np.float32)})
+    np.testing.assert_allclose(sums, 64, rtol=1e-5)
 
 
 def test_exported_steps_follow_pytorch() -> None:
