@@ -34,6 +34,12 @@ from kouxing.shared.service.service_kind import ServiceKind
 _LINE_END = re.compile(r"(?<!\n)\n(?!\n)")  # within a paragraph
 ENTRY_POINTS = "kouxing.commands"  # such as training and evaluation
 _VALUE_NAMES = {"bool": "", "str": "TEXT", "path": "PATH", "int": "NUMBER", "float": "NUMBER"}
+_RENDER_PANELS = {  # names of options
+    "Speech": ("text", "language", "track", "live"),
+    "Lips": ("lips", "mouth", "expressiveness"),
+    "Picture": ("head", "size", "background", "camera", "rate", "captions", "speed", "at"),
+    "Curves": ("curve_format", "sound"),
+}
 _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 _PYTHON_TYPE = re.compile(r"<(?:list\[)?(\w+)(?: range)?\]?>")
 
@@ -60,6 +66,8 @@ class CommandGroup(TyperGroup):
         command = super().get_command(ctx, cmd_name)
         if command is not None:
             _simplify_help(command, ctx)
+        if cmd_name == "render":
+            _group_options(command, _RENDER_PANELS)
         return command
 
     def get_params(self, ctx: Any) -> Any:
@@ -75,6 +83,13 @@ class CommandGroup(TyperGroup):
                 command.name = entry_point.name
                 command.rich_help_panel = command.rich_help_panel or Panel.MEASURE
                 self.add_command(command)
+
+
+def _group_options(command: Any, panels: Mapping[str, Sequence[str]]) -> None:
+    for parameter in command.params:
+        for panel, names in panels.items():
+            if parameter.name in names:
+                parameter.rich_help_panel = panel
 
 
 def _simplify_help(command: Any, ctx: Any) -> None:

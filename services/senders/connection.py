@@ -83,7 +83,6 @@ class DatagramConnection(TargetConnection):
                 if self._socket is None:
                     try:
                         self._socket = await self._open()
-                        self.problem = self._tracker_problem
                     except TrackerPortError as error:
                         self.problem = str(error)
                     except OSError as error:

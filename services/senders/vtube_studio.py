@@ -21,6 +21,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import write_private
 from kouxing.shared.files.user_file import parse_json, read_text
 from kouxing.shared.monitoring.logs import LOG
+from kouxing.shared.settings.endpoints import is_loopback
 from kouxing.shared.settings.keys import key_folder
 
 _TOKENS = "vtube-studio.json"
@@ -207,6 +208,8 @@ class VTubeStudioConnection(TargetConnection):
     def __init__(self, target: Target) -> None:
         super().__init__(target)
         self._address = f"{target.host}:{target.port}"
+        host = "127.0.0.1" if is_loopback(target.host) else target.host
+        self._token_name = f"{host}:{target.port}"
         self._newest: asyncio.Queue[FaceFrame] = asyncio.Queue(1)
         self._is_ready = False
 
@@ -245,7 +248,8 @@ class VTubeStudioConnection(TargetConnection):
         async with asyncio.timeout(TIMEOUT_S):
             vtube_studio = await http.ws_connect(f"ws://{host}:{self.target.port}", timeout=limit)
         async with vtube_studio:
-            protocol = VTubeStudioProtocol(_read_tokens().get(self._address, ""), self._save_token)
+            token = _read_tokens().get(self._token_name, "")
+            protocol = VTubeStudioProtocol(token, self._save_token)
             writer: asyncio.Task[None] | None = None
             try:
                 await vtube_studio.send_str(protocol.first_message())
@@ -281,7 +285,7 @@ class VTubeStudioConnection(TargetConnection):
         path = key_folder() / _TOKENS
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            write_private(path, json.dumps({**_read_tokens(), self._address: token}).encode())
+            write_private(path, json.dumps({**_read_tokens(), self._token_name: token}).encode())
         except OSError as error:
             LOG.warning("cannot write %s, so VTube Studio will ask again: %s", path, error.strerror)
 

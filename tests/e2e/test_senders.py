@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import json
 import socket
 import threading
@@ -20,7 +21,7 @@ from kouxing.services.gateway.senders_api import SendersApi
 from kouxing.services.senders import connection, vtube_studio
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.live_link import LiveLinkConnection
-from kouxing.services.senders.protocols import parse_target
+from kouxing.services.senders.protocols import make_connection, parse_target
 from kouxing.services.senders.sender_pool import MAX_SENDERS, SenderPool
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
@@ -119,6 +120,33 @@ def test_an_unknown_host_does_not_delay_other_targets(
     senders.start(parse_target(f"livelink://127.0.0.1:{receiver.getsockname()[1]}"))
     assert receiver.recv(2000)
     wait_until(lambda: "cannot reach nowhere.invalid" in problem_of(senders, lost))
+
+
+def test_a_firewall_is_reported_without_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    osc = make_connection(parse_target("osc://127.0.0.1:9000"))
+    send, refused = socket.socket.send, list[bytes]()
+
+    def refuse(sender: socket.socket, data: bytes) -> int:
+        if sender.type != socket.SOCK_DGRAM:
+            return send(sender, data)
+        refused.append(data)
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    async def collect_problems() -> set[str]:
+        problems = set()
+        connecting = asyncio.create_task(osc.run())
+        async with asyncio.timeout(LIMIT_S):
+            while len(refused) < 5:  # the socket was opened 5 times
+                if refused:
+                    problems.add(osc.problem)
+                osc.send(FaceFrame(OPEN_MOUTH, 0.0))
+                await asyncio.sleep(0.01)
+        connecting.cancel()
+        return problems
+
+    monkeypatch.setattr(socket.socket, "send", refuse)
+    (problem,) = asyncio.run(collect_problems())
+    assert problem.startswith("cannot reach 127.0.0.1:9000: Operation not permitted")
 
 
 def test_an_error_of_a_protocol_does_not_affect_other_targets(
@@ -246,6 +274,10 @@ def test_the_permission_of_vtube_studio_is_requested_once(senders: SenderPool) -
         wait_until(lambda: bool(stub.frames))
         assert stub.requests == ["AuthenticationRequest", "InputParameterListRequest"]
         assert problem_of(senders, url) == ""
+        senders.stop(parse_target(url))
+        senders.start(parse_target(f"vts://localhost:{port}"))
+        wait_until(lambda: len(stub.requests) == 4)
+        assert stub.requests[2:] == ["AuthenticationRequest", "InputParameterListRequest"]
 
 
 def test_a_sender_can_be_stopped_while_its_connection_ends(

@@ -84,16 +84,6 @@ def render(
             help="Folder for the videos of several files. Default: next to each file.",
         ),
     ] = None,
-    lips: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Lip model, such as learned or dynamic-visemes; repeat it to show several faces"
-            " side by side."
-        ),
-    ] = None,
-    live: Annotated[
-        bool, typer.Option("--live", help="Show what a viewer of the live stream would see.")
-    ] = False,
     text: Annotated[
         str | None,
         typer.Option(
@@ -102,14 +92,21 @@ def render(
         ),
     ] = None,
     language: Language = None,
-    curve_format: Annotated[
-        CurveFormat | None,
+    track: AudioTrack = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="Show what a viewer of the live stream would see.")
+    ] = False,
+    lips: Annotated[
+        list[str] | None,
         typer.Option(
-            "--as",
-            metavar="VALUES",
-            help=f"Values of a curve file: {', '.join(CurveFormat)}. Default: faps; rhubarb (drawn"
-            " mouths) in .tsv, .xml and .json.",
+            help="Lip model, such as learned or dynamic-visemes; repeat it to show several faces"
+            " side by side."
         ),
+    ] = None,
+    mouth: MouthFile = None,
+    expressiveness: Annotated[
+        float | None,
+        typer.Option(min=0.5, max=2, help="Size of the mouth movements; not for curves."),
     ] = None,
     head: HeadName = _DEFAULTS.head,
     size: Annotated[
@@ -144,14 +141,17 @@ def render(
     speed: Annotated[
         float, typer.Option(min=0.25, max=1, help="Speed at the same pitch; 0.5 is half as fast.")
     ] = _DEFAULTS.speed,
-    track: AudioTrack = None,
-    sound: Annotated[Path | None, typer.Option(help="Audio file to add to curves.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of a single picture, seconds.")] = None,
-    mouth: MouthFile = None,
-    expressiveness: Annotated[
-        float | None,
-        typer.Option(min=0.5, max=2, help="Size of the mouth movements; not for curves."),
+    curve_format: Annotated[
+        CurveFormat | None,
+        typer.Option(
+            "--as",
+            metavar="VALUES",
+            help=f"Values of a curve file: {', '.join(CurveFormat)}. Default: faps; rhubarb (drawn"
+            " mouths) in .tsv, .xml and .json.",
+        ),
     ] = None,
+    sound: Annotated[Path | None, typer.Option(help="Audio file to add to curves.")] = None,
     force: Force = False,
 ) -> None:
     """Render a recording, or existing animation curves, as a video, images or curves.

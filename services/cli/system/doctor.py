@@ -186,5 +186,4 @@ def _endpoint_problem(
                 f"it does not accept the key {key_name}; check its roles with 'kouxing keys list'"
                 " on control's machine, or restart the service"
             )
-        return ""
     return ""
