@@ -70,7 +70,7 @@ export class LipEngine {
   push(samples: Float32Array): LipFrame[];
   /** Phones that the last push() or finish() found or changed. */
   readonly newPhones: LipPhone[];
-  /** End the audio; return the remaining frames, until the face is at rest. */
+  /** End the audio; return the remaining frames, until the face is at rest. Further audio needs another engine. */
   finish(): LipFrame[];
   /** Show expressions, strengths 0 to 1, for some seconds. */
   express(strengths: Partial<Record<ExpressionName, number>>, holdS?: number): void;

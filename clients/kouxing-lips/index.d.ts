@@ -45,9 +45,9 @@ export class LipSync extends EventTarget {
    * Rejects with an AbortError if another source is chosen, or stop() or close() is called, while it opens.
    */
   listenTo(source: MediaStream | MediaStreamTrack | AudioBuffer | HTMLMediaElement | AudioNode): Promise<void>;
-  /** Start a session for push(). */
+  /** Start a session for push(). Rejects with an AbortError in the same cases as listenTo(). */
   open(sampleRateHz: number): Promise<void>;
-  /** Accept PCM, mono in [-1, 1]. It may arrive faster than real time. */
+  /** Accept PCM, mono in [-1, 1]. It may arrive faster than real time. Throws an error unless open() has opened a session. */
   push(samples: Float32Array): void;
   /** End pushed audio. Resolves when all its frames are known. */
   finish(): Promise<void>;
@@ -55,7 +55,7 @@ export class LipSync extends EventTarget {
   express(strengths: Partial<Record<ExpressionName, number>>, holdS?: number): void;
   /** Start suspended sound. Call it from a click handler. */
   resume(): Promise<void>;
-  /** Stop following the sound. The face returns to rest. A media element is still heard. */
+  /** Stop following the sound, and end pushed audio. The face returns to rest. A media element is still heard. */
   stop(): void;
   /** Stop, and release all resources. */
   close(): void;

@@ -37,6 +37,7 @@ export class LipSync extends EventTarget {
   #source = null; // { node, notice: about the source, or "", release() }
   #choice = 0; // number of the newest choice of a source, or of none
   #startS = null; // start of the session on the context's clock; null before the first sound, and for push()
+  #isPushed = false; // whether push() can be called
   #isPlayed = false; // whether the page plays the sound
   #pending = null; // the request that the worker has not answered: { message, answer, resolve, reject }
   #isSpeaking = false;
@@ -119,17 +120,23 @@ export class LipSync extends EventTarget {
   /** Start a session for push(). Its times count from the first sample. */
   async open(sampleRateHz) {
     this.stop();
+    const choice = this.#choice;
     await this.#open({ sampleRateHz });
+    this.#check(choice);
+    this.#isPushed = true;
   }
 
   /** Accept PCM, mono in [-1, 1], at the rate of open(). Audio may arrive faster than real time. */
   push(samples) {
+    this.#checkPushed();
     this.#worker.postMessage({ type: "push", session: this.#session, samples });
   }
 
   /** End pushed audio. Resolves when all its frames are known. */
-  finish() {
-    return this.#request("finished", { type: "finish", session: this.#session });
+  async finish() {
+    this.#checkPushed();
+    this.#isPushed = false;
+    await this.#request("finished", { type: "finish", session: this.#session });
   }
 
   /** Show expressions, strengths 0 to 1 by name, for a time. */
@@ -242,10 +249,16 @@ export class LipSync extends EventTarget {
     if (this.#isClosed) throw new Error("this lip sync is closed; create another one");
   }
 
+  #checkPushed() {
+    this.#checkOpen();
+    if (!this.#isPushed) throw new Error("no sound is open for push(); call open(), and wait until it has opened");
+  }
+
   #release() {
-    if (this.#source === null) return;
-    this.#source.release();
+    if (this.#source === null && !this.#isPushed) return;
+    this.#source?.release();
     this.#source = null;
+    this.#isPushed = false;
     this.#worker.postMessage({ type: "finish", session: this.#session });
   }
 

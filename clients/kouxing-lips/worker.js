@@ -44,6 +44,7 @@ const HANDLERS = {
   finish({ session }) {
     port?.close();
     send(session, engine.finish());
+    engine = null;
     self.postMessage({ type: "finished", session });
   },
 

@@ -250,6 +250,19 @@ def test_a_microphone_can_be_turned_off_while_it_starts(
     assert not [text for text in page.page_errors if "exceptionDetails" in text]
 
 
+@pytest.mark.usefixtures("drawing_seldom")
+def test_after_the_microphone_the_session_of_the_address_is_shown(
+    control: PageControl, session: Session, gateway: Gateway, page: Browser
+) -> None:
+    control.start("newest")
+    page.open(f"{gateway.page}?session={session.name}")
+    turn_on_microphone(control, page)
+    page.wait_for(f"!['newest', 'seen', null].includes({STATE}.session)")
+    turn_off_microphone(page)
+    control.stop_session("newest")
+    page.open(gateway.page)
+
+
 def face_changes(control: PageControl) -> list[tuple[str, FaceSettings]]:
     return [(message.session, message.face) for message in control.messages_of(SetFace)]
 

@@ -114,6 +114,22 @@ async def test_the_sample_sentence_plays_once_and_sigterm_closes_viewers(
 
 
 @async_test
+async def test_after_the_sample_sentence_the_requested_session_is_shown(
+    control: FakeControl, gateway: Gateway
+) -> None:
+    async with open_websockets(gateway.page, "viewer?session=talk", "viewer") as viewers:
+        for name in ("talk", "newest"):
+            control.start(name)
+            await receive_json(viewers[1], "session", session=name)
+        for viewer in viewers:
+            await viewer.send_json({"play": "sample"})
+        shown = [await receive_json(viewer, "session", sample=True) for viewer in viewers]
+        control.stop_session(shown[0]["session"])
+        for viewer, name in zip(viewers, ("talk", "newest"), strict=True):
+            await receive_json(viewer, "session", session=name)
+
+
+@async_test
 async def test_without_control_browsers_are_told_to_start_it() -> None:
     gateway = Gateway("tcp://127.0.0.1:9")
     async with open_websockets(gateway.page, "viewer", "microphone") as (viewer, microphone):

@@ -4,7 +4,7 @@ import { Face } from "./face.js";
 import { BlockScorer } from "./block-scorer.js";
 import { LightScorer } from "./light-scorer.js";
 import { loadModel } from "./model.js";
-import { checkOptions } from "./options.js";
+import { checkOptions, inRange } from "./options.js";
 import { PhoneRecognizer } from "./phone-recognizer.js";
 import { Resampler } from "./resampler.js";
 import { ShapeSet } from "./shapes.js";
@@ -28,6 +28,7 @@ export class LipEngine {
   #rateHz;
   #shapes;
   #isSpeaking = false;
+  #isFinished = false;
 
   /** Use LipEngine.load instead. */
   constructor(model, { sampleRateHz = 16000, shapes = DEFAULT_SHAPES, expressiveness, feeling, delayMs, ...unknown } = {}) {
@@ -69,6 +70,7 @@ export class LipEngine {
   /** Accept samples, mono in [-1, 1]; return the frames that are due. */
   push(samples) {
     if (!(samples instanceof Float32Array)) throw new TypeError("samples must be a Float32Array");
+    this.#checkUnfinished();
     const clipped = clip(samples);
     this.#numIn += samples.length;
     this.newPhones = [];
@@ -93,6 +95,8 @@ export class LipEngine {
 
   /** End the audio; return the remaining frames, until the face is at rest. */
   finish() {
+    this.#checkUnfinished();
+    this.#isFinished = true;
     this.newPhones = [];
     const frames = this.#process(this.#resampler.finish());
     const events = this.#segmenter.accept(this.#slice.subarray(0, this.#numKnown));
@@ -101,6 +105,10 @@ export class LipEngine {
     const { SILENT_DB } = this.#model.constants.stream;
     events.push(...this.#segmenter.finish(), { type: "progress", timeS, levelDb: SILENT_DB }, { type: "end", timeS });
     return [...frames, ...this.#animate(events)];
+  }
+
+  #checkUnfinished() {
+    if (this.#isFinished) throw new Error("finish() has ended the audio; load another engine");
   }
 
   get #mediaTimeS() {
@@ -135,11 +143,6 @@ function recognizerFor(model) {
   if (!model.phoneLm) return null;
   const { light, blocks } = model.phones.rules;
   return model.blocks ? new PhoneRecognizer(model, new BlockScorer(model), blocks) : new PhoneRecognizer(model, new LightScorer(model), light);
-}
-
-function inRange(name, value, lowest, highest) {
-  if (value >= lowest && value <= highest) return value;
-  throw new RangeError(`${name} is ${value}; it must be from ${lowest} to ${highest}`);
 }
 
 /** Return samples in [-1, 1]; throws a RangeError if some are not finite. */

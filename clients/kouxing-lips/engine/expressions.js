@@ -2,6 +2,9 @@
 // and services/synthesizer/modifiers/expressiveness.py have the formulas.
 
 import { clamp, smoothingGain } from "./math.js";
+import { inRange } from "./options.js";
+
+const MAX_HOLD_S = 3600; // as in the server
 
 /** The current expressions of the face. */
 export class Expressions {
@@ -28,8 +31,10 @@ export class Expressions {
   show(strengths, holdS) {
     const unknown = Object.keys(strengths).find((name) => !(name in this.#faps));
     if (unknown) throw new Error(`unknown expression ${unknown}; use ${Object.keys(this.#faps).join(", ")}`);
+    inRange("holdS", holdS, 0, MAX_HOLD_S);
     let goal = new Float32Array(this.#numFaps);
     for (const [name, strength] of Object.entries(strengths)) {
+      inRange(`expression ${name}`, strength, 0, 1);
       goal = goal.map((x, i) => x + strength * this.#faps[name][i]);
     }
     this.showFaps(goal, holdS);

@@ -6,8 +6,8 @@ for (const [options, message] of [
   [{ sampleRateHz: 4000 }, "the sample rate 4000 Hz is out of range; use 8000 to 192000 Hz"],
   [{ shapes: ["arkit52"] }, "unknown shapes arkit52; use arkit, oculus, vrm"],
   [{ shapes: "oculus" }, 'shapes must be an array of names, such as ["arkit"]'],
-  [{ expressiveness: 3 }, "expressiveness is 3; it must be from 0.5 to 2"],
-  [{ delayMs: -1 }, "delayMs is -1; it must be from 0 to 300"],
+  [{ expressiveness: 3 }, "expressiveness is 3; it must be a number from 0.5 to 2"],
+  [{ delayMs: -1 }, "delayMs is -1; it must be a number from 0 to 300"],
   [
     { sampleRate: 48000 },
     "unknown option sampleRate; use sampleRateHz, shapes, expressiveness, feeling, delayMs, phones, models",
@@ -20,6 +20,27 @@ test("rejects samples that are not finite", async () => {
   const engine = await LipEngine.load();
   const message = "some samples are not finite; they must be in [-1, 1]";
   assert.throws(() => engine.push(new Float32Array(320).fill(NaN)), { message });
+});
+
+for (const [strengths, holdS, message] of [
+  [{ joy: NaN }, 3, "expression joy is NaN; it must be a number from 0 to 1"],
+  [{ joy: undefined }, 3, "expression joy is undefined; it must be a number from 0 to 1"],
+  [{ joy: 5 }, 3, "expression joy is 5; it must be a number from 0 to 1"],
+  [{ joy: "0.5" }, 3, "expression joy is 0.5; it must be a number from 0 to 1"],
+  [{ joy: 0.5 }, NaN, "holdS is NaN; it must be a number from 0 to 3600"],
+]) {
+  test(`rejects the expression ${JSON.stringify(strengths)} for ${holdS} s`, async () => {
+    const engine = await LipEngine.load({ phones: false });
+    assert.throws(() => engine.express(strengths, holdS), { message });
+  });
+}
+
+test("finish() ends the audio", async () => {
+  const engine = await LipEngine.load({ phones: false });
+  engine.finish();
+  const message = "finish() has ended the audio; load another engine";
+  assert.throws(() => engine.push(new Float32Array(320)), { message });
+  assert.throws(() => engine.finish(), { message });
 });
 
 test("reports missing models", async () => {

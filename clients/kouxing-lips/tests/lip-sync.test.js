@@ -380,6 +380,35 @@ test("a buffer that is replaced does not report its end", async () => {
   assert.equal(numEnded, 1);
 });
 
+test("stop() ends pushed audio, and finish() ends it once", async () => {
+  const lips = await LipSync.create();
+  const { newest } = FakeWorker;
+  const count = (type) => newest.messages.filter((message) => message.type === type).length;
+  assert.throws(() => lips.push(new Float32Array(320)), /no sound is open for push\(\); call open\(\)/);
+  for (const end of ["stop", "finish"]) {
+    const opened = lips.open(16000);
+    newest.answer("opened");
+    await opened;
+    lips.push(new Float32Array(320));
+    const ended = lips[end]();
+    newest.answer("finished");
+    await ended;
+    assert.throws(() => lips.push(new Float32Array(320)), /no sound is open/);
+    await assert.rejects(lips.finish(), /no sound is open/);
+  }
+  lips.stop();
+  assert.deepEqual([count("push"), count("finish")], [2, 2]);
+});
+
+test("stop() also works while open() waits", async () => {
+  const lips = await LipSync.create();
+  const opened = lips.open(16000);
+  lips.stop();
+  FakeWorker.newest.answer("opened");
+  await assert.rejects(opened, aborted);
+  assert.throws(() => lips.push(new Float32Array(320)), /no sound is open/);
+});
+
 test("the face of two pushed minutes is known from the start", async () => {
   const lips = await LipSync.create();
   const opened = lips.open(16000);

@@ -22,6 +22,7 @@ import { ViewerSocket } from "./viewer-socket.js";
 const STATUS_INTERVAL_MS = 250;
 
 const query = new URLSearchParams(location.search);
+const requestedSession = query.get("session") ?? ""; // "": the newest
 const preferences = new Preferences(() => localStorage);
 const mouthProfiles = new MouthProfileStore(() => localStorage);
 const notice = new Notice();
@@ -57,7 +58,7 @@ const speech = new SpeechControls(sound, {
       showLipModel();
       if (name === gateway.session) sendFaceSettings(); // its "session" message arrived first
     }
-    socket.follow(name ?? "");
+    socket.follow(name ?? requestedSession);
   },
 });
 const player = new Player(sound, (nowMs, mediaTime) =>
@@ -81,7 +82,7 @@ const learnMouth = new LearnMouthDialog(mouthProfiles, {
 });
 const socket = new ViewerSocket(
   (session) => socketUrl("/viewer", { session }),
-  query.get("session") ?? "",
+  requestedSession,
   {
     async state(isConnected) {
       gateway.setConnected(isConnected);

@@ -45,14 +45,20 @@ class _ShownSession:
 class Viewer:
     """One browser that shows a session."""
 
-    chosen_session: str  # the requested session; empty: the newest
+    requested_session: str  # empty: the newest
     shape_encoder: ShapeEncoder | None  # encodes frames as blendshapes, in addition to FAPs
+    sample_session: str = ""  # shown instead until the sample sentence has ended
     queue: ViewerQueue = field(default_factory=ViewerQueue)
     shown_session: tuple[str, int] | None = None  # session and epoch
     # session and epoch, or only the name of a session that does not exist
     last_announced: tuple[str, int] | str = ""
     has_resting_face: bool = False  # whether it has the face at rest, from which its player starts
     last_frame_s: float = -math.inf  # when the newest frame was sent
+
+    @property
+    def chosen_session(self) -> str:
+        """The session to show; empty: the newest."""
+        return self.sample_session or self.requested_session
 
 
 class ViewerHandler:
@@ -229,7 +235,7 @@ class ViewerHandler:
         _check_single(command, lip_model)
         if command.play is not None:
             self._sample.play(lip_model or "", self._on_sample_end)
-            viewer.chosen_session = self._sample.session
+            viewer.sample_session = self._sample.session
         elif lip_model:
             if viewer.chosen_session not in self._sample.open_sessions:
                 raise UserError("a viewer can set lip_model only for the sample sentence")
@@ -239,7 +245,7 @@ class ViewerHandler:
                 raise UserError("no session is shown; start a microphone or the sample first")
             self._set_face(viewer.shown_session[0] if viewer.shown_session else "", command.face)
         elif command.follow is not None:
-            viewer.chosen_session = command.follow
+            viewer.requested_session, viewer.sample_session = command.follow, ""
         elif command.avatar is not None:
             viewer.shape_encoder = make_avatar_encoder(command.avatar, command.format)
             self._put(viewer, MessageKind.SHAPE_NAMES, viewer.shape_encoder.header_message())
@@ -248,10 +254,10 @@ class ViewerHandler:
             raise UserError(f"the message contains no command; send one of {names}")
 
     def _on_sample_end(self, session: str, error: str) -> None:
-        """Show the newest session again to viewers of the sample sentence, with the error."""
+        """Show the requested session again to viewers of the sample sentence, with the error."""
         for viewer in self._viewers:
-            if viewer.chosen_session == session:
-                viewer.chosen_session = ""
+            if viewer.sample_session == session:
+                viewer.sample_session = ""
                 if error:
                     self._put(viewer, MessageKind.TEXT, error)
         self._notify_viewers()
