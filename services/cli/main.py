@@ -176,8 +176,10 @@ def main() -> None:
     Ctrl-C gives exit status 130, whatever exception a library turns it into. Python's shutdown is
     skipped, because native libraries can hang or crash during a shutdown.
     """
-    if sys.stdout is None:  # closed, as with >&-
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 (until the end)
+    if sys.stdin is None:  # closed, as with <&-
+        sys.stdin = open(os.devnull)  # noqa: SIM115, PTH123 (until the end)
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
     if isinstance(sys.stdout, TextIOWrapper):  # flush each line also in a log file
         sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     try:

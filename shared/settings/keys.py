@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.files.output_file import write_private
+from kouxing.shared.files.output_file import write_error, write_private
 from kouxing.shared.files.user_file import parse_json, read_text
 from kouxing.shared.name_rules import NAME, NAME_RULE, is_name
 from kouxing.shared.settings.endpoints import is_local, split_endpoint, with_key
@@ -416,4 +416,4 @@ def _write(path: Path, text: str) -> None:
     try:
         write_private(path, text.encode("ascii"))
     except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from None
+        raise write_error(path, error) from None

@@ -284,6 +284,14 @@ def test_standard_output_may_be_closed() -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_standard_input_may_be_closed() -> None:
+    command = shlex.join((sys.executable, "-m", "kouxing", "phones", "-"))
+    done = subprocess.run(
+        ["sh", "-c", f"{command} <&-"], cwd=ROOT, stderr=subprocess.PIPE, check=False
+    )
+    assert (done.returncode, b"no audio arrived" in done.stderr) == (2, True)
+
+
 def test_an_empty_argument_is_refused() -> None:
     refused = kouxing("render", VOWELS_FILE, "")
     assert (refused.returncode, "an argument is empty" in refused.stderr) == (2, True)

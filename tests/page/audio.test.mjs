@@ -30,6 +30,18 @@ test("the microphone is cut into chunks of 20 ms without gaps, and clipped", () 
   assert.deepEqual(captured, [...expected]);
 });
 
+test("chunks of a microphone above 48 kHz have a fraction of its samples", () => {
+  globalThis.sampleRate = 176400;
+  const capture = new processors.capture();
+  globalThis.sampleRate = 48000;
+  const input = Float32Array.from({ length: 32 * BLOCK }, (_, i) => i / 8192);
+  for (let begin = 0; begin < input.length; begin += BLOCK) {
+    capture.process([[input.subarray(begin, begin + BLOCK)]]);
+  }
+  const [{ chunk }] = capture.port.posted;
+  assert.deepEqual([...chunk], Array.from({ length: 882 }, (_, i) => 4 * (4 * i + 3)));
+});
+
 /** Play blocks; return the output. */
 function play(player, numBlocks) {
   return Array.from({ length: numBlocks }, () => {

@@ -152,6 +152,29 @@ test("errors of a file do not mention the microphone", async () => {
   assert.ok(states.includes("The gateway closed the connection. Choose the file again."));
 });
 
+test("a microphone above 48 kHz is captured at its rate, and filtered to a fraction of it", async () => {
+  const filters = [];
+  globalThis.BiquadFilterNode = class {
+    constructor(_, options) {
+      filters.push(options.type);
+    }
+    connect = (next) => next;
+  };
+  globalThis.AudioContext = class extends globalThis.AudioContext {
+    constructor(options) {
+      super();
+      assert.ok(!("sampleRate" in options), "Firefox supports only the device's rate");
+    }
+    sampleRate = 96000;
+    createMediaStreamSource = () => ({ connect: (next) => next });
+  };
+  const { microphone } = makeMicrophone();
+  await microphone.start();
+  FakeWebSocket.newest.openSession("voice");
+  assert.equal(FakeWebSocket.newest.sent[0].sample_rate_hz, 48000);
+  assert.deepEqual(filters, ["lowpass", "lowpass"]);
+});
+
 test("a microphone that cannot be captured is reported and released", async () => {
   let numClosed = 0;
   globalThis.AudioContext = class extends globalThis.AudioContext {
@@ -159,7 +182,7 @@ test("a microphone that cannot be captured is reported and released", async () =
       numClosed++;
     }
     createMediaStreamSource = () => {
-      throw new Error("different sample-rate is currently not supported."); // Firefox, above 48 kHz
+      throw new Error("different sample-rate is currently not supported.");
     };
   };
   const { microphone, states } = makeMicrophone();

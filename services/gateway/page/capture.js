@@ -4,18 +4,22 @@ import { pathWithToken } from "./address.js";
 import { UserError, translate, translateResponse } from "./language.js";
 
 const MAX_RATE_HZ = 48000;
+// The lowpass before samples are dropped. It reduces frequencies that would alias to 8 kHz or lower by 33 dB or more.
+const CUTOFF_HZ = 16000;
+const BUTTERWORTH_Q_DB = [-5.33, 2.32]; // of 4th order
 const MAX_FILE_BYTES = 200 << 20;
 const QUIET_PEAK = 1e-3; // a file whose peak is lower (-60 dBFS) is called silent
 
-/** Return an audio context with a sample rate of at most 48 kHz. */
+/** Return an audio context at the device's rate. Firefox captures no microphone at another rate. */
 export async function openCaptureContext() {
-  let context = new AudioContext({ latencyHint: "interactive" });
-  if (context.sampleRate > MAX_RATE_HZ) {
-    context.close();
-    context = new AudioContext({ latencyHint: "interactive", sampleRate: MAX_RATE_HZ });
-  }
+  const context = new AudioContext({ latencyHint: "interactive" });
   await context.audioWorklet.addModule("microphone-worklet.js");
   return context;
+}
+
+/** Return the sample rate of captured audio: at most 48 kHz, and a fraction of the context's rate. */
+export function captureRateHz({ sampleRate }) {
+  return sampleRate / Math.ceil(sampleRate / MAX_RATE_HZ);
 }
 
 /**
@@ -32,7 +36,13 @@ export function capture(context, stream, onChunk) {
   });
   node.port.onmessage = ({ data: { chunk, rms, recordedMs } }) =>
     onChunk(chunk, rms, performance.now() - (Date.now() - recordedMs));
-  context.createMediaStreamSource(stream).connect(node);
+  let source = context.createMediaStreamSource(stream);
+  if (captureRateHz(context) < context.sampleRate) {
+    for (const Q of BUTTERWORTH_Q_DB) {
+      source = source.connect(new BiquadFilterNode(context, { type: "lowpass", frequency: CUTOFF_HZ, Q }));
+    }
+  }
+  source.connect(node);
   context.resume();
 }
 

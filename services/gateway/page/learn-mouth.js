@@ -2,7 +2,7 @@
 // the learned result, and stores it if the user keeps it.
 
 import { pathWithToken } from "./address.js";
-import { capture, openCaptureContext } from "./capture.js";
+import { capture, captureRateHz, openCaptureContext } from "./capture.js";
 import { element } from "./elements.js";
 import { FaceRecording } from "./face-recording.js";
 import { FaceTracker } from "./face-tracker.js";
@@ -132,7 +132,7 @@ export class LearnMouthDialog {
       video.srcObject = stream;
       [context] = await Promise.all([openCaptureContext(), tracker.load(), video.play()]);
       signal.throwIfAborted();
-      const recording = new FaceRecording(context.sampleRate);
+      const recording = new FaceRecording(captureRateHz(context));
       const images = await this.#read(recording, { video, tracker, context, stream, signal });
       stop();
       await this.#findFaces(images, recording, tracker, signal);

@@ -1,13 +1,17 @@
-// Collects the microphone's sound in int16 chunks of 20 ms. Runs in the audio thread.
+// Collects the microphone's sound in int16 chunks of 20 ms, at no more than 48 kHz. Runs in the audio thread.
 
 class CaptureProcessor extends AudioWorkletProcessor {
-  #chunk = new Int16Array(Math.round(sampleRate / 50));
+  #step = Math.ceil(sampleRate / 48000); // between two samples that are kept
+  #chunk = new Int16Array(Math.round(sampleRate / this.#step / 50));
   #numFilled = 0;
+  #numSkipped = 0;
   #squares = 0;
 
   process([[input]]) {
     if (input === undefined) return true;
     for (const value of input) {
+      this.#numSkipped = (this.#numSkipped + 1) % this.#step;
+      if (this.#numSkipped > 0) continue;
       this.#squares += value * value;
       this.#chunk[this.#numFilled++] = Math.max(-32768, Math.min(32767, Math.round(value * 32768)));
       if (this.#numFilled === this.#chunk.length) {

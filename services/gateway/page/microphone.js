@@ -2,7 +2,7 @@
 
 import { socketUrl } from "./address.js";
 import { AudioUplink } from "./audio-uplink.js";
-import { capture, openCaptureContext, openFileSpeech } from "./capture.js";
+import { capture, captureRateHz, openCaptureContext, openFileSpeech } from "./capture.js";
 import { UserError, translate } from "./language.js";
 
 const RETRY_MS = 500;
@@ -120,8 +120,7 @@ export class Microphone {
     let refusal = null;
     this.#socket = socket;
     socket.onopen = () => {
-      const { sampleRate } = this.#context;
-      const format = { sample_rate_hz: sampleRate, num_channels: 1, encoding: "s16le" };
+      const format = { sample_rate_hz: captureRateHz(this.#context), num_channels: 1, encoding: "s16le" };
       const [profile, language] = [this.#handlers.mouthProfile(), this.#handlers.language()];
       socket.send(JSON.stringify({ ...format, mouth_profile: profile, language }));
     };
@@ -138,7 +137,7 @@ export class Microphone {
   }
 
   #onOpened(session) {
-    this.#uplink = new AudioUplink(this.#socket, this.#context.sampleRate);
+    this.#uplink = new AudioUplink(this.#socket, captureRateHz(this.#context));
     this.#giveUpMs = null;
     this.#handlers.session(session);
     this.#handlers.state("on");
