@@ -153,7 +153,7 @@ export class KouxingFace extends HTMLElement {
     this.#checkAvatar(avatar);
     await new Promise((onEnded) => {
       this.#recording?.onEnded();
-      const nowS = recordingClock(audio);
+      const nowS = recordingClock(audio, frames[0][0] / RATE_HZ);
       this.#recording = { names, frames, nowS, onEnded };
     });
   }

@@ -8,6 +8,7 @@ const RATE_HZ = 16000;
 // all counts, or the app's default if the take does not cross a full second.
 const TIME_CODE_RATES_HZ = [24, 25, 30, 48, 50, 60, 100, 120];
 const DAY_S = 86400;
+const MAX_WEIGHT = 10; // limit for the weight of a shape; percentages are larger
 
 /**
  * Read a recording.
@@ -28,6 +29,9 @@ export function readRecording(content) {
   if (wrong >= 0) throw new Error(`frame ${wrong + 1} of the recording: a value is missing or not a number`);
   const early = recording.frames.findIndex(([time], number, frames) => time < frames[number - 1]?.[0]);
   if (early >= 0) throw new Error(`frame ${early + 1} of the recording: its time is earlier than the previous frame's; sort the frames by time`);
+  if (recording.names !== null && recording.frames.some(([, values]) => values.some((value) => Math.abs(value) > MAX_WEIGHT))) {
+    throw new Error("values of shapes must be from 0 to 1; divide percentages by 100");
+  }
   return recording;
 }
 
@@ -37,18 +41,21 @@ function decodeText(bytes) {
 }
 
 /**
- * Return a function that returns the time to show, seconds since the start of the recording.
+ * Return a function that returns the time to show, seconds.
  *
  * A recording may be longer than its audio, because the face returns to rest. After the audio, time continues.
+ * Without audio, or if the first frame is not within the audio, the first frame is shown at once.
  *
  * @param audio HTMLAudioElement that plays the sound; null for silence
+ * @param firstS time of the first frame, seconds
  * @param nowMs function that returns the page's time, ms
  */
-export function recordingClock(audio, nowMs = () => performance.now()) {
+export function recordingClock(audio, firstS, nowMs = () => performance.now()) {
   let startMs = nowMs(); // of the silent part
+  const startS = firstS >= 0 && firstS < audio?.duration ? 0 : firstS;
   return () => {
     if (audio && !audio.ended) startMs = nowMs();
-    return (audio?.currentTime ?? 0) + (nowMs() - startMs) / 1000;
+    return startS + (audio?.currentTime ?? 0) + (nowMs() - startMs) / 1000;
   };
 }
 

@@ -7,8 +7,10 @@ a file of `kouxing render my.wav my.csv --as arkit`, or a .jsonl file; for a tak
 > Preferences > Add-ons > Install from Disk". The panel is in the sidebar (N) of the 3-D view.
 """
 
+import codecs
 import csv
 import json
+import math
 import re
 import socket
 import struct
@@ -30,6 +32,7 @@ bl_info = {
 
 PORT = 11111
 POLL_S = 1 / 60
+MAX_WEIGHT = 10.0  # percentages are larger
 NUM_VALUES = 61  # in a packet; the first 52 are shapes
 # fmt: off
 LIVE_LINK_ORDER = (
@@ -176,19 +179,60 @@ def read_live_link(packet):
 
 
 def read_recording(path):
-    """Return the times in seconds, the set and the weights by name of a .csv or .jsonl file."""
-    with Path(path).open(encoding="utf-8-sig") as file:
-        if path.lower().endswith(".csv"):
-            rows = frames = list(csv.DictReader(file))
-        else:
-            frames = [json.loads(line) for line in file]
-            rows = [next((frame[name] for name in SETS if name in frame), {}) for frame in frames]
-    for set_name, entries in SETS.items():
-        names = [shape for shape, _, _ in entries]
-        if rows and rows[0].keys() >= set(names):
-            times_s = [float(frame["time_s"]) for frame in frames]
-            return times_s, set_name, {name: [float(row[name]) for row in rows] for name in names}
-    raise ValueError("its columns are not the shapes of ARKit, Oculus or VRM")
+    """Return the times in seconds, the set and the weights by shape of a .csv or .jsonl file."""
+    content = Path(path).read_bytes()
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
+    lines = [line for line in re.split(r"\r\n|\r|\n", text) if line.strip(" ,;\t")]
+    rows = read_csv(lines) if path.lower().endswith(".csv") else read_json_lines(lines)
+    if not rows or "time_s" not in rows[0]:
+        raise ValueError(
+            "it has no column time_s; for a take, run: kouxing render take.csv my.csv --as arkit"
+        )
+    shapes = {name: find_shapes(name, rows[0]) for name in SETS}
+    set_name = max(shapes, key=lambda name: len(shapes[name]))
+    if not shapes[set_name]:
+        raise ValueError("its columns are not the shapes of ARKit, Oculus or VRM")
+    times_s = read_numbers(rows, "time_s")
+    if times_s != sorted(times_s):
+        raise ValueError("its times are not in order; sort the rows by time_s")
+    columns = defaultdict(list)  # by shape; several may form one
+    for column, shape in shapes[set_name].items():
+        columns[shape].append(read_numbers(rows, column, MAX_WEIGHT))
+    weights = {
+        shape: [sum(parts) / len(parts) for parts in zip(*lists, strict=True)]
+        for shape, lists in columns.items()
+    }
+    return times_s, set_name, weights
+
+
+def read_csv(lines):
+    """Return the rows of a table with commas, semicolons or tabs."""
+    lines = [line for line in lines if not line.startswith("sep=")]  # from Excel
+    delimiter = max(",;\t", key=lines[0].count) if lines else ","
+    rows = csv.reader(lines, delimiter=delimiter)
+    titles = [re.sub("(?i)^time_s$", "time_s", title.strip()) for title in next(rows, ())]
+    return [dict(zip(titles, row, strict=False)) for row in rows]
+
+
+def read_json_lines(lines):
+    """Return the time and the weights of each frame."""
+    frames = [json.loads(line) for line in lines]
+    name = next((name for name in SETS if frames and name in frames[0]), "")
+    return [{"time_s": frame.get("time_s"), **frame.get(name, {})} for frame in frames]
+
+
+def read_numbers(rows, column, limit=math.inf):
+    """Return the numbers of a column, also with decimal commas."""
+    try:
+        numbers = [float(str(row.get(column)).replace(",", ".")) for row in rows]
+    except ValueError:
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"a value of {column} is missing or not a number")
+    if max(map(abs, numbers)) > limit:
+        raise ValueError(f"{column} must be from 0 to 1; divide percentages by 100")
+    return numbers
 
 
 class Receiver:
@@ -269,7 +313,7 @@ class KOUXING_OT_insert(bpy.types.Operator, ImportHelper):
         """Set a key frame for every frame of the file."""
         try:
             times_s, set_name, weights = read_recording(self.filepath)
-        except (OSError, KeyError, ValueError, TypeError) as error:
+        except (OSError, AttributeError, ValueError, TypeError, csv.Error) as error:
             self.report({"ERROR"}, f"{self.filepath} is not a file of weights: {error}")
             return {"CANCELLED"}
         if text := find_problem(set_name):

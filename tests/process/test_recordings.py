@@ -1,10 +1,15 @@
-"""The Python and JavaScript code reads the same recordings, and rejects the same ones."""
+"""The Python and JavaScript code, and the Blender add-on, read and reject the same recordings."""
 
+import importlib.util
 import json
 import subprocess
+import sys
 from base64 import b64encode
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -27,6 +32,7 @@ RECORDINGS: dict[str, str | bytes] = {
     "old line ends": "time_s,jawOpen\r0,0\r0.02,0.5\r",
     "an empty column": "time_s,jawOpen,\n0,0,\n0.02,0.5,\n",
     "numbers of the frames": "sequence,time_s,jawOpen\n,0,0\n,0.02,0.5\n",
+    "a late start": "time_s,jawOpen\n10.6,0\n10.62,0.5\n",
     "semicolons, from Excel": "sep=;\ntime_s;jawOpen\n0;0\n0,02;0,5\n;\n",
     "quotes": '"time_s","jawOpen"\n"0","0"\n"0.02","0.5"\n',
     "quotes and decimal commas": '"time_s","jawOpen"\n"0","0"\n"0,02","0,5"\n',
@@ -58,6 +64,7 @@ REJECTED: dict[str, str | bytes] = {
     "json without times": '{"faps": [0]}\n',
     "json without values": '{"time_s": 0}\n',
     "json with other values": FIRST_LINE + '{"time_s": 1, "vrm": {"aa": 0}}\n',
+    "percentages": "time_s,jawOpen\n0,0\n0.02,50\n",
     "no json": '{"time_s"\n',
 }
 
@@ -103,26 +110,84 @@ def write(folder: Path, recording: str | bytes) -> Path:
     return path
 
 
+Recording = tuple[list[float], str, dict[str, list[float]]]
+
+
+@pytest.fixture
+def read_in_blender(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Recording]:
+    """Return the function of the add-on. Fakes of Blender's modules are imported."""
+    bpy, helpers = MagicMock(), ModuleType("bpy_extras.io_utils")
+    bpy.types.Operator, bpy.types.Panel = type("Operator", (), {}), type("Panel", (), {})
+    helpers.ImportHelper = type("ImportHelper", (), {})  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "bpy", bpy)
+    monkeypatch.setitem(sys.modules, "bpy_extras", MagicMock())
+    monkeypatch.setitem(sys.modules, "bpy_extras.io_utils", helpers)
+    path = ROOT / "examples" / "blender" / "kouxing_face.py"
+    spec = importlib.util.spec_from_file_location("kouxing_face", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    function: Callable[[str], Recording] = module.read_recording
+    return function
+
+
 @pytest.mark.parametrize("recording", RECORDINGS.values(), ids=RECORDINGS)
-def test_both_read_the_same_frames(
+def test_python_and_javascript_read_the_same_frames(
     tmp_path: Path, in_javascript: dict[str | bytes, Any], recording: str | bytes
 ) -> None:
     animation = read_table(write(tmp_path, recording))
     read = in_javascript[recording]
     column, unit = (JAW, 1.0) if read["names"] is None else (0, JAW_PER_WEIGHT)
-    first, *_, (last_time, last) = read["frames"]
+    (first_time, first), *_, (last_time, last) = read["frames"]
     assert read["names"] is None or read["names"][0] == "jawOpen"
-    assert first[0] == 0
-    assert last_time / 16000 == pytest.approx((len(animation.faps) - 1) / animation.frame_rate_hz)
-    assert first[1][column] * unit == pytest.approx(animation.faps[0, JAW])
+    assert first_time / 16000 == animation.start_s
+    duration_s = (len(animation.faps) - 1) / animation.frame_rate_hz
+    assert (last_time - first_time) / 16000 == pytest.approx(duration_s)
+    assert first[column] * unit == pytest.approx(animation.faps[0, JAW])
     assert last[column] * unit == pytest.approx(animation.faps[-1, JAW])
     assert last[column] * unit == pytest.approx(0.5 * JAW_PER_WEIGHT)
 
 
 @pytest.mark.parametrize("recording", REJECTED.values(), ids=REJECTED)
-def test_both_reject_an_unclear_recording(
+def test_python_and_javascript_reject_an_unclear_recording(
     tmp_path: Path, in_javascript: dict[str | bytes, Any], recording: str | bytes
 ) -> None:
     with pytest.raises(UserError):
         read_table(write(tmp_path, recording))
     assert in_javascript[recording].get("error", "").startswith("Error: "), in_javascript[recording]
+
+
+@pytest.mark.parametrize("recording", RECORDINGS.values(), ids=RECORDINGS)
+def test_blender_reads_the_same_frames_or_names_the_shapes_that_it_needs(
+    tmp_path: Path, read_in_blender: Callable[[str], Recording], recording: str | bytes
+) -> None:
+    path = write(tmp_path, recording)
+    if isinstance(recording, str) and ("faps" in recording or recording.startswith(TAKE)):
+        with pytest.raises(ValueError, match=r"not the shapes of ARKit|has no column time_s"):
+            read_in_blender(str(path))
+        return
+    animation = read_table(path)
+    times_s, set_name, weights = read_in_blender(str(path))
+    assert (set_name, weights) == ("arkit", {"jawOpen": [0.0, 0.5]})
+    assert times_s == pytest.approx([animation.start_s, animation.start_s + 0.02])
+
+
+@pytest.mark.parametrize("recording", REJECTED.values(), ids=REJECTED)
+def test_blender_rejects_an_unclear_recording(
+    tmp_path: Path, read_in_blender: Callable[[str], Recording], recording: str | bytes
+) -> None:
+    with pytest.raises((AttributeError, ValueError, TypeError)):
+        read_in_blender(str(write(tmp_path, recording)))
+
+
+def test_blender_averages_the_parts_of_a_shape_as_the_server_does(
+    tmp_path: Path, read_in_blender: Callable[[str], Recording]
+) -> None:
+    path = tmp_path / "FACE.CSV"
+    path.write_text("time_s,Jaw_Open,Cheek_Puff_L,Cheek_Puff_R\n0,0.5,0.2,0.4\n")
+    _, _, weights = read_in_blender(str(path))
+    assert weights == {"jawOpen": [0.5], "cheekPuff": pytest.approx([0.3])}
+    puff = ARKIT.names.index("cheekPuff")
+    expected = 0.5 * ARKIT.basis[ARKIT.names.index("jawOpen")] + 0.3 * ARKIT.basis[puff]
+    assert read_table(path).faps[0] == pytest.approx(expected, abs=1e-3)
