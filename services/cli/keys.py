@@ -58,9 +58,9 @@ def add(
         if kind not in KINDS:
             raise UserError(f"there is no service {kind!r}; choose one of {', '.join(KINDS)}")
     add_key(name, roles, path)
+    copies = " and ".join(f"~/.local/state/kouxing/{kind}.key" for kind in kinds or [CLIENT])
     print_message(
-        f"wrote {path}; move it to ~/.local/state/kouxing/{(kinds or [CLIENT])[0]}.key on the other"
-        " machine (folder: mode 700, file: mode 600)"
+        f"wrote {path}; copy it to {copies} on the other machine (folder: mode 700, file: mode 600)"
     )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import entry_points, version
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 from typer.core import TyperGroup, TyperOption
@@ -223,6 +223,8 @@ def _run_command() -> None:
 
 def _usage_text(error: Any) -> str:
     """Return what is wrong with a command line; empty if the help was printed instead."""
+    if text := _number_text(error):
+        return text
     problem = error.format_message().removesuffix(".").replace("Value error, ", "")
     command = error.ctx.command_path if error.ctx else "kouxing COMMAND"
     option, group = getattr(error, "option_name", None), error.ctx and error.ctx.parent
@@ -231,3 +233,19 @@ def _usage_text(error: Any) -> str:
         return f"{option} is an option of {path}; write {path} {option} {error.ctx.info_name}"
     link = " See" if problem.endswith("?") else "; see"  # click asks "Did you mean ...?"
     return problem and f"{problem[0].lower()}{problem[1:]}{link} {command} -h"
+
+
+def _number_text(error: Any) -> str:
+    """Return what an option with a wrong number allows; empty for other errors."""
+    parameter, refused = getattr(error, "param", None), error.__cause__
+    if not isinstance(parameter, TyperOption) or not hasattr(refused, "errors"):
+        return ""
+    kind = parameter.type_descriptor.annotation
+    allowed = {int: "an integer", float: "a number"}.get((get_args(kind) or (kind,))[0])
+    if allowed is None:
+        return ""
+    if parameter.max is not None:
+        allowed += f" from {parameter.min:g} to {parameter.max:g}"
+    elif parameter.min is not None:
+        allowed += f" of at least {parameter.min:g}"
+    return f"{parameter.opts[0]} {refused.errors()[0]['input']}: use {allowed}"

@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check_output(options.output, inputs=[Path(options.input), options.dialogFile], force=True)
         _report(options, "start", f"reading {options.input}", file=options.input)
         motion = _animate(options)
-        _report(options, "progress", "finished", value=1.0)
+        _report(options, "progress", "progress: 100 %", value=1.0)
         result = _format_mouths(motion, options)
         if options.output is None:
             sys.stdout.write(result)

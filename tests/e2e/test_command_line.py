@@ -162,7 +162,7 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["speak", __file__], "test_command_line.py"),
         (["listen", "two words"], "letters, digits"),
         (["listen", "heard", "-o", "face.txt"], ".jsonl"),
-        (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "this format holds faps"),
+        (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "face.fap cannot contain vrm"),
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
         (["express", "heard", "joy=2"], "between 0 and 1"),

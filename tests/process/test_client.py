@@ -214,6 +214,7 @@ def test_a_key_may_be_a_path(control: FakeControl, tmp_path: Path) -> None:
     [
         ("127.0.0.1:5550", True, "cannot connect to '127.0.0.1:5550': .*; write tcp://HOST:PORT"),
         ("http://127.0.0.1:8080", True, "cannot connect to 'http://.*; write tcp://HOST:PORT"),
+        ("tcp://127.0.0.1", True, "cannot connect to 'tcp://127.0.0.1': .*; write tcp://HOST:PORT"),
         ("tcp://127.0.0.1:1 " + "a" * 40, True, "tcp://127.0.0.1:1 uses encryption, but this"),
     ],
 )

@@ -79,6 +79,12 @@ def test_a_group_without_a_command_lists_its_commands(group: str) -> None:
     [
         ("train gmm --any-license", "train --any-license gmm"),
         ("listen --as words", "'--as': 'words' is not one of 'faps'"),
+        ("render a.wav --rate 0.5", "--rate 0.5: use a number from 1 to 240"),
+        ("render a.wav --speed fast", "--speed fast: use a number from 0.25 to 1"),
+        ("run --workers 0", "--workers 0: use an integer from 1 to"),
+        ("phones a.wav --track x", "--track x: use an integer"),
+        ("bench load --seconds 0", "--seconds 0: use a number of at least 1"),
+        ("bench busy --programs 200", "--programs 200: use an integer from 0 to 100"),
         ("spek a.wav", "no such command 'spek'. Did you mean 'speak'? See "),
     ],
 )

@@ -93,6 +93,14 @@ def test_the_rate_of_a_table_with_two_different_steps_is_that_of_one_of_them(
     assert read_table(path).frame_rate_hz == pytest.approx(100.0)
 
 
+def test_a_table_may_have_a_long_gap(tmp_path: Path) -> None:
+    path = tmp_path / "face.csv"
+    path.write_text("time_s,jawOpen\n0,0\n0.02,1\n0.04,0\n300,0\n300.02,1\n300.04,0\n")
+    animation = read_table(path)
+    assert animation.frame_rate_hz == pytest.approx(50.0)
+    assert len(animation.faps) == 15_003
+
+
 def test_the_times_of_a_table_are_those_of_its_sound(tmp_path: Path) -> None:
     table, sound, faps = tmp_path / "face.csv", tmp_path / "s.wav", np.zeros(NUM_FAPS, np.float32)
     write(table, FrameStream([(12.0 + number / RATE_HZ, number, faps) for number in range(3)]))
@@ -206,6 +214,11 @@ def test_reads_the_names_of_other_programs(
         ("a.jsonl", f'{{"time_s": 0, "arkit": {{"jawOpen": {HUGE}}}}}', "frame 1: a value is"),
         ("a.jsonl", f'{{"time_s": {HUGE}, "arkit": {{"jawOpen": 0}}}}', "a time in seconds"),
         ("a.csv", "time_s,jawOpen\n0,0\n40,0\n", "1 to 1000 frames per second"),
+        (
+            "a.csv",
+            "time_s,jawOpen\n0,0\n0.02,0\n0.04,0\n30000,0\n",
+            "the times span 30000 s, more than 1000000 frames at 50 per second; split",
+        ),
         ("a.csv", "Timecode,JawOpen\n00:01,0\n", "every line needs a time code"),
         ("a.csv", "", "the file is empty"),
         ("a.csv", "\n,,\n", "the file is empty"),

@@ -14,6 +14,7 @@ from kouxing.services.cli.options import CurveFormat, ExportOptions, ListenForma
 from kouxing.services.cli.recordings.animation import FaceMotion
 from kouxing.services.cli.recordings.curve_exporters import (
     CURVE_EXPORTERS,
+    FapExporter,
     FrameRow,
     FrameStream,
     GlbExporter,
@@ -94,14 +95,14 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("output", "options", "message"),
     [
-        ("a.fap", {"curve_format": CurveFormat.ARKIT}, "holds faps; for arkit, write .csv"),
-        ("a.glb", {"curve_format": CurveFormat.OCULUS}, "holds faps or arkit; for oculus, write"),
+        ("a.fap", {"curve_format": CurveFormat.ARKIT}, "a.fap cannot contain arkit; use .* .csv"),
+        ("a.glb", {"curve_format": CurveFormat.OCULUS}, "a.glb cannot contain oculus; use"),
         ("a.csv", {"lips": ["dynamic-visemes", "learned"]}, "a curve file holds one face"),
         ("no/a.csv", {}, "cannot write"),
         ("no/a.mp4", {}, "cannot write"),
-        ("a.jsonl", {"curve_format": CurveFormat.LIVELINK}, "for livelink, write .csv"),
-        ("a.csv", {"curve_format": CurveFormat.RHUBARB}, "for rhubarb, write .tsv or .xml or .jso"),
-        ("a.tsv", {"curve_format": CurveFormat.ARKIT}, "holds rhubarb or oculus; for arkit, write"),
+        ("a.jsonl", {"curve_format": CurveFormat.LIVELINK}, "cannot contain livelink; use .* .csv"),
+        ("a.csv", {"curve_format": CurveFormat.RHUBARB}, "rhubarb; use .* .tsv, .xml, .json"),
+        ("a.tsv", {"curve_format": CurveFormat.ARKIT}, "a.tsv cannot contain arkit; use"),
         ("a.mp4", {"curve_format": CurveFormat.ARKIT}, "--as does not apply .* .fap, .csv"),
         ("a.csv", {"size": "640x360"}, "--size does not apply .* .mp4"),
         ("a.fap", {"rate_hz": 30.0}, "--rate does not apply .* .mp4"),
@@ -124,12 +125,18 @@ def test_options_are_checked_before_the_work(
         open_exporter(tmp_path / output, ExportOptions(**options))
 
 
-def test_the_times_of_a_live_animation_start_at_0_and_increase(tmp_path: Path) -> None:
+def test_the_times_of_a_live_animation_start_at_0_and_increase(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     frame = np.zeros(NUM_FAPS, np.float32)
     times_s = (60.0, 60.02, 60.02, 60.02, 60.04)  # media time stops while no audio arrives
     live = FrameStream([(time_s, n, frame) for n, time_s in enumerate(times_s)], is_live=True)
     output = tmp_path / "face.glb"
     assert GlbExporter(output, ExportOptions()).write(live) == 3
+    assert f"{output} starts at 60.000 s of the session" in capsys.readouterr().err
+    curves = tmp_path / "face.fap"
+    FapExporter(curves, ExportOptions()).write(live)
+    assert f"{curves} starts at 60.000 s of the session" in capsys.readouterr().err
     glb = GlbFile(output)
     times = glb.accessor(glb.json["animations"][0]["samplers"][0]["input"])
     np.testing.assert_allclose(times.ravel(), [0.0, 0.02, 0.04], atol=1e-6)

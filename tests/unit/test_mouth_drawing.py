@@ -8,7 +8,9 @@ import av
 import numpy as np
 import pytest
 import soundfile
+from typer.testing import CliRunner
 
+from kouxing.services.cli.main import app
 from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.cli.recordings.commands import lips
 from kouxing.services.cli.recordings.mouth_drawing import CSV_COLUMNS, NUM_POINTS, draw_mouth
@@ -84,11 +86,12 @@ def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "fits"), [(TEXT, True), ("四是四", False), (5 * TEXT, False)])
-def test_reports_a_text_that_does_not_fit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, fits: bool
-) -> None:
-    draw_mouth(SOUND, text, tmp_path / "mouth.csv", lips=WidthSource.FERGUSON)
-    assert ("the text does not fit the audio" not in capsys.readouterr().err) == fits
+def test_reports_a_text_that_does_not_fit(tmp_path: Path, text: str, fits: bool) -> None:
+    arguments = ["lips", str(SOUND), text, str(tmp_path / "mouth.csv"), "--lips", "ferguson"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == (0 if fits else 1)
+    assert ("the text does not fit the audio" not in result.output) == fits
+    assert (tmp_path / "mouth.csv").exists()
 
 
 @pytest.mark.parametrize(

@@ -146,6 +146,8 @@ def test_the_command_line_equals_rhubarbs(
     switches = capsys.readouterr().out.splitlines()
     assert switches[:2] == ["MohoSwitch1", "1 rest"]
     assert switches[-1].endswith(" rest")
+    rhubarb.main([str(VOWELS_FILE)])
+    assert capsys.readouterr().err.splitlines()[1:] == ["progress: 100 %", "finished"]
 
 
 def test_errors_equal_rhubarbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -135,6 +135,9 @@ def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) ->
     assert targets == [tmp_path / "a.mp4", tmp_path / "b.mp4"]
     assert pair_outputs(sources, tmp_path / "out", ".csv")[1][1] == tmp_path / "out" / "b.csv"
     assert (tmp_path / "out").is_dir()
+    single = pair_outputs(sources[:1], tmp_path / "one", ".mp4")
+    assert single == [(sources[0], tmp_path / "one" / "a.mp4")]
+    assert pair_outputs(sources[:1], tmp_path / "b.mp4", ".mp4")[0][1] == tmp_path / "b.mp4"
     with pytest.raises(UserError, match=r"a\.wav and .*a\.mp3 would both be written to"):
         pair_outputs([tmp_path / "a.wav", tmp_path / "a.mp3"], None, ".mp4")
     with pytest.raises(UserError, match=r"would both be written to"):
@@ -143,6 +146,9 @@ def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) ->
         UserError, match=r"one\.csv is a single file, but there are 2 inputs; use a folder"
     ):
         pair_outputs(sources, tmp_path / "one.csv", ".csv")
+    with pytest.raises(UserError, match=r"a\.wav is named twice"):
+        pair_outputs([tmp_path / "a.wav"] * 2, tmp_path / "unused", ".csv")
+    assert not (tmp_path / "unused").exists()
 
 
 def test_the_output_of_standard_input_has_a_name_that_is_no_option() -> None:
@@ -177,6 +183,9 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("render a.wav me.avi", "me.avi: unknown format; use a name that ends in .mp4"),
         ("render a.wav me.csv --lips lerned", "unknown lip model 'lerned'; use one of"),
         ("align a.wav 啊 -o said.xml", "ends in .txt, .csv, .json, .textgrid"),
+        ("render a.wav -o labels", "cannot write labels: labels is not a folder"),
+        ("phones a.wav -o labels --format csv", "cannot write labels: labels is not a folder"),
+        ("align a.wav 啊 -o labels", "cannot write labels: labels is not a folder"),
         ("plot heads .", "faces.webp exists; add --force"),
         ("express demo --hold 2", "--hold needs an expression"),
         ("express joy:0.4", "for example joy=0.4"),
@@ -195,11 +204,22 @@ def test_refuses_arguments_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("a.wav", "tablet.key", "faces.webp"):
+    for name in ("a.wav", "labels", "tablet.key", "faces.webp"):
         Path(name).touch()
     error = CliRunner().invoke(app, arguments.split()).exception
     assert isinstance(error, UserError), error
     assert message in str(error)
+
+
+def test_the_key_of_several_services_has_a_place_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    roles = ["--role", "service:recognizer", "--role", "service:synthesizer"]
+    printed = CliRunner().invoke(app, ["keys", "add", "worker", *roles]).output
+    places = "/kouxing/recognizer.key and ~/.local/state/kouxing/synthesizer.key on the other"
+    assert places in printed
 
 
 def fill_the_disk(path: Path) -> None:

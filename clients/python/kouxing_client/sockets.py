@@ -59,8 +59,9 @@ def connect(raw: Connection, endpoint: str, key: Key | None) -> None:
         raw.setsockopt(zmq.IPV6, "[" in address)
         raw.connect(address)
     except zmq.ZMQError as error:
-        hint = "" if address.startswith("tcp://") else "; write tcp://HOST:PORT"
-        raise KouxingError(f"cannot connect to {address!r}: {error.strerror}{hint}") from None
+        raise KouxingError(
+            f"cannot connect to {address!r}: {error.strerror}; write tcp://HOST:PORT"
+        ) from None
 
 
 class Sockets:

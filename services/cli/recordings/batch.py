@@ -16,32 +16,39 @@ def pair_outputs(
 ) -> list[tuple[Path, Path]]:
     """Return each source with its output, whose name ends in ``suffix``.
 
-    ``output`` is the file for a single source, or a folder, which is created. None: the outputs are
-    next to their sources. The output of standard input is named ``stdin``. Raises ``UserError`` if
-    several sources need a folder, the folder cannot be created, or two sources would have the same
-    output.
+    ``output`` is a folder, which is created, or a file for a single source (see ``is_folder``).
+    None: the outputs are next to their sources. The output of standard input is named ``stdin``.
+    Raises ``UserError`` if several sources need a folder, the folder cannot be created, or two
+    sources would have the same output.
     """
-    if output is not None and len(sources) == 1 and not output.is_dir():
-        return [(sources[0], output)]
-    if output is not None and not output.is_dir():
-        if output.suffix:
+    if output is not None and not is_folder(output):
+        if len(sources) > 1:
             raise UserError(
                 f"{output} is a single file, but there are {len(sources)} inputs; use a folder"
             )
-        try:
-            output.mkdir()
-        except OSError as error:
-            raise write_error(output, error) from None
+        return [(sources[0], output)]
     pairs: dict[Path, tuple[Path, Path]] = {}  # key: resolved path of the output
     for source in sources:
         name = "stdin" if source == Path("-") else source.stem
         target = (output or source.parent) / f"{name}{suffix}"
         if other := pairs.get(target.resolve()):
             raise UserError(
-                f"{other[0]} and {source} would both be written to {target}; rename one"
+                f"{source} is named twice"
+                if other[0] == source
+                else f"{other[0]} and {source} would both be written to {target}; rename one"
             )
         pairs[target.resolve()] = source, target
+    if output is not None:
+        try:
+            output.mkdir(exist_ok=True)
+        except OSError as error:
+            raise write_error(output, error) from None
     return [*pairs.values()]
+
+
+def is_folder(output: Path) -> bool:
+    """Return whether the output of a command is a folder: it exists, or its name has no suffix."""
+    return output.is_dir() or not output.suffix
 
 
 def process_all(pairs: Sequence[tuple[Path, T]], process: Callable[[Path, T], None]) -> None:

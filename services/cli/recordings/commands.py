@@ -1,5 +1,6 @@
 """The commands that need no running services: files in, files out."""
 
+from collections.abc import Sequence
 from contextlib import closing
 from enum import StrEnum
 from functools import partial
@@ -17,13 +18,12 @@ from kouxing.services.cli.options import (
     HeadName,
     Language,
     MouthFile,
-    Output,
     PhoneAlphabet,
     TimingMethod,
     WidthSource,
     reject_options,
 )
-from kouxing.services.cli.recordings.batch import pair_outputs, process_all
+from kouxing.services.cli.recordings.batch import is_folder, pair_outputs, process_all
 from kouxing.services.driver.config import Framing
 from kouxing.shared.command.terminal import (
     Force,
@@ -38,6 +38,14 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file; '-' is standard input.")]
+Outputs = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        help="File to write. A name without a suffix is a folder for files named after the inputs.",
+    ),
+]
 Acoustic = Annotated[
     str | None,
     typer.Option(help=f"{ACOUSTIC_MODEL}. Default: the model of the language."),
@@ -76,14 +84,7 @@ def render(
             " Then, for a single file, the output. Default: a video (.mp4) next to the file.",
         ),
     ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Folder for the videos of several files. Default: next to each file.",
-        ),
-    ] = None,
+    output: Outputs = None,
     text: Annotated[
         str | None,
         typer.Option(
@@ -236,9 +237,7 @@ def phones(
     acoustic: Acoustic = None,
     alphabet: PhoneAlphabet = None,
     phone_format: Form = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File to write; a folder for many files.")
-    ] = None,
+    output: Outputs = None,
     track: AudioTrack = None,
     force: Force = False,
 ) -> None:
@@ -256,11 +255,7 @@ def phones(
 
     if len(audio) > 1 and output is None:
         raise UserError(f"{len(audio)} files need a folder for their phones; add -o FOLDER")
-    is_folder = output is not None and (len(audio) > 1 or output.is_dir())
-    style = _format(phone_format, None if is_folder else output)
-    pairs: list[tuple[Path, Path | None]] = [(audio[0], output)]
-    if is_folder:
-        pairs = [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
+    style, pairs = _phone_outputs(audio, output, phone_format)
     check_output(*(target for _, target in pairs), inputs=audio, force=force)
     with show_loading():
         model = load_model_for_language(language, acoustic)
@@ -292,7 +287,7 @@ def align(
     acoustic: Acoustic = None,
     alphabet: PhoneAlphabet = None,
     phone_format: Form = None,
-    output: Output = None,
+    output: Outputs = None,
     track: AudioTrack = None,
     force: Force = False,
 ) -> None:
@@ -313,7 +308,7 @@ def align(
         from kouxing.shared.phones.inventory import load_inventory
         from kouxing.shared.phones.phone_files import format_phones
 
-    style = _format(phone_format, output)
+    style, [(_, output)] = _phone_outputs([audio], output, phone_format)
     check_output(output, inputs=[audio, Path(text)], force=force)
     with show_loading():
         model = load_model_for_language(language, acoustic)
@@ -364,7 +359,10 @@ def lips(
     track: AudioTrack = None,
     force: Force = False,
 ) -> None:
-    """Draw the mouth in two dimensions, for cartoons, teaching and papers."""
+    """Draw the mouth in two dimensions, for cartoons, teaching and papers.
+
+    The exit status is 1 if the text does not fit the audio.
+    """
     with show_loading():
         from kouxing.services.cli.recordings.mouth_drawing import draw_mouth
 
@@ -372,7 +370,7 @@ def lips(
     if len(text) > 1:
         raise UserError("expected one text and one output file; put a text with spaces in quotes")
     check_output(Path(output), inputs=[audio, *map(Path, text)], force=force)
-    draw_mouth(
+    fits = draw_mouth(
         audio,
         text[0] if text else None,
         Path(output),
@@ -382,10 +380,22 @@ def lips(
         track=track,
         language=language or DEFAULT_LANGUAGE,
     )
+    if not fits:
+        raise typer.Exit(1)
+
+
+def _phone_outputs(
+    audio: Sequence[Path], output: Path | None, phone_format: PhoneFormat | None
+) -> tuple[PhoneFormat, list[tuple[Path, Path | None]]]:
+    """Return the format, and each recording with its output, or None for standard output."""
+    style = _format(phone_format, output)
+    if output is None:
+        return style, [(source, None) for source in audio]
+    return style, [*pair_outputs(audio, output, _SUFFIX_OF_FORMAT[style])]
 
 
 def _format(phone_format: PhoneFormat | None, output: Path | None) -> PhoneFormat:
-    if output is None:
+    if output is None or is_folder(output):
         return phone_format or PhoneFormat.TABLE
     suffix_format = _FORMAT_OF_SUFFIX.get(output.suffix.lower())
     if suffix_format is None:

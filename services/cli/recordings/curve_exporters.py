@@ -25,7 +25,7 @@ from kouxing.services.cli.recordings.curve_reader import median_rate_hz
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.command.terminal import write_text
+from kouxing.shared.command.terminal import print_message, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
 from kouxing.shared.face.faps import FAPS, NUM_FAPS
@@ -45,6 +45,7 @@ _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default
 # The time code does not contain its rate, so readers infer it from the highest frame count. At
 # lower rates, there may be no count of 50 or more, and readers would infer 50 frames per second.
 _MIN_LIVE_LINK_FRAMES_HZ = 6
+_MIN_REPORTED_START_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +77,8 @@ class CurveExporter(ABC):
                 name for name, cls in CURVE_EXPORTERS.items() if curve_format in cls.formats
             ]
             raise UserError(
-                f"{output}: this format holds {' or '.join(self.formats)}; for {curve_format},"
-                f" write {' or '.join(suffixes)}"
+                f"{output} cannot contain {curve_format}; use a name that ends in"
+                f" {', '.join(suffixes)}"
             )
         if len(options.lips) > 1:
             raise UserError("a curve file holds one face; use --lips only once")
@@ -101,6 +102,11 @@ class CurveExporter(ABC):
 
         Raises ``UserError`` if the file cannot be written.
         """
+
+    def _report_start(self, curves: FrameStream, start_s: float) -> None:
+        """Report where a recording starts in its session, for a format without start times."""
+        if curves.is_live and start_s >= _MIN_REPORTED_START_S:
+            print_message(f"{self._output} starts at {start_s:.3f} s of the session")
 
     def close(self) -> None:  # noqa: B027 - not abstract: there is nothing to do
         """Release the exporter's resources. A curve exporter has no resources."""
@@ -153,6 +159,7 @@ class FapExporter(CurveExporter):
             frame_rate_hz = median_rate_hz(times_s)
         faps = np.array([values for _, _, values in frames], np.float32).reshape(-1, NUM_FAPS)
         if frames:
+            self._report_start(curves, times_s[0])
             numbers = np.rint((times_s - times_s[0]) * frame_rate_hz)
             faps = faps[np.searchsorted(numbers, np.arange(numbers[-1] + 1), side="right") - 1]
         write_fap(self._output, FapAnimation(self._output.stem, frame_rate_hz, faps))
@@ -175,6 +182,7 @@ class GlbExporter(CurveExporter):
             if not frames or time_s > frames[-1][0]:  # media time stops while no audio arrives
                 frames.append((time_s, faps))
         if frames and curves.is_live:
+            self._report_start(curves, frames[0][0])
             frames = [(time_s - frames[0][0], faps) for time_s, faps in frames]
         is_arkit = self._curve_format is CurveFormat.ARKIT
         export_glb(load_head(self._head), self._output, frames, as_arkit=is_arkit)

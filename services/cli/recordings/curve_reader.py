@@ -210,10 +210,14 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
         )
     times_s, first = np.unique(times_s - times_s[0], return_index=True)
     rate_hz = median_rate_hz(times_s)
-    num_frames = round(times_s[-1] * rate_hz) + 1
-    if not 1.0 <= rate_hz <= 1000.0 or num_frames > 10 * len(times_s) + 1000:
+    if not 1.0 <= rate_hz <= 1000.0:
         raise UserError(f"{path}: the times must match a rate of 1 to 1000 frames per second")
-    grid_s = np.arange(num_frames) / rate_hz
+    if times_s[-1] > (MAX_FRAMES - 1) / rate_hz:
+        raise UserError(
+            f"{path}: the times span {times_s[-1]:.0f} s, more than {MAX_FRAMES} frames at"
+            f" {rate_hz:g} per second; split the table"
+        )
+    grid_s = np.arange(round(times_s[-1] * rate_hz) + 1) / rate_hz
     columns = [np.interp(grid_s, times_s, column) for column in faps[first].T]
     return FapAnimation(path.stem, rate_hz, np.stack(columns, axis=1).astype(np.float32))
 

@@ -110,13 +110,13 @@ def draw_mouth(
     speech_to_text: Path | None = None,
     track: int | None = None,
     language: str = DEFAULT_LANGUAGE,
-) -> None:
+) -> bool:
     """Draw the mouth of an audio file, in the format of the output's suffix.
 
     ``.svg`` and ``.png`` show the mouth at the key frames, ``.mp4`` is a video with audio, and
     ``.csv`` has the contour of every frame with ``NUM_POINTS`` for each line. Without a text, the
     model in the folder ``speech_to_text`` recognizes the text. Without that folder, phones are
-    recognized. ``lips`` gives the width.
+    recognized. ``lips`` gives the width. Returns False if the text does not fit the audio.
 
     Raises ``UserError`` if a file cannot be read or written, or the options do not fit each other.
     """
@@ -141,7 +141,7 @@ def draw_mouth(
         print_message(f"labels show only pinyin: {NO_CHINESE_FONT}")
     with open_progress() as progress:
         with_progress = partial(progress.track, description="timing")
-        timed = _time_phones(source, samples, transcript, timing, inventory, with_progress)
+        timed, fits = _time_phones(source, samples, transcript, timing, inventory, with_progress)
         with_progress = partial(progress.track, description="finding the width")
         widths = _find_widths(lips, samples, timed, inventory, with_progress)
     phones = drop_pauses(timed, inventory)
@@ -157,6 +157,7 @@ def draw_mouth(
         shows_text=shows_text,
     )
     print_message(f"wrote {output}: {write(output, mouth)}")
+    return fits
 
 
 def _time_phones(
@@ -166,7 +167,8 @@ def _time_phones(
     timing: TimingMethod | None,
     inventory: PhoneInventory,
     with_progress: WithProgress,
-) -> list[Phone]:
+) -> tuple[list[Phone], bool]:
+    """Return the phones, and whether the text fits the audio."""
     if transcript is not None and timing is None:
         is_long = len(transcript.syllables) > MAX_SYLLABLES
         timing = TimingMethod.ALIGN if is_long else TimingMethod.ENDPOINTS
@@ -174,15 +176,16 @@ def _time_phones(
         recording = measure_slices(samples, with_progress), transcript.phones, load_table(inventory)
         phones = time_text(*recording)
         ratio = speech_ratio(*recording)
-        if not MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO:
+        fits = MIN_SPEECH_RATIO <= ratio <= MAX_SPEECH_RATIO
+        if not fits:
             print_mismatch(source, f"the speech is {ratio:.1f} times the text's usual duration")
-        return phones
+        return phones, fits
     model = load_model_for_language(inventory.language)
     if transcript is None:
-        return recognize_recording(model, samples, with_progress)
+        return recognize_recording(model, samples, with_progress), True
     alignment = align_syllables(model, samples, transcript.phones, with_progress)
     report_mismatch(source, alignment)
-    return alignment.phones
+    return alignment.phones, alignment.fits
 
 
 def _find_widths(

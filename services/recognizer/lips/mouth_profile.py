@@ -21,6 +21,7 @@ Format in files and messages:
     rest      s, b and r: float16, little endian
 """
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
-from kouxing.shared.files.user_file import read_file
+from kouxing.shared.files.user_file import open_file
 
 Floats = NDArray[np.float32]
 
@@ -93,7 +94,8 @@ def parse_mouth_profile(
 
 def read_mouth_profile(path: Path) -> bytes:
     """Read a file that starts like a mouth profile; raises ``UserError`` if it does not."""
-    content = read_file(path, MAX_MOUTH_PROFILE_BYTES)
-    if content[: len(_MAGIC)] != _MAGIC:
+    with open_file(path, sys.maxsize) as file:
+        content = file.read(MAX_MOUTH_PROFILE_BYTES + 1)
+    if content[: len(_MAGIC)] != _MAGIC or len(content) > MAX_MOUTH_PROFILE_BYTES:
         raise UserError(f"{path} is not a mouth profile; make one with 'kouxing adapt'")
     return content
