@@ -111,21 +111,21 @@ def test_containers_are_healthy_private_and_speak(
     containers: Containers, network: Network, keys: Path
 ) -> None:
     end_s = time.monotonic() + 800
-    for host, service in HOSTS.items():
-        if service == "client":
-            continue
-        check = COMPOSE["services"][service]["healthcheck"]["test"][1:]
-        while not containers.is_healthy(host, check):
-            assert time.monotonic() < end_s, containers.log(host).read_text("utf-8")
-            time.sleep(0.2)
-
     address = f"tcp://{network.address('control')}:5550"
-    with network.on("client-1"), Client(control_endpoint(address, insecure=False)) as client:
+    with (
+        network.on("client-1"),
+        Client(control_endpoint(address, insecure=False), start_s=LIMIT_S) as client,
+    ):
         while len(services := client.status().services) < len(HOSTS) - 1:
             assert time.monotonic() < end_s, services
             time.sleep(0.2)
         reported_endpoints = {item for state in services for item in state.endpoints.values()}
         check_page(reported_endpoints, network.address("gateway-1"))
+    for host, service in HOSTS.items():
+        if service != "client":
+            check = COMPOSE["services"][service]["healthcheck"]["test"][1:]
+            while not containers.is_healthy(host, check):
+                assert time.monotonic() < end_s, containers.log(host).read_text("utf-8")
     for host, port in (("recognizer-1", 5560), ("synthesizer-1", 5571)):
         assert any(
             item.startswith(f"tcp://{network.address(host)}:{port} ") for item in reported_endpoints

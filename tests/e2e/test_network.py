@@ -15,10 +15,10 @@ from kouxing.evaluation.system.network import NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem
 from kouxing.shared.settings.keys import CLIENT
 from tests.containers import network_or_skip
-from tests.system import DEMO, SKIP_NO_AUDIO, samples_of_file
+from tests.system import DEMO, LIGHT_MODEL, SKIP_NO_AUDIO, samples_of_file
 
 CUT_AT_S = 1.0
-SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:64000]
+SAMPLES = samples_of_file(DEMO / "hello-female.wav")[:56000]
 
 
 LOST_AFTER = {"KOUXING_CONTROL_LOST_AFTER_S": "5"}  # a busy service is not lost
@@ -26,9 +26,9 @@ LOST_AFTER = {"KOUXING_CONTROL_LOST_AFTER_S": "5"}  # a busy service is not lost
 
 @pytest.fixture(scope="module")
 def _complete() -> Iterator[None]:
-    """Let services process everything on a busy machine, with the block network."""
+    """Let services process everything on a busy machine."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (SKIP_NO_AUDIO | LOST_AFTER).items():
+        for name, value in (SKIP_NO_AUDIO | LOST_AFTER | LIGHT_MODEL).items():
             patch.setenv(name, value)
         yield
 

@@ -36,7 +36,7 @@ def test_chunks_do_not_affect_resampling(cuts: list[int], rate_hz: int) -> None:
     np.testing.assert_array_equal(np.concatenate([*parts, resampler.finish()]), undivided)
 
 
-@settings(max_examples=30)
+@settings(max_examples=10)
 @given(cuts=CUTS, name=st.sampled_from(["gmm", "blocks"]))
 def test_chunks_do_not_affect_front_ends(cuts: list[int], name: str) -> None:
     model = load_model(name)

@@ -23,8 +23,8 @@ from tests.lips import INVENTORY, LIPS, advance, lip_gaps, make_face
 
 PARAMETERS = LIPS.parameters
 FRAME_S = 0.02
-examples = settings(max_examples=20)
-few_examples = settings(max_examples=12)
+examples = settings(max_examples=15)
+few_examples = settings(max_examples=8)
 CLOSED = 20.0  # FAP units: 0.5 mm on a face
 CLOSED_IN_HASTE = 35.0  # recognized less than two frames before the apex
 # Jaw, width and protrusion have no closures.

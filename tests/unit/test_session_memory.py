@@ -29,8 +29,8 @@ class Sessions:
     def __init__(self, model: AcousticModel) -> None:
         self._recognizer = Recognizer(model)
         self._lips = load_lip_predictor()
-        sound = to_16_khz(*read_audio(DEMO / "bilabials-female.wav"))[:24_000]
-        self._sounds = [np.roll(sound, number * 6_000) for number in range(NUM_SESSIONS)]
+        sound = to_16_khz(*read_audio(DEMO / "bilabials-female.wav"))[:16_000]
+        self._sounds = [np.roll(sound, number * 4_000) for number in range(NUM_SESSIONS)]
         self._rng = np.random.default_rng(0)
         self._streams: list[SpeechStream] = []
 
