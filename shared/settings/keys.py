@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import write_error, write_private
-from kouxing.shared.files.user_file import parse_json, read_text
+from kouxing.shared.files.user_file import read_text
 from kouxing.shared.name_rules import NAME, NAME_RULE, is_name
 from kouxing.shared.settings.endpoints import is_local, split_endpoint, with_key
 
@@ -46,7 +46,6 @@ _MAX_ALLOWED_BYTES = 768 * 1024
 _MAX_FILE_BYTES = 1 << 20
 _ALLOWED = "allowed"
 _SUBSCRIBER = "subscriber:"
-_PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
 _ROLE = re.compile(rf"client|operator|service:[a-z-]{{1,64}}|subscriber:({NAME}|\*)")
 
 
@@ -291,15 +290,13 @@ def read_key(path: Path) -> Key:
 
     Raises ``UserError`` if it cannot be read, or other users can read it.
     """
-    from kouxing_client.keys import Key  # noqa: PLC0415 (slow to import)
+    from kouxing_client import KouxingError, keys  # noqa: PLC0415 (slow to import)
 
+    _check_private(path, 0o600)
     try:
-        key = Key(**parse_json(_read(path)))
-        if all(_PUBLIC.fullmatch(part) for part in (key.public, key.secret, key.control)):
-            return key
-    except (ValueError, TypeError):
-        pass
-    raise _key_error(path)
+        return keys.read_key(path)
+    except KouxingError:
+        raise _key_error(path) from None
 
 
 def _key_error(path: Path) -> UserError:
@@ -323,11 +320,13 @@ def _read_grants(path: Path) -> dict[str, Grant]:
 def _parse_grants(path: Path) -> dict[str, Grant]:
     if not path.exists():
         return {}
+    from kouxing_client.keys import Z85_KEY  # noqa: PLC0415 (slow to import)
+
     grants = {}
     for line in _read(path).splitlines():
         public, *name_and_roles = line.split() or [""]
         name, *roles = name_and_roles or [""]
-        is_whole = _PUBLIC.fullmatch(public) and is_name(name)
+        is_whole = re.fullmatch(Z85_KEY, public) and is_name(name)
         if not (is_whole and all(map(_ROLE.fullmatch, roles))):
             raise UserError(
                 f"{path}: {line!r} is not of the form PUBLIC-KEY NAME ROLE...; delete this line,"
@@ -391,7 +390,10 @@ def _find_credential(name: str) -> Path | None:
 
 def _check_private(path: Path, mode: int) -> None:
     """Reject a file that other users can read. Credentials may be readable by the group."""
-    about = path.stat()
+    try:
+        about = path.stat()
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
     if mode == 0o600 and not stat.S_ISREG(about.st_mode):
         raise UserError(f"{path} is not a regular file; run 'rm -r {path}'")
     is_given = path.parent == Path(os.environ.get("CREDENTIALS_DIRECTORY", ""))
@@ -405,10 +407,7 @@ def _check_private(path: Path, mode: int) -> None:
 
 
 def _read(path: Path) -> str:
-    try:
-        _check_private(path, 0o600)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error}") from None
+    _check_private(path, 0o600)
     return read_text(path, _MAX_FILE_BYTES)
 
 

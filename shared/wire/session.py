@@ -12,7 +12,7 @@ from kouxing_client.field_types import (
     Name,
     Seconds,
     Text,
-    whole_text,
+    full_match,
 )
 from kouxing_client.messages import ServiceState, SessionFacts, SessionState
 from kouxing_client.options import MAX_CHANNELS, MAX_RATE_HZ, MIN_RATE_HZ
@@ -22,7 +22,7 @@ from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import RegisteredMessage
 
-Encoding = Annotated[str, whole_text(f"({'|'.join(SAMPLE_BYTES)})")]
+Encoding = Annotated[str, full_match(f"({'|'.join(SAMPLE_BYTES)})")]
 SampleRate = Annotated[int, Meta(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]
 NumChannels = Annotated[int, Meta(ge=1, le=MAX_CHANNELS)]
 MouthProfile = Annotated[bytes, Meta(max_length=MAX_MOUTH_PROFILE_BYTES)]

@@ -325,7 +325,8 @@ def test_a_request_of_another_thread_fails_while_the_client_ends(
 
     def close_late(failure: KouxingError) -> None:
         close(failure)
-        answers.append(thread.start(lambda core: core.request("status-request")))
+        answer = thread.submit(lambda core: core.request("status-request"), may_wait=False)
+        answers.append(answer)
 
     monkeypatch.setattr(thread.core, "close", close_late)
     client.close()
@@ -343,6 +344,19 @@ def test_values_of_numpy_do_not_end_the_client(control: FakeControl, client: Cli
     wait_until(lambda: control.audio_messages)
     assert control.audio_messages[0].media_time == 1600
     assert not client.is_closed
+
+
+def test_skip_has_the_limits_of_push(client: Client) -> None:
+    session = client.open_session("s")
+    with pytest.raises(KouxingError, match="num_samples must be at least 0, not -1"):
+        session.skip(-1)
+    session.finish()
+    with pytest.raises(KouxingError, match=r"finish\(\) has ended the audio"):
+        session.skip(1600)
+    closed = client.open_session("t")
+    closed.close()
+    with pytest.raises(KouxingError, match="the session is closed"):
+        closed.skip(1600)
 
 
 class Odd(Result, frozen=True, kw_only=True):

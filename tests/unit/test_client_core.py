@@ -213,9 +213,9 @@ def test_ends_after_the_last_phones_though_a_publisher_confirms_late() -> None:
     harness.session.subscribe(Subscription(harness.session, (Phone,), "", inbox))
     harness.sockets.connections[-1].on_message(EndOfFaps(session="s", epoch=1, sequence=1))
     harness.confirm()  # the first subscription; phones may follow
-    assert not inbox.is_over
+    assert not inbox.has_ended
     harness.confirm()
-    assert inbox.is_over
+    assert inbox.has_ended
 
 
 def test_an_unknown_session_ends_unless_it_moves() -> None:
@@ -226,11 +226,22 @@ def test_an_unknown_session_ends_unless_it_moves() -> None:
     assert [error.code for error in harness.session.errors] == ["bad-audio"]
     harness.commands.answer("session-moved", **MOVED, next_sequence=1)
     harness.pass_time(MOVE_TIMEOUT_S + 0.1)
-    assert not harness.session.is_over
+    assert not harness.session.has_ended
     harness.audio(2).answer("error", code="unknown-session", text="x")
     harness.pass_time(MOVE_TIMEOUT_S + 0.1)
-    assert harness.session.is_over
+    assert harness.session.has_ended
     assert "unknown-session" in str(harness.session.failure)
+
+
+def test_a_message_that_the_recognizer_cannot_read_ends_the_session() -> None:
+    harness = CoreHarness()
+    inbox = harness.subscribe()
+    harness.push(1)
+    harness.audio().answer("error", code="bad-message", text="media_time must be ...")
+    assert harness.session.has_ended
+    assert "bad-message" in str(inbox.failure)
+    harness.pass_time(ANSWER_LIMITS_S[1])
+    assert sequences(harness.audio()) == [1]
 
 
 @pytest.mark.parametrize("cause", ["moved", "replaced", "ended"])
@@ -249,14 +260,14 @@ def test_asks_where_a_silent_session_of_another_program_is(cause: str) -> None:
         state["endpoints"] = {**endpoints, "faps": "faps 2"}
         harness.answer("status-report", services=[], sessions=[state])
         assert harness.sockets.at("faps 2")
-        assert not inbox.is_over
+        assert not inbox.has_ended
     else:
         if cause == "replaced":
             state["session_id"] = "another session with its name"
             harness.answer("status-report", services=[], sessions=[state])
         else:
             harness.answer("error", code="unknown-session", text="x")
-        assert inbox.is_over
+        assert inbox.has_ended
         assert inbox.failure is None
 
 
@@ -265,9 +276,9 @@ def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
     inbox = harness.subscribe()
     for is_refused in (True, False, True, True):  # the first refusal is short
         harness.commands.on_refused(is_refused)
-        assert not inbox.is_over
+        assert not inbox.has_ended
         harness.pass_time(6.0)
-    assert inbox.is_over
+    assert inbox.has_ended
     assert "rejects this client" in str(inbox.failure)
 
 
@@ -288,10 +299,10 @@ def test_failing_on_result_does_not_keep_other_sessions_open(reason: str) -> Non
     phone = Phone(**stamp, index=0, symbol="a", duration=1600, confidence=1.0, final=True)
     harness.sockets.at("phones 1")[0].unread.append(phone)
     harness.session.end(None if reason == "closed by the program" else KouxingError(reason))
-    assert inbox.is_over
+    assert inbox.has_ended
     assert "on_result failed: ValueError('a bug')" in str(inbox.failure)
-    assert other.is_over
-    assert harness.session.is_over
+    assert other.has_ended
+    assert harness.session.has_ended
 
 
 def test_closes_a_session_that_opens_after_its_request_has_failed() -> None:
@@ -325,8 +336,8 @@ def test_events_can_be_closed_twice() -> None:
         harness.core.add_inbox(harness.session, inbox)
     for _ in range(2):
         harness.core.remove_inbox(harness.session, first)
-    assert first.is_over
-    assert not second.is_over
+    assert first.has_ended
+    assert not second.has_ended
 
 
 def test_a_session_without_inboxes_is_freed_when_it_is_over() -> None:
@@ -356,7 +367,7 @@ def test_late_event_of_an_ended_session_does_not_affect_its_successor(
     events.answer("event", name="session-closed", session_id=session_id)
     assert len(inbox.messages) == is_same
     harness.pass_time(2 * LAST_RESULTS_WAIT_S)
-    assert harness.session.is_over == is_same
+    assert harness.session.has_ended == is_same
 
 
 def test_a_diagnosis_may_arrive_after_the_client_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,6 +82,17 @@ def test_names_an_invalid_key_file_and_an_unusable_folder(
         load_user_key()
 
 
+@pytest.mark.parametrize("text", ["~" * 40, "a" * 39, "a" * 40 + "\\n"])
+def test_a_key_is_z85_in_every_program(text: str) -> None:
+    load_user_key()
+    path = key_folder() / "client.key"
+    path.write_text(f'{{"public": "{text}", "secret": "{"b" * 40}", "control": "{"c" * 40}"}}')
+    with pytest.raises(KouxingError, match="is not a valid key file"):
+        read_key(path)
+    with pytest.raises(UserError, match="is not a valid key file"):
+        load_user_key()
+
+
 def test_a_folder_is_not_a_key_and_is_closed(tmp_path: Path) -> None:
     def next_descriptor() -> int:
         with tmp_path.joinpath("file").open("w") as file:

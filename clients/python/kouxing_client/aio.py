@@ -99,7 +99,7 @@ class AsyncSession(BaseSession):
 
     async def close(self) -> None:
         """Close the session, as ``Session.close``."""
-        if self._core.is_over:
+        if self._core.has_ended:
             return
         try:
             if self._options is not None:

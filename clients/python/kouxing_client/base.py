@@ -86,8 +86,9 @@ class BaseClient:
                 closed.set_result(None)
                 return
             core = opened.result()
-            answer = self._thread.start(
-                lambda client: client.request("close-session", core.name, token=core.token)
+            answer = self._thread.submit(
+                lambda client: client.request("close-session", core.name, token=core.token),
+                may_wait=False,
             )
             answer.add_done_callback(lambda _: closed.set_result(None))
             self._thread.forget(core)
@@ -147,13 +148,24 @@ class BaseSession:
             self._add(chunk, self._num_samples(chunk))
         return True
 
-    def skip(self, num_frames: int) -> None:
-        """Advance media time by ``num_frames`` samples per channel without sending audio."""
-        num_samples = int(num_frames)  # NumPy integers cannot be encoded
+    def skip(self, num_samples: int) -> None:
+        """Advance media time by ``num_samples`` samples per channel without sending audio.
+
+        Raises
+        ------
+        KouxingError
+            As ``try_push``, or if the number is negative.
+        """
+        self._check_sender()
+        self._check_unfinished()
+        self._check_open()
+        count = int(num_samples)  # NumPy integers cannot be encoded
+        if count < 0:
+            raise KouxingError(f"num_samples must be at least 0, not {count}")
 
         def skip() -> None:
             if self._core.stream is not None:
-                self._core.stream.skip(num_samples)
+                self._core.stream.skip(count)
 
         self._thread.call(skip)
 
@@ -285,17 +297,17 @@ class BaseSession:
             raise KouxingError("finish() has ended the audio of this session; open another session")
 
     def _check_open(self) -> None:
-        if self._core.is_over:
+        if self._core.has_ended:
             raise self._core.failure or KouxingError("the session is closed")
 
     def _has_room(self) -> bool:
         return self._num_unacknowledged() < MAX_UNACKNOWLEDGED_MESSAGES
 
     def _can_push(self) -> bool:
-        return self._core.is_over or bool(self._core.errors) or self._has_room()
+        return self._core.has_ended or bool(self._core.errors) or self._has_room()
 
     def _is_delivered(self) -> bool:
-        return self._core.is_over or not self._has_finished or self._num_unacknowledged() == 0
+        return self._core.has_ended or not self._has_finished or self._num_unacknowledged() == 0
 
     def _num_unacknowledged(self) -> int:
         stream = self._core.stream
@@ -315,7 +327,7 @@ class BaseResults:
     @property
     def has_ended(self) -> bool:
         """Whether the session's last frame has arrived, or the session is closed."""
-        return self._inbox.is_over
+        return self._inbox.has_ended
 
     @property
     def num_missed(self) -> int:
@@ -323,7 +335,7 @@ class BaseResults:
         return self._inbox.num_missed
 
     def _has_results(self) -> bool:
-        return self._inbox.is_over or bool(self._inbox.messages)
+        return self._inbox.has_ended or bool(self._inbox.messages)
 
     def _take(self) -> Any:
         """Return the next result, or None if none is left."""
@@ -336,6 +348,6 @@ class BaseResults:
     def _take_or_fail(self) -> Any:
         """Return the next result, or None; at the end, raise an error that no push has raised."""
         result = self._take()
-        if result is None and self._inbox.is_over and self._inbox.errors:
+        if result is None and self._inbox.has_ended and self._inbox.errors:
             raise self._inbox.errors.popleft()
         return result

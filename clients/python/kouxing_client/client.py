@@ -136,7 +136,7 @@ class Session(BaseSession):
 
     def close(self) -> None:
         """Close the connections of the session, and the session if this program opened it."""
-        if self._core.is_over:
+        if self._core.has_ended:
             return
         self._thread.check_may_wait()
         try:

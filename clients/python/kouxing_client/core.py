@@ -156,7 +156,7 @@ class ClientCore:
             self._sockets.explain(self._control, self._fail_requests)
         for session in list(self.sessions):
             session.tick()
-            if session.is_over:
+            if session.has_ended:
                 self._remove(session)
             elif session.is_silent():
                 self._locate(session)

@@ -14,13 +14,13 @@ SESSION_NAME = "[A-Za-z0-9_-]{0,64}"  # empty: no session
 NO_LINE_BREAK = r"(?!\n)"  # "$" alone also matches before a final line break
 
 
-def whole_text(pattern: str) -> Meta:
+def full_match(pattern: str) -> Meta:
     """Return the rule that a regular expression matches a whole text."""
     return Meta(pattern=f"^{pattern}${NO_LINE_BREAK}")
 
 
 Version = Annotated[int, Meta(ge=1, le=65535)]
-SessionName = Annotated[str, whole_text(SESSION_NAME)]
+SessionName = Annotated[str, full_match(SESSION_NAME)]
 Name = Annotated[str, Meta(min_length=1, max_length=128)]
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
@@ -28,7 +28,7 @@ Samples = Annotated[int, Meta(ge=0, le=2**53)]  # at 16 kHz
 Seconds = Annotated[float, Meta(ge=0)]
 Milliseconds = Annotated[float, Meta(ge=0)]
 Probability = Annotated[float, Meta(ge=0, le=1)]
-PhoneSymbol = Annotated[str, whole_text("[a-z]{1,4}")]
+PhoneSymbol = Annotated[str, full_match("[a-z]{1,4}")]
 FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]
 FapMask = Annotated[bytes, Meta(min_length=MASK_BYTES, max_length=MASK_BYTES)]
 ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
@@ -36,6 +36,6 @@ ShapeMap = Annotated[dict[Name, ShapeWeights], Meta(max_length=16)]
 Endpoint = Annotated[str, Meta(max_length=MAX_ENDPOINT)]
 EndpointMap = Annotated[dict[Name, Endpoint], Meta(max_length=16)]
 MetricMap = Annotated[dict[Name, float], Meta(max_length=512)]  # control can have 80
-Role = Annotated[str, whole_text("(control|worker|observer)")]
-ServiceStatus = Annotated[str, whole_text("(ready|draining)")]
-SessionStatus = Annotated[str, whole_text("(starting|open)")]
+Role = Annotated[str, full_match("(control|worker|observer)")]
+ServiceStatus = Annotated[str, full_match("(ready|draining)")]
+SessionStatus = Annotated[str, full_match("(starting|open)")]

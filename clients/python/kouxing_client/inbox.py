@@ -60,7 +60,7 @@ class Inbox:
 
     def __init__(self, capacity: int | None) -> None:
         self.messages: deque[Any] = deque(maxlen=capacity)
-        self.is_over = False  # no more messages arrive
+        self.has_ended = False  # no more messages arrive
         self.failure: KouxingError | None = None  # reason for an early end
         self.num_missed = 0  # frames and phones that did not arrive
         self.errors: deque[Refused] = deque()  # errors about the session's audio
@@ -73,5 +73,5 @@ class Inbox:
 
     def end(self, failure: KouxingError | None) -> None:
         """Stop accepting messages."""
-        self.is_over, self.failure = True, self.failure or failure
+        self.has_ended, self.failure = True, self.failure or failure
         self.signal.notify()

@@ -8,10 +8,12 @@ from typing import Annotated
 import msgspec
 
 from kouxing_client.errors import KouxingError
+from kouxing_client.field_types import full_match
 
 _FILE = "client.key"
 _MAX_BYTES = 1000
-Z85Key = Annotated[str, msgspec.Meta(min_length=40, max_length=40)]
+Z85_KEY = r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}"  # 32 bytes
+Z85Key = Annotated[str, full_match(Z85_KEY)]
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ class Subscription:
             self._session.sockets.set_topics(connection, joined, on=on)
 
     def _on_complete(self) -> None:
-        if self.follower.has_ended and not self.inbox.is_over:
+        if self.follower.has_ended and not self.inbox.has_ended:
             if self._awaits_last_phones:
                 self.inbox.end(None)
             else:  # this confirms an earlier subscription
@@ -166,7 +166,7 @@ class Subscription:
 class SessionCore:
     """One session: its audio, if this client opened it, and its subscriptions.
 
-    Any thread may use ``name``, ``token``, ``signal``, ``errors``, ``failure`` and ``is_over``.
+    Any thread may use ``name``, ``token``, ``signal``, ``errors``, ``failure`` and ``has_ended``.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ class SessionCore:
         self.signal = Signal()  # notified of changes
         self.errors: deque[Refused] = deque()  # errors about the audio
         self.failure: KouxingError | None = None  # reason for the end; None: closed
-        self.is_over = False
+        self.has_ended = False
         self.is_blocked = False  # the audio socket accepts no more
         self.last_located_s = 0.0  # when control was last asked where the silent session is
         self._audio: Connection | None = None
@@ -227,7 +227,7 @@ class SessionCore:
 
     def add_audio(self, num_samples: int, fields: Fields) -> None:
         """Send a chunk of ``num_samples`` samples per channel."""
-        if self.stream is not None and not self.is_over:
+        if self.stream is not None and not self.has_ended:
             fields = {"token": self.token, **fields}
             self.stream.add(fields, num_samples, self.sockets.now_s)
             self.send_audio()
@@ -245,7 +245,7 @@ class SessionCore:
 
     def subscribe(self, subscription: Subscription) -> None:
         """Start a subscription."""
-        if self.is_over:
+        if self.has_ended:
             subscription.end(self.failure or KouxingError("the session is closed"))
             return
         try:
@@ -305,7 +305,7 @@ class SessionCore:
 
     def end(self, failure: KouxingError | None) -> None:
         """Close all connections; ``failure`` is the reason for an early end."""
-        self.is_over, self.failure = True, failure
+        self.has_ended, self.failure = True, failure
         for subscription in self._subscriptions:
             subscription.end(failure)
         self._subscriptions.clear()
@@ -344,6 +344,8 @@ class SessionCore:
             error = refused(fields)
             if error.code == "unknown-session":  # the recognizer restarted
                 self._unknown = self._unknown or (self.sockets.now_s, error)
+            elif error.code == "bad-message":  # a chunk that is never acknowledged
+                self.end(error)
             else:
                 self.errors.append(error)
         self.signal.notify()

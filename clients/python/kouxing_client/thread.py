@@ -71,13 +71,15 @@ class ClientThread:
                 "on_result cannot call a method that waits for an answer; call it in another thread"
             )
 
-    def submit(self, function: Callable[[ClientCore], Future[T]]) -> Future[T]:
-        """Let the thread call a function; return a future that the caller may wait for."""
-        self.check_may_wait()
-        return self.start(function)
+    def submit(
+        self, function: Callable[[ClientCore], Future[T]], *, may_wait: bool = True
+    ) -> Future[T]:
+        """Let the thread call a function; return the future that this function returns.
 
-    def start(self, function: Callable[[ClientCore], Future[T]]) -> Future[T]:
-        """Let the thread call a function; return the future that this function returns."""
+        ``may_wait``: the caller may wait for the future.
+        """
+        if may_wait:
+            self.check_may_wait()
         if not self.is_running:
             raise KouxingError("the client is closed")
         answer = new_future()

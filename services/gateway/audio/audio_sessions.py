@@ -47,8 +47,9 @@ class AudioSession:
             self._warn("slow_recognizer", "dropped audio: the recognizer cannot keep up", self.name)
 
     def skip(self, num_samples: int) -> None:
-        """Skip audio: media time advances."""
-        self._session.skip(num_samples)
+        """Skip audio: media time advances. If the session has ended, this does nothing."""
+        with contextlib.suppress(KouxingError):
+            self._session.skip(num_samples)
 
     async def flush(self) -> None:
         """Interrupt: drop audio whose face is not shown yet."""

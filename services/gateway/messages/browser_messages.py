@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from typing import Annotated, Any, TypeVar
 
 import msgspec
-from kouxing_client.field_types import SessionName, whole_text
+from kouxing_client.field_types import SessionName, full_match
 from kouxing_client.options import MAX_RATE_HZ
 from msgspec import Meta, Struct
 
@@ -133,9 +133,9 @@ class ViewerCommand(Struct, frozen=True, kw_only=True):
     """A command of a viewer."""
 
     follow: SessionName | None = None  # session to show; empty: the newest
-    play: Annotated[str, whole_text("(sample)")] | None = None
+    play: Annotated[str, full_match("(sample)")] | None = None
     avatar: list[list[Annotated[str, Meta(max_length=128)]]] | None = None  # shapes of each mesh
-    format: Annotated[str, whole_text(f"({'|'.join(FORMATS)})")] = FORMATS[0]  # the weights' format
+    format: Annotated[str, full_match(f"({'|'.join(FORMATS)})")] = FORMATS[0]  # the weights' format
     face: FaceSettings | None = None  # settings to change
     problem: str = ""  # error about fields that are ignored
 
