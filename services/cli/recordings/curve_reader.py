@@ -218,8 +218,10 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
             f" {rate_hz:g} per second; split the table"
         )
     grid_s = np.arange(round(times_s[-1] * rate_hz) + 1) / rate_hz
-    columns = [np.interp(grid_s, times_s, column) for column in faps[first].T]
-    return FapAnimation(path.stem, rate_hz, np.stack(columns, axis=1).astype(np.float32))
+    resampled = np.empty((len(grid_s), faps.shape[1]), np.float32)
+    for index, column in enumerate(faps[first].T):
+        resampled[:, index] = np.interp(grid_s, times_s, column)
+    return FapAnimation(path.stem, rate_hz, resampled)
 
 
 def median_rate_hz(times_s: Float64) -> float:
