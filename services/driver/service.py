@@ -19,8 +19,6 @@ from kouxing.shared.errors import Rejected
 from kouxing.shared.face.idle_motion import STALL_S
 from kouxing.shared.files.output_file import remove_unfinished
 from kouxing.shared.monitoring.logs import LOG
-from kouxing.shared.network.peer import Peer
-from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.service.session_follower import SessionFollower
 from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
@@ -58,11 +56,7 @@ class DriverService(SessionService):
             on_image=lambda: self.metrics.count("video_ms", round(1000 / config.frame_rate_hz)),
         )
 
-    def control_handlers(self) -> dict[type[Message], Handler]:
-        """Return the handlers of control's messages."""
-        return super().control_handlers() | {SetFace: self._on_set_face}
-
-    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+    def change_face(self, message: SetFace) -> None:
         """Change the face at rest; the frames of a session already have its settings."""
         if message.session == "" and message.face.expressions is not None:
             self.poses.express(message.face.expressions, message.face.hold_s)

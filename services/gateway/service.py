@@ -213,11 +213,7 @@ class GatewayService(SessionService):
         self._create_task(self._microphones.close_session(session))
         self._create_task(self._whip_handler.close_session(session))
 
-    def control_handlers(self) -> dict[type[Message], Handler]:
-        """Return the handlers of control's messages."""
-        return super().control_handlers() | {SetFace: self._on_set_face}
-
-    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+    def change_face(self, message: SetFace) -> None:
         """Change the face at rest, or notify viewers of a change of a session's face."""
         if message.session == "" and (strengths := message.face.expressions) is not None:
             self._resting_face.express(strengths, message.face.hold_s)

@@ -36,7 +36,6 @@ from kouxing.shared.monitoring.metrics import trim_heap
 from kouxing.shared.network.peer import NO_PEER, Peer
 from kouxing.shared.network.sockets import Socket
 from kouxing.shared.phones.events import Waveform
-from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import SetFace
@@ -134,10 +133,6 @@ class RecognizerService(SessionService):
 
     # --- sessions --------------------------------------------------------------------------------
 
-    def control_handlers(self) -> dict[type[Message], Handler]:
-        """Return the handlers of control's messages."""
-        return super().control_handlers() | {SetFace: self._on_set_face}
-
     def served_sessions(self) -> Iterable[StartSession]:
         """Return the current state of the sessions, for a restarted control."""
         now_s = time.monotonic()
@@ -145,7 +140,8 @@ class RecognizerService(SessionService):
             start = session.start.with_face(session.face.at(now_s))
             yield replace(start, speech_time=session.speech_time)
 
-    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+    def change_face(self, message: SetFace) -> None:
+        """Change the acoustic model and the face that a move restores."""
         self._pending.set_face(message.session, message.face)
         if (session := self._sessions.get(message.session)) is not None:
             session.face.change(message.face, time.monotonic())

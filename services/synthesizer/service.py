@@ -36,7 +36,7 @@ from kouxing.shared.network.peer import Peer
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.service.message_loop import MAX_TURN_S, Handler
+from kouxing.shared.service.message_loop import MAX_TURN_S
 from kouxing.shared.service.overload import CATCH_UP_S, MAX_LATE_FOR_S
 from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.settings.endpoints import key_of
@@ -96,10 +96,6 @@ class SynthesizerService(SessionService):
         self.register(self._input, {Results: self._on_results})
         self.register(self._faps, {})
 
-    def control_handlers(self) -> dict[type[Message], Handler]:
-        """Return the handlers of control's messages."""
-        return super().control_handlers() | {SetFace: self._on_set_face}
-
     def start_session(self, start: StartSession) -> bool:
         """Create a face at rest. A session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
@@ -132,7 +128,8 @@ class SynthesizerService(SessionService):
             )
             flushed.face.flush()
 
-    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+    def change_face(self, message: SetFace) -> None:
+        """Change the face of a session."""
         if (session := self._sessions.get(message.session)) is not None:
             self._face_maker.change(session, message.face)
 

@@ -12,6 +12,7 @@ from kouxing.shared.network.peer import Peer
 from kouxing.shared.service.base import HEARTBEAT_S, Service
 from kouxing.shared.service.message_loop import Handler
 from kouxing.shared.wire.control import EventName, SessionStarted, StartSession
+from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, FlushSession
 
 
@@ -33,6 +34,9 @@ class SessionService(Service):
     def flush_session(self, session: str) -> None:
         """Drop audio of a session whose face is not shown yet."""
 
+    def change_face(self, message: SetFace) -> None:
+        """Change the face of a session, or the face at rest if the message has no session."""
+
     def served_sessions(self) -> Iterable[StartSession]:
         """Return the sessions that a restarted control restores from this service."""
         return ()
@@ -44,6 +48,7 @@ class SessionService(Service):
             StartSession: self._on_start_session,
             CloseSession: lambda message, _: self.stop_session(message.session),
             FlushSession: lambda message, _: self.flush_session(message.session),
+            SetFace: lambda message, _: self.change_face(message),
         }
 
     def on_control_restart(self) -> None:

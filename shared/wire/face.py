@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from kouxing_client.field_types import Name, SessionName
+from kouxing_client.field_types import Name, Probability, SessionName
 from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
@@ -18,8 +18,7 @@ from kouxing.shared.face.expressions import (
 from kouxing.shared.fast_record import replace
 from kouxing.shared.wire.message import RegisteredMessage
 
-Strength = Annotated[float, Meta(ge=0, le=1)]
-ExpressionMap = Annotated[dict[Name, Strength], Meta(max_length=32)]
+ExpressionMap = Annotated[dict[Name, float], Meta(max_length=32)]  # control checks them by name
 ShapeSets = Annotated[list[Name], Meta(max_length=16)]
 
 
@@ -31,7 +30,7 @@ class FaceSettings(Struct, frozen=True, kw_only=True):
     expressiveness: Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)] | None = (
         None  # scales the mouth's motion; 1: as the lip model moves it
     )
-    feeling: Strength | None = None  # strength of the voice's feeling on the face; 0: off
+    feeling: Probability | None = None  # strength of the voice's feeling on the face; 0: off
     still: bool | None = None  # the head and the brows do not move
     eye_contact: bool | None = None  # the eyes do not leave the viewer
     listen_to: SessionName | None = None  # session that the face listens to; "": none

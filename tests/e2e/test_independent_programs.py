@@ -418,7 +418,7 @@ def test_the_csharp_program_passes_the_token_to_the_gateway(csharp_program: Path
             ("a+secret", "stdout", "0.00"),
             ("wrong", "stderr", "cannot connect to the gateway"),
         ):
-            environment = {**os.environ, "KOUXING_TOKEN": token}
+            environment = {**os.environ, "KOUXING_GATEWAY_TOKEN": token}
             pipe: Any = {stream: subprocess.PIPE}
             with subprocess.Popen(command, env=environment, text=True, **pipe) as follower:
                 assert text in getattr(follower, stream).readline()

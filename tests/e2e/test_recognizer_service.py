@@ -185,9 +185,7 @@ def test_other_sessions_continue_while_a_model_is_loaded(
     service.receive(chunk(0, 3200, "live"))
     service.decode_all()
     assert service._sessions["live"].stream.media_time > 0
-    service._on_set_face(
-        SetFace(session="de", face=FaceSettings(acoustic=AcousticModelName.LIGHT)), Peer()
-    )
+    service.change_face(SetFace(session="de", face=FaceSettings(acoustic=AcousticModelName.LIGHT)))
     service.stop_session("closed")
     assert service.started == ["live"]
     is_released.set()

@@ -84,7 +84,7 @@ def record_events(
 
 def test_ignores_unknown_names(service: RecordingSynthesizer) -> None:
     face = FaceSettings(expressions={"glee": 1.0, "joy": 0.5}, shapes=["clay", "vrm"])
-    service._on_set_face(SetFace(session="gap", face=face), Peer())
+    service.change_face(SetFace(session="gap", face=face))
     service.receive_progress("gap", 1, 1.0)
     assert {tuple(frame.shapes) for frame in service.frames("gap")} == {("vrm",)}
 
@@ -135,7 +135,7 @@ def test_a_session_continues_if_its_new_lip_model_cannot_be_loaded(
         service.stop_session("gap")
         service.start_session(replace(START.with_face(face), session="gap", epoch=epoch))
     else:
-        service._on_set_face(SetFace(session="gap", face=face), Peer())
+        service.change_face(SetFace(session="gap", face=face))
     text = f"bad-face: ferguson cannot be loaded for {DEFAULT_LANGUAGE}"
     assert events == [("error", "gap", text)]
     for sequence in (1, 2):

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from kouxing.services.control.face_check import check_face
@@ -27,11 +28,10 @@ def test_known_names_are_accepted() -> None:
         ({"acoustic": "fast"}, "unknown acoustic model 'fast'; use full, light"),
         ({"shapes": ["vrm", "clay"]}, "unknown set of shapes 'clay'; use arkit, oculus, vrm"),
         ({"expressions": {"happy": 1.0}}, "unknown expression 'happy'; use joy, sadness, "),
+        ({"expressions": {"joy": 2}}, "expression joy: strength 2.0 is not between 0 and 1"),
     ],
 )
-def test_an_unknown_name_is_refused_with_the_known_ones(
-    settings: dict[str, Any], text: str
-) -> None:
+def test_a_refused_setting_is_named(settings: dict[str, Any], text: str) -> None:
     with pytest.raises(Rejected, match=text) as caught:
-        check_face(FaceSettings(**settings), LIP_MODELS)
+        check_face(msgspec.convert(settings, FaceSettings), LIP_MODELS)
     assert caught.value.code == "bad-face"

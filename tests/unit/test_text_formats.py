@@ -206,6 +206,20 @@ def test_reads_times_only_where_they_are_spoken(text: str, spoken_text: str) -> 
     assert "".join(syllable.text for syllable in transcript.syllables) == spoken_text
 
 
+@pytest.mark.parametrize("text", ["The price is $5 [approx 3]", "[Hello] world", "[Anna] ist da"])
+def test_words_in_brackets_are_text(text: str) -> None:
+    assert extract_text(text) == (text, "")
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["[S1]", "[uv_break]", "[laugh_0]", "[laughs harder]", "[/emphasis]", "[clears throat]"],
+)
+def test_commands_of_synthesizers_are_not_text(command: str) -> None:
+    spoken, name = extract_text(f"Hello {command} world")
+    assert (spoken, name) == ("Hello  world", "text with commands of a synthesizer")
+
+
 def test_a_sentence_may_start_like_a_format_in_lower_case() -> None:
     sentence = "webvtt is a format of subtitles"
     assert extract_text(sentence) == (sentence, "")

@@ -6,8 +6,17 @@ import re
 from kouxing.services.cli.texts.text_columns import remove_columns
 from kouxing.shared.errors import UserError
 
+# in brackets, for Bark, ChatTTS, CosyVoice, Dia and ElevenLabs; other words in brackets are text
+_COMMANDS = (
+    "laugh|laughs|laughing|laughter|chuckles|giggles|sigh|sighs|cough|gasps|sobs|crying|wheezing"
+    "|snorts|clears|starts|whispers|whispering|breath|quick_breath|inhales|exhales|hissing|clucking"
+    "|lipsmack|noise|vocalized-noise|music|accent|mn|angry|curious|excited|happy|sad|sarcastic"
+    "|pause|silence|break|uv_break|lbreak|oral|speed|emphasis|strong|spk_emb|[SEP]tts|S[1-9]"
+)
 COMMAND = re.compile(  # [laughter], [pause:500], [S1], <#0.5#>, <|zh|>, and prosody: #1 to #4
-    r"\[/?[A-Za-z_]\w*(?:[ :=]+[\w.]+)?\]|<#[\d.]+#>|<\|[^|<>]*\|>|(?<=[^\0-\x7f])#[1-4](?!\d)"
+    rf"\[/?(?:{_COMMANDS})(?:[_ :=]+[\w.]+)?\]|<#[\d.]+#>|<\|[^|<>]*\|>"
+    r"|(?<=[^\0-\x7f])#[1-4](?!\d)",
+    re.IGNORECASE,
 )
 MARKDOWN = re.compile(r"^#{1,6} |^```|\]\([^])\s]+\)", re.MULTILINE)
 TAG = re.compile(
