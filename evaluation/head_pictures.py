@@ -17,9 +17,9 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
+from kouxing.shared.files.output_file import create_folder, open_output
 
 Float32 = NDArray[np.float32]
 
@@ -58,11 +58,9 @@ def thumbnail_renderers(folder: Path) -> dict[Path, Callable[[], Image.Image]]:
 
 def save(path: Path, image: Image.Image) -> None:
     """Write a picture. Raises ``UserError`` if it cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        image.save(path, quality=85)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    create_folder(path.parent)
+    with open_output(path) as file:
+        image.save(file, "WEBP", quality=85)
 
 
 def _draw_heads() -> Image.Image:

@@ -24,8 +24,8 @@ from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video import film
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import Frame
-from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.files.output_file import create_folder
 
 VIDEO_PX = (640, 640)
 _IMAGES_PER_S = 25.0
@@ -69,10 +69,7 @@ def write_video(
     path: Path, frames: list[Frame], samples: NDArray[np.float32], renderer: Renderer
 ) -> None:
     """Write a video for a listening test, with its folder; UserError if that fails."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot create {path.parent}: {error.strerror}") from error
+    create_folder(path.parent)
     film.render_video(frames, path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples)
 
 

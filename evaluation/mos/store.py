@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.output_file import write_error
 from kouxing.shared.files.user_file import check_content, parse_json, read_text
 
 FILE_NAME = "answers.jsonl"
@@ -44,7 +45,7 @@ class AnswerStore:
             path.chmod(0o600)  # in case it existed
             self._file = path.open("a", encoding="utf-8")
         except OSError as error:
-            raise UserError(f"cannot write {path}: {error.strerror}") from None
+            raise write_error(path, error) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

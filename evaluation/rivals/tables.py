@@ -31,6 +31,7 @@ from kouxing.evaluation.lips.references import read_parts
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.output_file import create_folder
 
 Array = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ def write_tables(folder: Path, output: Path, programs: Sequence[str]) -> None:
     clips = [*held_out, *training]
     for program in track(programs, description="programs", transient=True):
         tables = output / program
-        tables.mkdir(parents=True, exist_ok=True)
+        create_folder(tables)
         missing = [clip for clip in clips if not (tables / f"{clip.name}.csv").exists()]
         if program == LOUDNESS:
             for clip in missing:

@@ -33,6 +33,7 @@ from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.client_connection import connect_client
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.output_file import create_folder
 from kouxing.shared.settings.keys import CLIENT
 
 NUM_SESSIONS = 16
@@ -201,7 +202,7 @@ def measure(
             console.print(f"fault: {name}, at {at_s:g} s")
             with tempfile.TemporaryDirectory() as temporary:
                 folder = Path(temporary) if logs is None else logs / f"{name}-{at_s:g}-s"
-                folder.mkdir(parents=True, exist_ok=True)
+                create_folder(folder)
                 times = replace(timing, fault_at_s=at_s)
                 try:
                     outcome = _measure_fault(name, folder, sentence, undisturbed, times, console)

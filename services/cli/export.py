@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from kouxing.shared.command.terminal import Force, check_output, print_message
-from kouxing.shared.files.output_file import open_output, write_error
+from kouxing.shared.files.output_file import create_folder, open_output
 
 app = typer.Typer(no_args_is_help=True, help="Export the models for other programs.")
 
@@ -24,10 +24,7 @@ def export_web(
     """Write the models for lip sync in a browser, without a server."""
     from kouxing.services.cli.web_model import web_model
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(folder, error) from error
+    create_folder(folder)
     contents = web_model()
     check_output(*(folder / name for name in contents), force=force)
     for name, content in contents.items():

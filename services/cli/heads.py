@@ -15,6 +15,7 @@ from kouxing.services.cli.options import HeadName
 from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES, page_file, page_heads_folder
 from kouxing.shared.command.terminal import Force, check_output, print_message
 from kouxing.shared.errors import UserError
+from kouxing.shared.files.output_file import create_folder
 
 _DRIVER_HEADS = Path(str(resources.files("kouxing.services.driver"))) / "head"
 _PAGE = Path(str(resources.files("kouxing.services.gateway"))) / "page"
@@ -77,10 +78,7 @@ def export_page_heads(folder: Path) -> None:
     from kouxing.services.driver.head.glb_export import export_glb
     from kouxing.services.driver.render.scene import load_head
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}") from None
+    create_folder(folder)
     for name in HEAD_NAMES:
         export_glb(load_head(name), folder / page_file(name))
 

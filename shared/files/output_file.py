@@ -104,6 +104,14 @@ def _replace(path: Path, part: Path) -> None:
         shutil.copyfile(part, path)
 
 
+def create_folder(path: Path) -> None:
+    """Create a folder and its parents, unless it exists; raise ``UserError`` if that fails."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from None
+
+
 def write_private(path: Path, content: bytes) -> None:
     """Write a file that only this user can read. Other processes see it only when it is complete.
 
