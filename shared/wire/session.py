@@ -106,7 +106,7 @@ class AudioChunk(RegisteredMessage, frozen=True, kw_only=True):
 
 
 class CloseSession(RegisteredMessage, frozen=True, kw_only=True):
-    """The session is over; the services delete its state.
+    """The session has ended; the services delete its state.
 
     Sent by a client to control, and by control to the services.
     """

@@ -173,7 +173,7 @@ class RealTimeQueue:
             try:
                 self._session.send(chunk, len(chunk) // self._format.frame_bytes)
                 self._skip_due()
-            except KouxingError:  # the session is over; its errors are reported elsewhere
+            except KouxingError:  # the session has ended; its errors are reported elsewhere
                 self.clear()
             due_s += len(chunk) / self._format.frame_bytes / self._format.sample_rate_hz
             await asyncio.sleep(due_s - loop.time())

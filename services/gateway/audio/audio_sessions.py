@@ -40,7 +40,7 @@ class AudioSession:
     def send(self, pcm: bytes, num_samples: int) -> None:
         """Send ``num_samples`` samples per channel; drop them if the recognizer is too slow.
 
-        Raises ``KouxingError`` if the session is over.
+        Raises ``KouxingError`` if the session has ended.
         """
         if not self.is_closed and not self._session.try_push(pcm):
             self.skip(num_samples)
@@ -62,7 +62,7 @@ class AudioSession:
     def take_errors(self) -> list[Refused]:
         """Return the recognizer's errors since the last call.
 
-        Raises ``KouxingError`` if the session is over.
+        Raises ``KouxingError`` if the session has ended.
         """
         return [] if self.is_closed else self._session.take_errors()
 

@@ -158,7 +158,7 @@ class WhipHandler:
                     session.send(pcm, num_samples)
                     for error in session.take_errors():
                         self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
-            except KouxingError as error:  # the session is over
+            except KouxingError as error:  # the session has ended
                 self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
             client.is_ending = True
 
