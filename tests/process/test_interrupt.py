@@ -133,7 +133,6 @@ COMMANDS = (
 
 
 PREAMBLES = {
-    "FFmpeg": INTERRUPT_IN_FFMPEG,
     "import": "",
     "shutdown": HANG_IN_SHUTDOWN + INTERRUPT_IN_FFMPEG,
     "options": INTERRUPT_IN_OPTIONS,

@@ -32,7 +32,7 @@ main.main()
 """
 
 
-@pytest.mark.parametrize("num_available", [1, 4])
+@pytest.mark.parametrize("num_available", [1, 2])
 def test_results_have_the_order_of_the_items(
     monkeypatch: pytest.MonkeyPatch, num_available: int
 ) -> None:

@@ -29,7 +29,7 @@ from kouxing.shared.wire.events import event_to_message
 from tests.live_streams import LiveStream, recognize_live, recognize_together
 from tests.system import HELLO, VOWELS_FILE, samples_of_file
 
-SAMPLES = samples_of_file(VOWELS_FILE)[:30_000]
+SAMPLES = samples_of_file(VOWELS_FILE)[:22_400]
 RATE_HZ = 16_000
 FACE: dict[str, Any] = {"lip_predictor": load_lip_predictor(), "face_delay_s": 0.1}
 E = TypeVar("E")
@@ -170,7 +170,7 @@ def test_lip_positions_are_known_5_ms_before_the_face_frame(rate_hz: int, before
             is_speaking = event.active
         elif isinstance(event, Progress) and is_speaking:
             lags_s.append(event.time_s - newest_s)
-    assert len(lags_s) > 50
+    assert len(lags_s) > 30
     np.testing.assert_allclose(lags_s, 0.005, atol=1e-9)
 
 
