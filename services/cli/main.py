@@ -25,7 +25,7 @@ from kouxing.services.cli.options import Assignments, ConfigFile, Panel
 from kouxing.services.cli.recordings import commands as recordings
 from kouxing.services.cli.system import commands as system
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.command.terminal import CONSOLE
+from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.files.output_file import write_error
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
@@ -207,7 +207,7 @@ def _run_command() -> None:
     except _UsageError as error:
         text = _usage_text(error)
     except typer.Abort:
-        CONSOLE.print("kouxing: aborted; nothing was written")
+        print_message("kouxing: aborted; nothing was written")
         sys.exit(1)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
@@ -217,7 +217,7 @@ def _run_command() -> None:
     else:
         sys.exit(status or 0)
     if text:
-        CONSOLE.print(f"kouxing: {text}", style="red", markup=False, soft_wrap=True)
+        print_message(f"kouxing: {text}", "red")
     sys.exit(USER_ERROR)
 
 

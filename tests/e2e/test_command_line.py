@@ -292,6 +292,12 @@ def test_standard_input_may_be_closed() -> None:
     assert (done.returncode, b"no audio arrived" in done.stderr) == (2, True)
 
 
+def test_an_error_keeps_its_status_if_its_log_is_full() -> None:
+    with open("/dev/full", "w") as full:  # noqa: PTH123 (a device)
+        command = [sys.executable, "-m", "kouxing", "phones", "missing.wav"]
+        assert subprocess.run(command, cwd=ROOT, stderr=full, check=False).returncode == 2
+
+
 def test_an_empty_argument_is_refused() -> None:
     refused = kouxing("render", VOWELS_FILE, "")
     assert (refused.returncode, "an argument is empty" in refused.stderr) == (2, True)

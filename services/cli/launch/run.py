@@ -123,7 +123,8 @@ def run(
         if warning := _port_warning(settings, free_ports, control_address):
             print_message(warning)
         try:
-            with CONSOLE.status(f"starting {', '.join(KINDS)}"):
+            status = CONSOLE.status(f"starting {', '.join(KINDS)}")
+            with status if CONSOLE.is_terminal else contextlib.nullcontext():  # not in a full log
                 ensure_page_heads()
                 supervisor.start()
                 supervisor.wait_ready(control)
