@@ -39,7 +39,7 @@ export class KouxingFace extends HTMLElement {
   /** Turn the session's sound on. Call it from a click handler. */
   turnSoundOn(): Promise<void>;
   turnSoundOff(): void;
-  /** Show values of the model's set: 68 FAPs, or weights with their names. */
+  /** Show values of the model's set: 68 FAPs, or weights with their names. Throws a RangeError for others, and for NaN. */
   show(values: Float32Array, names?: readonly string[]): void;
   /**
    * Play the recording, with the sound of an audio element. Resolves when it ends. Rejects with an AbortError if the

@@ -16,6 +16,7 @@ const LOST_WEBGL = "the browser no longer draws this face; show fewer faces, at 
 const NO_WEBGL = "this browser has no WebGL; turn on hardware acceleration";
 const FOV_DEGREES = 20;
 const RATE_HZ = 16000;
+const NUM_FAPS = 68;
 const MAX_STEP_S = 0.1; // longest time step of the hair physics
 
 /** The custom element; README.md lists its attributes. */
@@ -35,6 +36,7 @@ export class KouxingFace extends HTMLElement {
   #player = new Player(this.#sound);
   #values = null; // shown values of the avatar's set
   #names = [];
+  #playId = 0; // number of the newest call of play()
   #recording = null; // { frames, names, nowS, onEnded }
   #lips = null; // a promise of the local lip sync
   #lipsId = 0; // number of the newest local lip sync
@@ -124,6 +126,14 @@ export class KouxingFace extends HTMLElement {
   /** Show values: 68 FAPs, or weights with their names. Nothing happens before the model is loaded. */
   show(values, names = []) {
     if (this.#avatar === null) return;
+    const isFaps = this.set === "faps";
+    if (values.length !== (isFaps ? NUM_FAPS : names.length) || !values.every(Number.isFinite)) {
+      throw new RangeError(`show() needs ${isFaps ? `${NUM_FAPS} FAPs` : "weights with their names"}; all must be finite numbers`);
+    }
+    this.#show(values, names);
+  }
+
+  #show(values, names) {
     this.#values = values;
     this.#names = names;
     this.#avatar.pose(values, names);
@@ -141,13 +151,18 @@ export class KouxingFace extends HTMLElement {
     if (!url) throw new Error("<kouxing-face> needs the attribute recording; add it");
     const avatar = this.#avatar;
     if (avatar === null) throw new Error("the model is not loaded yet; wait for the event load");
+    const playId = ++this.#playId;
     const reading = fetchFile(url).then(readRecording);
     const { names, frames } = await reading.catch(({ message }) => {
       throw new Error(`${url}: ${message}`);
     });
     this.#checkAvatar(avatar);
+    if (playId !== this.#playId) return;
     const set = names === null ? "faps" : chooseSet(names);
     if (set !== this.set) throw new Error(`the recording moves ${set}, and the model needs ${this.set}; record it again`);
+    if (set === "faps" && frames.some(([, values]) => values.length !== NUM_FAPS)) {
+      throw new Error(`${url}: a frame needs ${NUM_FAPS} FAPs; record it again`);
+    }
     await audio?.play();
     if (this.#avatar !== avatar) audio?.pause();
     this.#checkAvatar(avatar);
@@ -303,7 +318,7 @@ export class KouxingFace extends HTMLElement {
     if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize();
     if (this.#recording) this.#poseRecording();
     else if (this.hasAttribute("local")) this.#poseLocalFace(nowMs);
-    else if (this.#viewer !== null && this.#values !== null) this.show(this.#player.faps, this.#names);
+    else if (this.#viewer !== null && this.#values !== null) this.#show(this.#player.faps, this.#names);
     this.#avatar.update(Math.min(MAX_STEP_S, (nowMs - this.#drawnMs) / 1000));
     this.#drawnMs = nowMs;
     this.#images.draw(nowMs, () => this.#renderer.render(this.#scene, this.#camera));
@@ -316,7 +331,7 @@ export class KouxingFace extends HTMLElement {
     const names = this.#localFaces.names[set] ?? [];
     const values = face[set].slice();
     this.#blinks.apply(values, names, nowMs / 1000);
-    this.show(values, names);
+    this.#show(values, names);
   }
 
   #poseRecording() {
@@ -324,7 +339,7 @@ export class KouxingFace extends HTMLElement {
     const mediaTime = (nowS() + this.#drawRate.visibleDelayMs / 1000) * RATE_HZ;
     const next = frames.findIndex(([time]) => time > mediaTime);
     if (next === -1) {
-      this.show(frames.at(-1)[1], names ?? []);
+      this.#show(frames.at(-1)[1], names ?? []);
       this.#recording = null;
       onEnded();
       return;
@@ -333,7 +348,7 @@ export class KouxingFace extends HTMLElement {
     for (const [time, values] of frames.slice(Math.max(0, next - 1), next + 1)) track.push(time, values);
     const values = new Float32Array(frames[0][1].length);
     track.sample(mediaTime, values);
-    this.show(values, names ?? []);
+    this.#show(values, names ?? []);
   }
 
   #resize() {

@@ -51,13 +51,14 @@ export class HeadAudio extends GainNode {
   }
 
   /** Follow the sound. */
-  start() {
-    return this.#lips.listenTo(this);
+  async start() {
+    if (this.#lips === null) throw new Error("the models are not loaded; call loadModel() first, which also starts");
+    await this.#lips.listenTo(this);
   }
 
   /** Stop following the sound. */
   stop() {
-    this.#lips.stop();
+    this.#lips?.stop();
   }
 }
 

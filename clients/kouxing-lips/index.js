@@ -147,6 +147,7 @@ export class LipSync extends EventTarget {
   /** The audio context of this lip sync. */
   get context() {
     if (this.#context === null) {
+      this.#checkOpen();
       this.#context = new AudioContext({ latencyHint: "interactive" });
       this.#context.addEventListener("statechange", this.#onContextState);
     }
@@ -188,6 +189,7 @@ export class LipSync extends EventTarget {
 
   /** Stop, and release all resources. */
   close() {
+    if (this.#isClosed) return;
     this.#isClosed = true;
     this.stop();
     this.#supersede();

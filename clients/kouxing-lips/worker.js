@@ -33,7 +33,13 @@ const HANDLERS = {
     if (port === null) return;
     const current = engine;
     port.onmessage = ({ data: { samples, endS } }) => {
-      if (engine === current) send(session, current.push(samples), endS - current.inputS);
+      if (engine !== current) return;
+      try {
+        send(session, current.push(samples), endS - current.inputS);
+      } catch (error) {
+        input.close(); // one report is enough
+        self.postMessage({ type: "error", request: "sound", session, text: error.message });
+      }
     };
   },
 

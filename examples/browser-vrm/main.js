@@ -67,7 +67,13 @@ function missingNames(names) {
 
 /** Follow the session; reconnect while the page is open. */
 function connect() {
-  const url = new URL("/viewer", query.get("gateway") ?? "ws://127.0.0.1:8080");
+  const gateway = query.get("gateway") ?? "ws://127.0.0.1:8080";
+  if (!/^(ws|http)s?:/i.test(gateway)) {
+    note.textContent = `${gateway} is not the address of a gateway, such as ws://127.0.0.1:8080`;
+    return;
+  }
+  const url = new URL("/viewer", gateway);
+  url.protocol = url.protocol.replace("http", "ws");
   url.searchParams.set("session", query.get("session") ?? "");
   url.searchParams.set("token", query.get("token") ?? "");
   // Avatars with "Perfect Sync" have ARKit's 52 shapes, others have only VRM's shapes.

@@ -293,6 +293,27 @@ def test_the_web_component_plays_no_recording_after_it_was_removed(
     faces.wait_for("arkit.set === 'arkit'")
 
 
+def test_the_web_component_rejects_values_that_it_cannot_show(faces: Browser) -> None:
+    for call in ("own.show([1])", "own.show(Array(68).fill(NaN))", "vrm.show([1, 1], ['aa'])"):
+        error = faces.evaluate(f"(() => {{ try {{ {call} }} catch (e) {{ return `${{e}}`; }} }})()")
+        assert error.startswith("RangeError: show() needs ")
+
+
+def test_the_web_component_plays_the_recording_that_was_chosen_last(
+    faces: Browser, project: Path
+) -> None:
+    for name, shape in (("slow.jsonl", "jawOpen"), ("fast.jsonl", "mouthClose")):
+        write_recording(project / name, "arkit", shape)
+    faces.evaluate(
+        "const load = fetch; window.fetch = (url) => url.endsWith('slow.jsonl')"
+        " ? new Promise((done) => (window.goOn = () => done(load(url)))) : load(url);"
+        "arkit.setAttribute('recording', 'slow.jsonl'); window.first = arkit.play();"
+        "arkit.setAttribute('recording', 'fast.jsonl');"
+        "arkit.play().then(() => { goOn(); window.fetch = load; return window.first; })"
+    )
+    assert faces.evaluate("arkit.shown.mouthClose") == 1
+
+
 def test_a_web_component_outside_the_page_starts_no_lip_sync(faces: Browser) -> None:
     make = "const face = document.createElement('kouxing-face'); face.setAttribute('local', '')"
     error = faces.evaluate(

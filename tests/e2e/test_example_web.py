@@ -83,6 +83,9 @@ def test_the_avatar_shows_the_face_of_a_session(
                 return bool((moved[70:150, 90:150] > 60).sum() > 40)
 
             wait_until(is_open)
+        browser.command("Page.navigate", url=f"{site}/index.html?gateway=127.0.0.1:8080")
+        note = "document.getElementById('note')?.textContent"
+        browser.wait_for(f"{note}?.startsWith('127.0.0.1:8080 is not the address of a gateway')")
         assert [text for text in browser.page_errors if "exceptionDetails" in text] == []
     finally:
         browser.close()

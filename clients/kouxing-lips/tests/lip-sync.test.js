@@ -199,12 +199,33 @@ test("an error of open() rejects it", async () => {
   await assert.rejects(result, /wrong rate/);
 });
 
-test("the worker names the request that failed", async () => {
+let numWorkers = 0;
+
+/** Import the worker; return a function that sends it a message, and the messages that it posts. */
+async function startWorker() {
   const messages = [];
   globalThis.self = { postMessage: (message) => messages.push(message) };
-  await import("../worker.js");
-  await globalThis.self.onmessage({ data: { type: "finish", session: 7 } });
-  delete globalThis.self;
+  await import(`../worker.js?${++numWorkers}`);
+  const worker = globalThis.self;
+  return { messages, send: (data) => worker.onmessage({ data }) };
+}
+
+test("the worker reports broken sound once, and still finishes", async (t) => {
+  const { send, messages } = await startWorker();
+  await send({ type: "load", models: new URL("../models/", import.meta.url).href, phones: false });
+  const input = { close: t.mock.fn() };
+  await send({ type: "open", session: 3, options: {}, input });
+  input.onmessage({ data: { samples: new Float32Array(320).fill(NaN), endS: 0 } });
+  assert.equal(input.close.mock.callCount(), 1);
+  const text = "some samples are not finite; they must be in [-1, 1]";
+  assert.deepEqual(messages.at(-1), { type: "error", request: "sound", session: 3, text });
+  await send({ type: "finish", session: 3 });
+  assert.equal(messages.at(-1).type, "finished");
+});
+
+test("the worker names the request that failed", async () => {
+  const { send, messages } = await startWorker();
+  await send({ type: "finish", session: 7 });
   const [{ type, request, session }] = messages;
   assert.deepEqual([type, request, session], ["error", "finish", 7]);
 });
@@ -433,6 +454,21 @@ async function waitForGesture(lips, t) {
   await resuming;
 }
 
+test("a lip sync can be closed twice, and opens no audio context afterwards", async () => {
+  globalThis.AudioContext = class extends FakeContext {
+    async close() {
+      if (this.state === "closed") await closedContext(); // an unhandled rejection fails the test
+      this.state = "closed";
+    }
+  };
+  const [used, unused] = [await LipSync.create(), await LipSync.create()];
+  assert.equal(used.context.state, "running");
+  for (const lips of [used, unused, used]) lips.close();
+  assert.equal(used.context.state, "closed");
+  assert.throws(() => unused.context, /this lip sync is closed/);
+  await new Promise(setImmediate);
+});
+
 test("a click after close() does not resume the sound", async (t) => {
   const lips = await LipSync.create({ context });
   await waitForGesture(lips, t);
@@ -466,13 +502,15 @@ test("the notice about a tab in the background disappears when the tab is visibl
   assert.deepEqual(notices.slice(1), [""]);
 });
 
-test("HeadAudio loads its models once if loadModel() is called twice", async () => {
+test("HeadAudio starts after its models are loaded, once if loadModel() is called twice", async () => {
   globalThis.GainNode = class extends AudioNode {
     context = context;
     connect() {}
   };
   const { HeadAudio } = await import("../headaudio.js");
   const head = new HeadAudio(context);
+  head.stop();
+  await assert.rejects(head.start(), /the models are not loaded; call loadModel\(\) first/);
   const loading = [head.loadModel(), head.loadModel()];
   await open();
   await Promise.all(loading);
