@@ -91,6 +91,18 @@ function makeMicrophone() {
   return { microphone, states };
 }
 
+test("without the gateway, the error says so, and no audio context stays open", async (t) => {
+  const close = t.mock.fn();
+  globalThis.AudioContext = class {
+    audioWorklet = { addModule: () => Promise.reject(new DOMException("network error", "AbortError")) };
+    close = close;
+  };
+  const { microphone, states } = makeMicrophone();
+  await microphone.start();
+  assert.deepEqual(states.slice(-2), ["The gateway does not answer. Start it with “kouxing run” and try again.", "off"]);
+  assert.equal(close.mock.callCount(), 1);
+});
+
 test("the end of a file stops it after its last frames", async (t) => {
   const { microphone, states } = makeMicrophone();
   await microphone.startFile(FILE);

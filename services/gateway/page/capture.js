@@ -10,10 +10,19 @@ const BUTTERWORTH_Q_DB = [-5.33, 2.32]; // of 4th order
 const MAX_FILE_BYTES = 200 << 20;
 const QUIET_PEAK = 1e-3; // a file whose peak is lower (-60 dBFS) is called silent
 
-/** Return an audio context at the device's rate. Firefox captures no microphone at another rate. */
+/**
+ * Return an audio context at the device's rate. Firefox captures no microphone at another rate.
+ *
+ * @throws {UserError} if the gateway, which has the worklet, does not answer
+ */
 export async function openCaptureContext() {
   const context = new AudioContext({ latencyHint: "interactive" });
-  await context.audioWorklet.addModule("microphone-worklet.js");
+  try {
+    await context.audioWorklet.addModule("microphone-worklet.js");
+  } catch {
+    context.close();
+    throw new UserError(translate("gatewaySilent"));
+  }
   return context;
 }
 
