@@ -112,9 +112,10 @@ def test_containers_are_healthy_private_and_speak(
 ) -> None:
     end_s = time.monotonic() + 800
     address = f"tcp://{network.address('control')}:5550"
+    endpoint = control_endpoint(address, insecure=False)
     with (
         network.on("client-1"),
-        Client(control_endpoint(address, insecure=False), start_s=LIMIT_S) as client,
+        Client(endpoint, timeout_s=LIMIT_S, start_s=LIMIT_S) as client,
     ):
         while len(services := client.status().services) < len(HOSTS) - 1:
             assert time.monotonic() < end_s, services
