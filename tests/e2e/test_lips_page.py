@@ -62,10 +62,12 @@ def demo(browser: Browser, site: Path) -> Iterator[Browser]:
 
 
 def test_calls_without_sound_and_replaced_sources_are_reported(demo: Browser) -> None:
-    text = "no sound is open; call open() or listenTo() first"
-    demo.evaluate("window.lips.push(new Float32Array(320)); 1")
-    demo.wait_for(f"window.notices.includes('{text}')")
-    assert demo.evaluate("window.lips.finish().catch(({ message }) => message)") == text
+    demo.evaluate("window.lips.express({ joy: 1 }); 1")
+    demo.wait_for("window.notices.includes('no sound is open; call open() or listenTo() first')")
+    push = "window.lips.push(new Float32Array(320))"
+    for call in (f"(async () => {push})()", "window.lips.finish()"):
+        text = demo.evaluate(f"{call}.catch(({{ message }}) => message)")
+        assert text == "no sound is open for push(); call open(), and wait until it has opened"
     result = demo.evaluate(
         "Promise.allSettled([window.lips.open(16000), window.lips.open(48000)])"
         ".then((all) => all.map(({ status, reason }) => reason?.name ?? status))"
