@@ -4,8 +4,8 @@ Telemetry is disabled: onnxruntime would store usage data and send it to its mak
 thread can also keep a process from ending (onnxruntime-genai, pull request 2363).
 
 Integer products are exact on every processor. By default, their partial sums overflow on x86
-processors without VNNI instructions (onnxruntime, issue 14642), and a third of the phones in
-conversation are wrong, instead of a fifth.
+processors without VNNI instructions (onnxruntime, issue 14642). In conversation, a third of the
+phones would then be wrong, instead of a fifth.
 """
 
 import os
