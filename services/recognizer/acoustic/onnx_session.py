@@ -51,4 +51,4 @@ def _products_overflow() -> bool:
     )
     a, b = np.full((1, 2), 255, np.uint8), np.full((2, 1), 127, np.int8)
     (product,) = session.run(None, {"a": a, "b": b})
-    return product.item() != 2 * 255 * 127
+    return bool(product.item() != 2 * 255 * 127)
