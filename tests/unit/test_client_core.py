@@ -242,6 +242,7 @@ def test_a_message_that_the_recognizer_cannot_read_ends_the_session() -> None:
     assert "bad-message" in str(inbox.failure)
     harness.pass_time(ANSWER_LIMITS_S[1])
     assert sequences(harness.audio()) == [1]
+    assert harness.commands.sent[-1][0] == "close-session"
 
 
 @pytest.mark.parametrize("cause", ["moved", "replaced", "ended"])

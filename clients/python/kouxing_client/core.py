@@ -238,6 +238,9 @@ class ClientCore:
 
     def _remove(self, session: SessionCore) -> None:
         self.sessions.remove(session)
+        if session.stream is not None and isinstance(session.failure, Refused):
+            # the recognizer has rejected the audio, but control still has the session
+            self.request("close-session", session.name, token=session.token)
         self._watch(session.name, on=False)
 
     def _watch(self, session: str, *, on: bool) -> None:
