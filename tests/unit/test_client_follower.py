@@ -168,3 +168,24 @@ def test_drops_old_live_frames_after_the_process_was_suspended() -> None:
     harness.publish(frames[-1])
     assert harness.received == [frames[0], *frames[-1 - MAX_HELD_FRAMES :]]
     assert harness.follower.num_missed == 28 - MAX_HELD_FRAMES
+
+
+def test_delivers_the_last_frames_after_a_suspension() -> None:
+    harness = FollowerHarness().complete()
+    harness.sockets.resumed_at_s = harness.sockets.now_s
+    harness.publish(frame(1))
+    assert harness.follower.tick() == harness.sockets.now_s + CATCH_UP_S
+    assert harness.received == []
+    harness.sockets.now_s += CATCH_UP_S
+    harness.follower.tick()
+    assert harness.received == [frame(1)]
+
+
+def test_delivers_no_frame_after_it_is_closed() -> None:
+    harness = FollowerHarness().complete()
+    harness.sockets.resumed_at_s = harness.sockets.now_s
+    harness.publish(frame(1))
+    harness.follower.close()
+    harness.sockets.now_s += CATCH_UP_S
+    harness.follower.tick()
+    assert harness.received == []

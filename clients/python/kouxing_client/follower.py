@@ -148,18 +148,21 @@ class Follower:
         self._subscribe()
 
     def tick(self) -> float:
-        """Resubscribe or close the old connection, if due; return the time of the next call.
+        """Resubscribe, close the old connection, or deliver held frames, if due.
 
-        Also call this after every message.
+        Returns the time of the next call. Also call this after every message.
         """
         now_s = self._transport.now_s
+        if self._held_frames and now_s >= self._caught_up_at_s:
+            self._deliver_held()
         if now_s >= self._close_old_due_s:
             self._close_old_connection()
         if self._connection is not None and now_s >= self._retry_s:
             self._stop_waiting()
             self._transport.close_connection(self._connection)
             self._subscribe()
-        return min(self._close_old_due_s, self._retry_s)
+        held_until_s = self._caught_up_at_s if self._held_frames else math.inf
+        return min(self._close_old_due_s, self._retry_s, held_until_s)
 
     def drain(self) -> None:
         """Pass on all messages that have arrived."""
@@ -184,6 +187,7 @@ class Follower:
             if connection is not None:
                 self._transport.close_connection(connection)
         self._connection = self._old_connection = None
+        self._held_frames.clear()
         self.is_complete = False
         self._retry_s = self._close_old_due_s = math.inf
 
@@ -235,8 +239,13 @@ class Follower:
             if self._connection is not None:  # no handler has closed it
                 self._receive(message)
 
+    @property
+    def _caught_up_at_s(self) -> float:
+        """When the messages that were queued during the last suspension have arrived."""
+        return self._transport.resumed_at_s + CATCH_UP_S
+
     def _receive(self, message: Message) -> None:
-        is_catching_up = self._transport.now_s < self._transport.resumed_at_s + CATCH_UP_S
+        is_catching_up = self._transport.now_s < self._caught_up_at_s
         if self._is_paced and isinstance(message, FapFrame) and is_catching_up:
             self._held_frames.append(message)
         else:
