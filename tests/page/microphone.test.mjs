@@ -238,9 +238,12 @@ function makeControls() {
   };
   const ignore = () => {};
   const handlers = { mouthProfile: () => "", language: () => "", lipModel: () => null, level: ignore };
-  const controls = new SpeechControls(sound, { ...handlers, error: ignore, session: ignore });
-  return { microphone: controls.microphone, buttons, sound };
+  const others = { error: ignore, session: ignore, fileStarted: ignore };
+  const controls = new SpeechControls(sound, { ...handlers, ...others });
+  return { controls, microphone: controls.microphone, buttons, sound };
 }
+
+const drop = (...files) => document.ondrop({ preventDefault() {}, dataTransfer: { files } });
 
 test("sound that the user turns off stays off when the microphone or a file ends", async () => {
   const { microphone, buttons, sound } = makeControls();
@@ -267,4 +270,14 @@ test("sound is turned on again after the microphone", async () => {
   FakeWebSocket.newest.openSession("voice");
   microphone.stop();
   assert.equal(sound.state, "on");
+});
+
+test("a file that is dropped while the user's mouth is being learned is not played", () => {
+  const { controls, microphone } = makeControls();
+  controls.pause();
+  drop(FILE);
+  assert.ok(!microphone.isActive);
+  controls.resume();
+  drop(FILE);
+  assert.ok(microphone.isFile);
 });

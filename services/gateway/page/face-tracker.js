@@ -17,8 +17,11 @@ export class FaceTracker {
     this.#frame.tabIndex = -1;
     document.body.append(this.#frame);
     const timer = setTimeout(() => this.#fail("timeout"), LOADING_TIMEOUT_MS);
-    ({ lips: this.lips } = await this.#nextAnswer());
-    clearTimeout(timer);
+    try {
+      ({ lips: this.lips } = await this.#nextAnswer());
+    } finally {
+      clearTimeout(timer);
+    }
   }
 
   /** Return the landmarks of the face in an image (x, y, z in pixels), or null without a face. */

@@ -123,14 +123,20 @@ export class LearnMouthDialog {
       for (const track of stream?.getTracks() ?? []) track.stop();
       if (context?.state !== "closed") context?.close();
     };
+    signal.addEventListener("abort", () => {
+      stop();
+      tracker.close();
+    });
     try {
       stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
         video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 } },
       });
+      signal.throwIfAborted(); // the browser may ask for permission after the dialog was closed
       const video = element("learn-video");
       video.srcObject = stream;
-      [context] = await Promise.all([openCaptureContext(), tracker.load(), video.play()]);
+      context = await openCaptureContext();
+      await Promise.all([tracker.load(), video.play()]);
       signal.throwIfAborted();
       const recording = new FaceRecording(captureRateHz(context));
       const images = await this.#read(recording, { video, tracker, context, stream, signal });

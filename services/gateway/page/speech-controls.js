@@ -11,6 +11,7 @@ export class SpeechControls {
   session = null;
   #sound;
   #handlers;
+  #isPaused = false; // by Learn my mouth
   #wasSoundWanted = false; // whether sound was on before the microphone or Learn my mouth muted it
 
   /**
@@ -57,14 +58,20 @@ export class SpeechControls {
     this.microphone.start();
   }
 
-  /** Stop the microphone and mute the sound, for Learn my mouth. */
+  /** Stop the microphone, mute the sound and ignore dropped files, for Learn my mouth. */
   pause() {
+    this.#isPaused = true;
     this.microphone.stop();
     this.#mute();
   }
 
-  /** Undo the muting of pause(). */
+  /** Undo pause(). The microphone stays off. */
   resume() {
+    this.#isPaused = false;
+    this.#unmute();
+  }
+
+  #unmute() {
     if (this.#wasSoundWanted) this.turnSoundOn();
   }
 
@@ -93,6 +100,7 @@ export class SpeechControls {
   }
 
   #speakFile(file) {
+    if (this.#isPaused) return;
     this.unblockSound();
     this.#handlers.fileStarted();
     this.microphone.startFile(file);
@@ -121,7 +129,7 @@ export class SpeechControls {
     if (state === "off" && this.session !== null) {
       this.session = null;
       this.#handlers.session(null);
-      this.resume();
+      this.#unmute();
     }
   }
 

@@ -1,0 +1,71 @@
+// The dialog "Learn my mouth" releases the camera. Browser parts are fakes.
+
+import assert from "node:assert/strict";
+import test from "node:test";
+
+const elements = {};
+const makeElement = () => ({
+  classList: { remove() {} },
+  dataset: {},
+  querySelectorAll: () => [],
+  close() {
+    this.open = false;
+    this.onclose();
+  },
+  showModal() {
+    this.open = true;
+  },
+  play: async () => {},
+});
+globalThis.document = {
+  documentElement: { lang: "en" },
+  body: { append() {} },
+  createElement: () => ({ remove() {} }),
+  getElementById: (id) => (elements[id] ??= makeElement()),
+};
+const { LearnMouthDialog } = await import("../../services/gateway/page/learn-mouth.js");
+
+/** Open the dialog and start a recording; return the dialog element and allow(), which grants the camera. */
+function startRecording() {
+  let allow;
+  const permission = new Promise((resolve) => (allow = resolve));
+  Object.defineProperty(globalThis, "navigator", {
+    value: { mediaDevices: { getUserMedia: () => permission } },
+    configurable: true,
+  });
+  globalThis.AudioContext = class {
+    audioWorklet = { addModule: async () => {} };
+    async close() {}
+  };
+  globalThis.addEventListener = globalThis.removeEventListener = () => {};
+  const dialog = new LearnMouthDialog({ current: null }, { opened() {}, closed() {}, profileChanged() {} });
+  dialog.open();
+  elements["learn-start"].onclick();
+  return { dialog: elements["learn-mouth"], allow };
+}
+
+function makeCamera() {
+  const camera = { isOn: true, stop: () => (camera.isOn = false) };
+  return { camera, stream: { getTracks: () => [camera] } };
+}
+
+const settle = () => new Promise((resolve) => setImmediate(resolve));
+
+test("a dialog that is closed before the camera is allowed leaves the camera off", async () => {
+  const { dialog, allow } = startRecording();
+  const { camera, stream } = makeCamera();
+  dialog.close();
+  allow(stream);
+  await settle();
+  assert.ok(!camera.isOn);
+});
+
+test("a dialog that is closed while the tracker loads turns the camera off at once", async () => {
+  const { dialog, allow } = startRecording();
+  const { camera, stream } = makeCamera();
+  allow(stream);
+  await settle();
+  assert.ok(camera.isOn);
+  dialog.close();
+  assert.ok(!camera.isOn);
+});
