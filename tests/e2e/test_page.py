@@ -149,6 +149,29 @@ def test_every_control_can_be_clicked(page: Browser, width: int, is_phone: bool)
 
 
 @pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.parametrize("size", [(375, 667), (667, 375)])
+def test_panels_on_a_phone_have_buttons_without_scrolling(
+    page: Browser, size: tuple[int, int]
+) -> None:
+    page.resize(*size, mobile=True)
+    page.click("open-settings")
+    page.click("close-settings")
+    page.wait_for("!document.querySelector(':popover-open')")
+    page.click("learn")
+    page.evaluate(  # the longest step, without a camera
+        "for (const part of document.querySelectorAll('dialog section'))"
+        " part.hidden = part.dataset.step !== 'reading';"
+        "document.getElementById('learn-reading').textContent = 'A long text. '.repeat(60);"
+    )
+    assert page.evaluate(
+        "document.querySelector('[data-step=reading] .close').getBoundingClientRect().bottom"
+        " <= document.getElementById('learn-mouth').getBoundingClientRect().bottom"
+    )
+    page.evaluate("document.getElementById('learn-mouth').close()")
+    page.resize(*SIZE_PX)
+
+
+@pytest.mark.usefixtures("drawing_seldom")
 def test_the_caption_shows_syllables_or_phones(
     control: PageControl, session: Session, page: Browser
 ) -> None:

@@ -1,13 +1,18 @@
-// The dialog "Learn my mouth" releases the camera. Browser parts are fakes.
+// The dialog "Learn my mouth" keeps the focus and releases the camera. Browser parts are fakes.
 
 import assert from "node:assert/strict";
 import test from "node:test";
 
 const elements = {};
+let focused = null; // step of the section that has the focus
+const sections = ["intro", "reading", "learning", "result", "problem"].map((step) => ({
+  dataset: { step },
+  focus: () => (focused = step),
+}));
 const makeElement = () => ({
   classList: { remove() {} },
   dataset: {},
-  querySelectorAll: () => [],
+  querySelectorAll: (selector) => (selector === "section" ? sections : []),
   close() {
     this.open = false;
     this.onclose();
@@ -68,4 +73,9 @@ test("a dialog that is closed while the tracker loads turns the camera off at on
   assert.ok(camera.isOn);
   dialog.close();
   assert.ok(!camera.isOn);
+});
+
+test("the focus moves to the step that is shown", () => {
+  startRecording();
+  assert.equal(focused, "reading");
 });

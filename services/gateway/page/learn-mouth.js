@@ -85,7 +85,10 @@ export class LearnMouthDialog {
 
   #show(step) {
     dialog.dataset.step = step;
-    for (const section of dialog.querySelectorAll("section")) section.hidden = section.dataset.step !== step;
+    for (const section of dialog.querySelectorAll("section")) {
+      section.hidden = section.dataset.step !== step;
+      if (!section.hidden) section.focus(); // the button that had the focus is hidden
+    }
   }
 
   #fail(text) {
