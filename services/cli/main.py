@@ -25,7 +25,7 @@ from kouxing.services.cli.options import Assignments, ConfigFile, Panel
 from kouxing.services.cli.recordings import commands as recordings
 from kouxing.services.cli.system import commands as system
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.command.terminal import print_message
+from kouxing.shared.command.terminal import print_message, replace_closed_streams
 from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.files.output_file import write_error
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
@@ -176,10 +176,7 @@ def main() -> None:
     Ctrl-C gives exit status 130, whatever exception a library turns it into. Python's shutdown is
     skipped, because native libraries can hang or crash during a shutdown.
     """
-    if sys.stdin is None:  # closed, as with <&-
-        sys.stdin = open(os.devnull)  # noqa: SIM115, PTH123 (until the end)
-    if sys.stdout is None:
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+    replace_closed_streams()
     if isinstance(sys.stdout, TextIOWrapper):  # flush each line also in a log file
         sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     try:

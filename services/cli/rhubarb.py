@@ -8,6 +8,7 @@ import argparse
 import io
 import json
 import math
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import redirect_stderr
@@ -20,10 +21,11 @@ from kouxing.services.cli.recordings.animation import FaceMotion, animate
 from kouxing.services.cli.recordings.cue_files import format_cues
 from kouxing.services.cli.texts.spoken_text import MAX_TEXT_BYTES
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.command.terminal import check_output, write_text
+from kouxing.shared.command.terminal import check_output, replace_closed_streams, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.mouth_shapes import REST, Cue, mouth_cues
+from kouxing.shared.files.output_file import write_error
 from kouxing.shared.files.user_file import read_text
 from kouxing.shared.phones.inventory import AUTO, find_language
 
@@ -33,6 +35,7 @@ _PRESTON_BLAIR = dict(zip("ABCDEFGHX", "MBP etc E AI O U FV L rest".split(), str
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; exit with status 1 after an error."""
+    replace_closed_streams()
     options = _parser().parse_args(arguments)
     try:
         rate_hz = options.datFrameRate
@@ -44,8 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _report(options, "progress", "progress: 100 %", value=1.0)
         result = _format_mouths(motion, options)
         if options.output is None:
-            sys.stdout.write(result)
-            sys.stdout.flush()  # plug-ins read the result when the success is reported
+            _print_result(result)
         else:
             write_text(options.output, result)
     except UserError as error:
@@ -133,6 +135,15 @@ def _moho_switches(cues: Iterable[Cue], rate_hz: float, names: dict[str, str]) -
         1 + math.floor(rate_hz * start_s + 1e-6): names.get(mouth, mouth) for start_s, mouth in cues
     }
     return "MohoSwitch1\n" + "".join(f"{frame} {mouth}\n" for frame, mouth in mouths.items())
+
+
+def _print_result(result: str) -> None:
+    """Print all of the result now: plug-ins read it when the success is reported."""
+    try:
+        print(result, end="", flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes the rest at exit
+        raise write_error(Path("standard output"), error) from None
 
 
 def _report(options: argparse.Namespace, kind: str, text: str, **details: object) -> None:

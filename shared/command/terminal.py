@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,6 +26,14 @@ if TYPE_CHECKING:
 CONSOLE = Console(stderr=True)
 Force = Annotated[bool, typer.Option("--force", help="Overwrite output files that exist.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file for the results.")]
+
+
+def replace_closed_streams() -> None:
+    """Replace a closed standard input or output (``<&-``, ``>&-``) by an empty one."""
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull)  # noqa: SIM115, PTH123 (until the end)
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
 def print_message(text: str, style: str | None = None) -> None:

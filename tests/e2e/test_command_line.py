@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -290,6 +291,19 @@ def test_standard_input_may_be_closed() -> None:
         ["sh", "-c", f"{command} <&-"], cwd=ROOT, stderr=subprocess.PIPE, check=False
     )
     assert (done.returncode, b"no audio arrived" in done.stderr) == (2, True)
+
+
+RHUBARB = [sys.executable, "-c", "from kouxing.services.cli.rhubarb import main; main()"]
+
+
+def test_rhubarb_reports_a_closed_input_and_a_full_output() -> None:
+    run = partial(subprocess.run, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
+    done = run(["sh", "-c", f"{shlex.join([*RHUBARB, '-'])} <&-"])
+    assert (done.returncode, "no audio arrived" in done.stderr) == (1, True)
+    with open("/dev/full", "w") as full:  # noqa: PTH123 (a device)
+        done = run([*RHUBARB, "-q", str(VOWELS_FILE)], stdout=full)
+    error = "cannot write standard output: the disk is full; free some space\n"
+    assert (done.returncode, done.stderr) == (1, error)
 
 
 def test_an_error_keeps_its_status_if_its_log_is_full() -> None:
