@@ -417,7 +417,7 @@ def test_reconnects_when_the_gateway_restarts(
     control: PageControl, gateway: Gateway, page: Browser
 ) -> None:
     assert gateway.stop() == 0
-    page.wait_for(f"{NOTICE}.includes('The gateway has stopped')")
+    page.wait_for(f"{NOTICE}.includes('The gateway does not answer')")
     assert "disconnected" in page.evaluate("document.getElementById('status').textContent")
     gateway.start()
     page.wait_for(f"{STATE}.connected")

@@ -2,6 +2,7 @@
 
 import assert from "node:assert/strict";
 import test from "node:test";
+import { translate } from "../../services/gateway/page/language.js";
 import { Microphone } from "../../services/gateway/page/microphone.js";
 import { SpeechControls } from "../../services/gateway/page/speech-controls.js";
 
@@ -99,7 +100,7 @@ test("without the gateway, the error says so, and no audio context stays open", 
   };
   const { microphone, states } = makeMicrophone();
   await microphone.start();
-  assert.deepEqual(states.slice(-2), ["The gateway does not answer. Start it with “kouxing run” and try again.", "off"]);
+  assert.deepEqual(states.slice(-2), [translate("gatewaySilent"), "off"]);
   assert.equal(close.mock.callCount(), 1);
 });
 

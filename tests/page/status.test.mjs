@@ -116,7 +116,7 @@ test("the state is shown with the delay", () => {
 test("a hint names the problem and the remedy", () => {
   const well = { isConnected: true, wasConnected: true, missing: [] };
   assert.equal(hintText(well), "");
-  assert.match(hintText({ ...well, isConnected: false }), /gateway has stopped.*kouxing run/);
+  assert.match(hintText({ ...well, isConnected: false }), /does not answer.*network.*kouxing run/);
   const starting = { ...well, isConnected: false, wasConnected: false };
   assert.equal(hintText(starting), "");
   assert.match(hintText({ ...starting, isRefused: true }), /#token/);

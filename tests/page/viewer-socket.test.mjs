@@ -32,7 +32,8 @@ function binary(kind, mediaTime, payload) {
   return data;
 }
 
-test.beforeEach(() => {
+test.beforeEach((t) => {
+  t.mock.timers.enable({ apis: ["setTimeout", "setInterval"] });
   FakeWebSocket.instances = [];
   globalThis.WebSocket = FakeWebSocket;
   globalThis.location = { protocol: "http:", host: "localhost:8080", hash: "" };
@@ -70,7 +71,6 @@ test("binary messages are read by their type; unknown types are ignored", () => 
 });
 
 test("it reconnects with increasing delays, to the session chosen last", (t) => {
-  t.mock.timers.enable({ apis: ["setTimeout"] });
   const { calls, handlers } = record();
   const viewer = new ViewerSocket(toViewer, "", handlers);
   FakeWebSocket.instances[0].open();
@@ -106,7 +106,6 @@ test("it follows a session that was chosen while it was connecting", () => {
 });
 
 test("a command waits while it is connecting, and is dropped if that fails", (t) => {
-  t.mock.timers.enable({ apis: ["setTimeout"] });
   const viewer = new ViewerSocket(toViewer, "", record().handlers);
   viewer.send({ play: "sample" });
   FakeWebSocket.instances[0].open();
@@ -123,11 +122,30 @@ test("a command waits while it is connecting, and is dropped if that fails", (t)
 });
 
 test("the handler of a lost connection can close it for good", (t) => {
-  t.mock.timers.enable({ apis: ["setTimeout"] });
   const { handlers } = record();
   const viewer = new ViewerSocket(toViewer, "", { ...handlers, state: (isConnected) => isConnected || viewer.close() });
   FakeWebSocket.instances[0].open();
   FakeWebSocket.instances[0].onclose();
   t.mock.timers.tick(5000);
   assert.equal(FakeWebSocket.instances.length, 1);
+});
+
+test("a connection on which nothing arrives is replaced", (t) => {
+  const { calls, handlers } = record();
+  const viewer = new ViewerSocket(toViewer, "", handlers);
+  const [lost] = FakeWebSocket.instances;
+  lost.open();
+  t.mock.timers.tick(5000);
+  lost.onmessage({ data: binary(3, 0, new Float32Array(68)) });
+  t.mock.timers.tick(5000);
+  assert.deepEqual(calls.at(-1)[0], "rest");
+  t.mock.timers.tick(1000);
+  assert.deepEqual(calls.at(-1), ["state", false]);
+  assert.equal(lost.onmessage, null, "its old faces are not shown");
+  t.mock.timers.tick(300);
+  assert.equal(FakeWebSocket.instances.length, 2);
+  t.mock.timers.tick(6000); // it does not connect either
+  t.mock.timers.tick(600);
+  assert.equal(FakeWebSocket.instances.length, 3);
+  viewer.close();
 });

@@ -28,7 +28,7 @@ const mouthProfiles = new MouthProfileStore(() => localStorage);
 const notice = new Notice();
 const offers = await loadOffers(() => {
   setLanguage(preferredLanguage(preferences));
-  notice.showHint(translate("gatewayStopped"));
+  notice.showHint(translate("gatewayLost"));
 });
 const meter = new LevelMeter();
 const gateway = new GatewayState();

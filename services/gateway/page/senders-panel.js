@@ -77,7 +77,7 @@ export class SendersPanel {
   async #post(command) {
     const options = { method: "POST", body: JSON.stringify(command) };
     const response = await fetch(pathWithToken("senders"), options).catch(() => null);
-    if (response === null) return false; // the notice reports that the gateway has stopped
+    if (response === null) return false; // the notice reports that the gateway does not answer
     setText(element("send-problem"), response.ok ? "" : await translateResponse(response));
     if (response.ok) this.#show(await response.json());
     return response.ok;

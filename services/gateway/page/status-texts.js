@@ -51,7 +51,7 @@ export function turnText(turned) {
 /** Return what does not work and what to do; "" if all is well. */
 export function hintText({ isConnected, wasConnected, isRefused, missing }) {
   if (isRefused) return translate("connectionRefused");
-  if (!isConnected && wasConnected) return translate("gatewayStopped");
+  if (!isConnected && wasConnected) return translate("gatewayLost");
   if (isConnected && missing.includes("control")) return translate("controlMissing");
   if (isConnected && missing.length > 0) {
     return translate("servicesMissing", {

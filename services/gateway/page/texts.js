@@ -55,9 +55,9 @@ export const TEXTS = {
   },
   lowerFrameRate: { en: "Lower the frame rate", zh: "降低帧率" },
   useLightModel: { en: "Use the light model", zh: "使用轻量模型" },
-  gatewayStopped: {
-    en: "The gateway has stopped. Start it with “kouxing run”; this page will reconnect automatically.",
-    zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
+  gatewayLost: {
+    en: "The gateway does not answer. Check the network, or start the gateway with “kouxing run”; this page will reconnect automatically.",
+    zh: "网关没有应答。请检查网络，或运行 kouxing run；本页会自动重新连接。",
   },
   connectionRefused: {
     en: "The gateway rejected the connection. Open the full URL that “kouxing run” printed, including #token=… if it has one.",
@@ -267,8 +267,8 @@ export const TEXTS = {
     zh: "此浏览器无法跟踪面部：{reason}。请用最新版的 Chrome、Edge 或 Firefox。",
   },
   gatewaySilent: {
-    en: "The gateway does not answer. Start it with “kouxing run” and try again.",
-    zh: "网关没有应答。请运行 kouxing run 后重试。",
+    en: "The gateway does not answer. Check the network, or start the gateway with “kouxing run”, and try again.",
+    zh: "网关没有应答。请检查网络，或运行 kouxing run，然后重试。",
   },
 };
 

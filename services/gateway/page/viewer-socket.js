@@ -1,6 +1,10 @@
 // The WebSocket that brings a session's frames, sound and events; see proto/GATEWAY.md.
 
 const RETRY_MS = { min: 300, max: 5000 };
+const TICK_MS = 1000;
+// Faces arrive all the time, also at rest. Without any, the network is down, which a socket reports after minutes. Ticks
+// are counted, because a busy page or one that was frozen receives late.
+const MAX_SILENT_TICKS = 5;
 const [FAPS, SOUND, REST, SHAPES, REST_SHAPES] = [1, 2, 3, 4, 5]; // types of binary messages
 const HEADER_BYTES = 16;
 
@@ -12,6 +16,7 @@ export class ViewerSocket {
   #socket = null; // null after close()
   #unsent = []; // commands that wait until the socket has connected
   #retryTimer = null;
+  #tickTimer = null;
   #retryMs = RETRY_MS.min;
 
   /**
@@ -47,9 +52,14 @@ export class ViewerSocket {
     if (socket === null) return;
     this.#socket = null;
     clearTimeout(this.#retryTimer);
-    socket.onclose = socket.onerror = null;
-    socket.close();
+    this.#abandon(socket);
     this.#handlers.state(false);
+  }
+
+  #abandon(socket) {
+    clearInterval(this.#tickTimer);
+    socket.onopen = socket.onmessage = socket.onclose = socket.onerror = null;
+    socket.close();
   }
 
   #connect() {
@@ -61,14 +71,23 @@ export class ViewerSocket {
       for (const command of this.#unsent) this.send(command);
       this.#handlers.state(true);
     };
-    socket.onmessage = (event) => this.#receive(event.data);
-    // Node 22 reports a failed connection only as an error.
-    socket.onclose = socket.onerror = () => {
-      socket.onclose = socket.onerror = null;
+    let numSilentTicks = 0;
+    socket.onmessage = (event) => {
+      numSilentTicks = 0;
+      this.#receive(event.data);
+    };
+    const reconnect = () => {
+      this.#abandon(socket);
       this.#retryTimer = setTimeout(() => this.#connect(), this.#retryMs);
       this.#retryMs = Math.min(RETRY_MS.max, this.#retryMs * 2);
       this.#handlers.state(false); // may call close()
     };
+    // Node 22 reports a failed connection only as an error.
+    socket.onclose = socket.onerror = reconnect;
+    this.#tickTimer = setInterval(() => {
+      numSilentTicks++;
+      if (numSilentTicks > MAX_SILENT_TICKS) reconnect();
+    }, TICK_MS);
     this.#socket = socket;
   }
 
