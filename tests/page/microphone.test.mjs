@@ -223,6 +223,7 @@ test("the end of an abandoned microphone does not stop a newer one", async () =>
 /** Return speech controls, their buttons by id, and a sound that is on. */
 function makeControls() {
   const buttons = {};
+  const toasts = [];
   const makeButton = () => ({ setAttribute() {} });
   globalThis.document = { getElementById: (id) => (buttons[id] ??= makeButton()) };
   const sound = {
@@ -239,9 +240,9 @@ function makeControls() {
   };
   const ignore = () => {};
   const handlers = { mouthProfile: () => "", language: () => "", lipModel: () => null, level: ignore };
-  const others = { error: ignore, session: ignore, fileStarted: ignore };
+  const others = { error: ignore, session: ignore, fileStarted: ignore, toast: (text) => toasts.push(text) };
   const controls = new SpeechControls(sound, { ...handlers, ...others });
-  return { controls, microphone: controls.microphone, buttons, sound };
+  return { controls, microphone: controls.microphone, buttons, sound, toasts };
 }
 
 const drop = (...files) => document.ondrop({ preventDefault() {}, dataTransfer: { files } });
@@ -281,4 +282,38 @@ test("a file that is dropped while the user's mouth is being learned is not play
   controls.resume();
   drop(FILE);
   assert.ok(microphone.isFile);
+});
+
+test("the first of several dropped files is played, and the page says so", () => {
+  const { microphone, toasts } = makeControls();
+  drop(FILE, { name: "other.wav", size: 1 });
+  assert.ok(microphone.isFile);
+  assert.deepEqual(toasts, [translate("severalFiles", { file: FILE.name })]);
+});
+
+test("a folder or a file that was deleted is not called a problem of the gateway", async () => {
+  globalThis.fetch = () => Promise.reject(new TypeError("Failed to fetch"));
+  for (const [arrayBuffer, key] of [
+    [() => Promise.reject(new DOMException("gone", "NotFoundError")), "fileUnreadable"],
+    [async () => new ArrayBuffer(1), "gatewaySilent"],
+  ]) {
+    const { microphone, states } = makeMicrophone();
+    await microphone.startFile({ ...FILE, slice: () => ({ arrayBuffer }) });
+    assert.deepEqual(states.slice(-2), [translate(key, { file: FILE.name }), "off"]);
+  }
+});
+
+test("a missing microphone and a muted one are reported", async () => {
+  navigator.mediaDevices.getUserMedia = () => Promise.reject(new DOMException("not found", "NotFoundError"));
+  const { microphone, states } = makeMicrophone();
+  await microphone.start();
+  assert.deepEqual(states.slice(-2), [translate("microphoneMissing"), "off"]);
+
+  const track = { muted: true, stop() {} };
+  navigator.mediaDevices.getUserMedia = async () => ({ getTracks: () => [track] });
+  await microphone.start();
+  assert.deepEqual(states.slice(-2), ["starting", translate("microphoneMuted")]);
+  track.onmute();
+  assert.deepEqual(states.slice(-2), [translate("microphoneMuted"), translate("microphoneMuted")]);
+  microphone.stop();
 });

@@ -55,11 +55,19 @@ export function capture(context, stream, onChunk) {
   context.resume();
 }
 
+/** Return whether the browser can read a file; it cannot read a folder or a file that was moved. */
+function isReadable(file) {
+  return file.slice(0, 1).arrayBuffer().then(
+    () => true,
+    () => false,
+  );
+}
+
 /**
  * Return { name, stream, remarks, play(onEnded) } for an audio file or the sound of a video. The gateway
  * decodes it, as browsers ignore gaps in timestamps and read fewer formats.
  *
- * @throws {UserError} if the file is too large, too long or silent, or cannot be decoded
+ * @throws {UserError} if the file is too large, too long or silent, or cannot be read or decoded
  */
 export async function openFileSpeech(context, file) {
   if (file.size > MAX_FILE_BYTES) throw new UserError(translate("fileTooLarge"));
@@ -67,7 +75,7 @@ export async function openFileSpeech(context, file) {
   try {
     response = await fetch(pathWithToken("sound", { name: file.name }), { method: "POST", body: file });
   } catch {
-    throw new UserError(translate("gatewaySilent"));
+    throw new UserError(await isReadable(file) ? translate("gatewaySilent") : translate("fileUnreadable", { file: file.name }));
   }
   if (!response.ok) throw new UserError(await translateResponse(response));
   const buffer = await context.decodeAudioData(await response.arrayBuffer());

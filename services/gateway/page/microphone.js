@@ -57,6 +57,8 @@ export class Microphone {
       });
       for (const track of source.stream.getTracks()) {
         track.onended = () => this.#run === run && this.#fail(translate("microphoneUnplugged"));
+        track.onmute = () => this.#run === run && this.#report(translate("microphoneMuted"));
+        if (track.muted) track.onmute();
       }
       source.context = await openCaptureContext();
     });
@@ -176,8 +178,12 @@ export class Microphone {
     }
   }
 
-  #fail(text) {
+  #report(text) {
     this.#handlers.error({ code: "microphone", text });
+  }
+
+  #fail(text) {
+    this.#report(text);
     this.stop();
   }
 }
@@ -185,6 +191,7 @@ export class Microphone {
 function problemText(error, isFile) {
   if (error instanceof UserError) return error.message;
   if (error.name === "NotAllowedError") return translate("microphoneForbidden");
+  if (error.name === "NotFoundError") return translate("microphoneMissing");
   const reason = error.message.replace(/\.$/, ""); // Firefox writes a period
   return translate(isFile ? "fileFailed" : "microphoneFailed", { reason });
 }

@@ -43,7 +43,10 @@ export class SpeechControls {
     document.ondragover = (event) => event.preventDefault();
     document.ondrop = (event) => {
       event.preventDefault();
-      if (event.dataTransfer.files.length > 0) this.#speakFile(event.dataTransfer.files[0]);
+      const { files } = event.dataTransfer;
+      if (files.length === 0 || this.#isPaused) return;
+      this.#speakFile(files[0]);
+      if (files.length > 1) this.#handlers.toast(translate("severalFiles", { file: files[0].name }));
     };
     element("sound").onclick = () => {
       if (sound.state === "on") this.#turnSoundOff();
@@ -100,7 +103,6 @@ export class SpeechControls {
   }
 
   #speakFile(file) {
-    if (this.#isPaused) return;
     this.unblockSound();
     this.#handlers.fileStarted();
     this.microphone.startFile(file);

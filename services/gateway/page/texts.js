@@ -98,6 +98,14 @@ export const TEXTS = {
     en: "The microphone is blocked. Allow it for this page in the browser and try again.",
     zh: "未允许使用麦克风。请在浏览器中允许本页使用，然后重试。",
   },
+  microphoneMissing: {
+    en: "No microphone was found. Connect one and press Microphone again.",
+    zh: "没有找到麦克风。请接上后再按“麦克风”。",
+  },
+  microphoneMuted: {
+    en: "The microphone is muted. Unmute it in the system, in the browser, or on the microphone.",
+    zh: "麦克风已静音。请在系统、浏览器或麦克风上取消静音。",
+  },
   microphoneUnplugged: {
     en: "The microphone was unplugged. Plug it in and press Microphone again.",
     zh: "麦克风断开了。请接上后再按“麦克风”。",
@@ -117,6 +125,14 @@ export const TEXTS = {
   fileStopped: {
     en: "The gateway closed the connection. Choose the file again.",
     zh: "网关关闭了连接。请重新选择文件。",
+  },
+  fileUnreadable: {
+    en: "The browser cannot read {file}. It may be a folder, or it was moved or deleted. Choose the file again.",
+    zh: "浏览器无法读取 {file}。它可能是文件夹，或者已被移动或删除。请重新选择文件。",
+  },
+  severalFiles: {
+    en: "One file plays at a time: {file}. Drop the others when it has ended.",
+    zh: "一次只能播放一个文件：{file}。请在播放结束后再拖入其他文件。",
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
   noSpeech: {
