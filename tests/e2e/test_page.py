@@ -349,6 +349,30 @@ def test_another_head_is_shown(control: PageControl, session: Session, page: Bro
     assert_changed_and_back(woman, man, woman_again)
 
 
+@pytest.mark.usefixtures("drawing_seldom")
+def test_a_head_that_is_no_longer_chosen_is_not_loaded(page: Browser) -> None:
+    loaded = "performance.getEntriesByType('resource').map(({ name }) => name.split('/').pop())"
+    page.evaluate("performance.clearResourceTimings()")
+    for name in ("man", "woman", "man"):
+        choose(page, "heads", name)
+    page.wait_for(f"{loaded}.filter((name) => name === 'head-man.glb').length > 0")
+    page.wait_for("document.getElementById('loading').hidden")
+    assert "head-woman.glb" not in page.evaluate(loaded)
+
+
+@pytest.mark.usefixtures("drawing_seldom")
+def test_a_head_that_cannot_be_loaded_leaves_the_other_one_visible(page: Browser) -> None:
+    page.evaluate(
+        "window.realFetch = fetch; void (window.fetch = () => Promise.reject(Error('off')))"
+    )
+    choose(page, "heads", "woman")
+    page.wait_for(f"{NOTICE}.includes('off. Check the network')")
+    assert page.evaluate("document.getElementById('no-head').textContent") == ""
+    page.evaluate("void (window.fetch = window.realFetch)")
+    choose(page, "heads", "")
+    page.wait_for("document.getElementById('loading').hidden")
+
+
 def assert_changed_and_back(first: NDArray[np.uint8], *others: NDArray[np.uint8]) -> None:
     change, change_back = (
         (np.abs(first.astype(int) - other).max(axis=2) > 40).mean() for other in others

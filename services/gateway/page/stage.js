@@ -28,7 +28,8 @@ function save(video) {
 
 export class Stage {
   #head = null; // null until it is loaded
-  #loading = Promise.resolve(); // done when the head that was chosen last is loaded
+  #chosen = ""; // name of the head that was chosen last
+  #loading = Promise.resolve(); // done when it is loaded
   #faps;
   #handlers;
   #recorder;
@@ -67,6 +68,7 @@ export class Stage {
 
   /** Load a head by its name; "" for the gateway's default. */
   load(name) {
+    this.#chosen = name;
     this.#loading = this.#loading.then(() => this.#load(name)); // in order: the last one stays
     return this.#loading;
   }
@@ -93,6 +95,7 @@ export class Stage {
   }
 
   async #load(name) {
+    if (name !== this.#chosen) return; // the user has chosen another one in the meantime
     element("loading").hidden = false;
     setText(element("no-head"), "");
     const file = name === "" ? "head.glb" : `head-${name}.glb`;
@@ -107,7 +110,7 @@ export class Stage {
       const isText = error instanceof UserError;
       const text = isText ? error.message : translate("headMissing", { file, reason: error.message });
       this.#handlers.failed(text);
-      setText(element("no-head"), text); // stays after the notice has vanished
+      if (this.#head === null) setText(element("no-head"), text); // stays after the notice has vanished
     }
     element("loading").hidden = true;
   }

@@ -83,8 +83,8 @@ export const TEXTS = {
 
   // Errors
   headMissing: {
-    en: "Cannot load {file}: {reason}. Create the file with “kouxing head export”.",
-    zh: "无法加载 {file}：{reason}。请用 kouxing head export 生成该文件。",
+    en: "Cannot load {file}: {reason}. Check the network and choose the head again, or create the file with “kouxing head export”.",
+    zh: "无法加载 {file}：{reason}。请检查网络后重新选择头像，或用 kouxing head export 生成该文件。",
   },
   webGlMissing: {
     en: "This browser cannot draw 3-D images (WebGL). Turn on hardware acceleration in its settings, or use another browser.",
