@@ -131,8 +131,8 @@ def write_private(path: Path, content: bytes) -> None:
 
 
 def path_as_text(path: Path | str) -> str:
-    """Return a path as valid UTF-8 text. Bytes that are not UTF-8 are replaced."""
-    return os.fsencode(path).decode("utf-8", "replace")
+    """Return a path, or a text with paths, as valid UTF-8. Other bytes are replaced."""
+    return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def write_error(path: Path, error: Any) -> UserError:

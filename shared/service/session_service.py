@@ -7,6 +7,7 @@ from kouxing_client.field_types import MAX_TEXT
 from kouxing_client.messages import Event, Message
 
 from kouxing.shared.errors import Rejected, StartFailure, UserError
+from kouxing.shared.files.output_file import path_as_text
 from kouxing.shared.monitoring.logs import LOG
 from kouxing.shared.network.peer import Peer
 from kouxing.shared.service.base import HEARTBEAT_S, Service
@@ -72,7 +73,7 @@ class SessionService(Service):
             session=start.session,
             session_id=start.session_id,
             name=name,
-            detail=detail[:MAX_TEXT],
+            detail=path_as_text(detail)[:MAX_TEXT],
             media_time=media_time,
         )
         self.send_to_control(event)
@@ -106,7 +107,7 @@ class SessionService(Service):
                 session=start.session,
                 request=start.request,
                 code=rejection.code,
-                text=rejection.text,
+                text=path_as_text(rejection.text),
                 retry_after_s=rejection.retry_after_s,
             )
         )

@@ -198,6 +198,12 @@ def test_reports_an_unwritable_video_to_control(tmp_path: Path, harness: DriverH
     assert harness.events("error")[0].detail.startswith("no-video: ")
 
 
+def test_reports_a_video_in_a_folder_whose_name_is_not_utf8(harness: DriverHarness) -> None:
+    harness.driver._report_written(replace(START, session="film"), Path("\udce9/film.mp4"))
+    harness.step_until(lambda: harness.has_recorded(1))
+    assert harness.events("recorded")[0].detail == "\ufffd/film.mp4"
+
+
 def test_reports_a_video_that_ends_early_before_it_is_written(harness: DriverHarness) -> None:
     harness.start("film", record=True)
     harness.publish("film", 0, 100.0)
