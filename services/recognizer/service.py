@@ -39,7 +39,7 @@ from kouxing.shared.phones.events import Waveform
 from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode
+from kouxing.shared.wire.session import AudioChunk, Error, ErrorCode, FlushSession
 from kouxing.shared.wire.speech import Acknowledge, Progress
 
 MAX_QUEUED_S = 60.0  # limit for live audio; later audio waits at the clients
@@ -184,14 +184,14 @@ class RecognizerService(SessionService):
             free_at_s = time.monotonic() + FREE_MEMORY_AFTER_S
             self._free_memory_at_s = min(self._free_memory_at_s, free_at_s)
 
-    def flush_session(self, session: str) -> None:
+    def flush_session(self, message: FlushSession) -> None:
         """Drop the current speech; the next audio starts a new segment."""
-        if (flushed := self._sessions.get(session)) is not None:
+        if (flushed := self._sessions.get(message.session)) is not None:
             if flushed.is_paced:
                 self._live.decode_all([flushed])
             flushed.audio.clear()
             flushed.link.forget()
-            flushed.on_flush(time.monotonic())
+            flushed.on_flush(message.sequence)
             flushed.stream.flush()
             self._send_results(flushed)
             if flushed.last_chunk is not None:

@@ -48,7 +48,7 @@ from kouxing.shared.wire.events import (
     split_batch,
 )
 from kouxing.shared.wire.face import SetFace
-from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.session import ErrorCode, FlushSession
 from kouxing.shared.wire.speech import (
     AudioState,
     NewestFrame,
@@ -119,10 +119,9 @@ class SynthesizerService(SessionService):
         if stopped is not None and not stopped.is_finished and not self.should_exit:
             self._end(stopped)
 
-    def flush_session(self, session: str) -> None:
+    def flush_session(self, message: FlushSession) -> None:
         """Drop queued phones and lip positions; the next frames return to rest."""
-        flushed = self._sessions.get(session)
-        if flushed is not None:
+        if (flushed := self._sessions.get(message.session)) is not None:
             flushed.events = deque(
                 event for event in flushed.events if not isinstance(event, Phone | LipPositions)
             )

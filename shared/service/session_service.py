@@ -32,7 +32,7 @@ class SessionService(Service):
     def stop_session(self, session: str) -> None:
         """Stop serving a session, if it exists."""
 
-    def flush_session(self, session: str) -> None:
+    def flush_session(self, message: FlushSession) -> None:
         """Drop audio of a session whose face is not shown yet."""
 
     def change_face(self, message: SetFace) -> None:
@@ -48,7 +48,7 @@ class SessionService(Service):
             **super().control_handlers(),
             StartSession: self._on_start_session,
             CloseSession: lambda message, _: self.stop_session(message.session),
-            FlushSession: lambda message, _: self.flush_session(message.session),
+            FlushSession: lambda message, _: self.flush_session(message),
             SetFace: lambda message, _: self.change_face(message),
         }
 

@@ -118,7 +118,8 @@ class CloseSession(RegisteredMessage, frozen=True, kw_only=True):
 class FlushSession(RegisteredMessage, frozen=True, kw_only=True):
     """Interrupts: audio not yet shown is dropped and the face returns to rest.
 
-    Sent by a client to control, and by control to the services.
+    ``sequence`` is the number of the client's newest audio message. Sent by a client to control,
+    and by control to the services.
     """
 
     request: Name

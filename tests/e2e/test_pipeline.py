@@ -95,6 +95,24 @@ def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
     assert max(map(opening, after[8:])) < 1, "150 ms are 7.5 frames"
 
 
+def test_a_flush_also_drops_audio_that_is_still_queued(system: System) -> None:
+    with (
+        Client(system.control) as client,
+        client.open_session(encoding="f32le", paced=False) as session,
+    ):
+        streamed = StreamedSession(session)
+        session.push(np.tile(SENTENCE, 20))  # more than the recognizer decodes before the flush
+        flushed = session.media_time
+        streamed.collect_until(lambda: streamed.frames)
+        session.flush()
+        client.open_session().close()  # every service has processed control's messages
+        streamed.collect()
+        num_before = len(streamed.frames)
+        session.push(np.zeros(8000, np.float32))
+        streamed.collect_until(lambda: streamed.times[-1:] >= [flushed + 8000 - 3200])
+    assert all(time > flushed - 3200 for time in streamed.times[num_before + 8 :])
+
+
 def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
     positions = np.arange(len(samples) * rate_hz // 16000) * (16000 / rate_hz)
     resampled: NDArray[np.float32] = np.interp(positions, np.arange(len(samples)), samples).astype(

@@ -22,7 +22,7 @@ from kouxing.shared.network.bus import Bus
 from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
-from kouxing.shared.wire.session import AudioChunk, Error
+from kouxing.shared.wire.session import AudioChunk, Error, FlushSession
 from kouxing.shared.wire.speech import AcousticModelName
 from tests.live_streams import START
 from tests.samples import with_opening
@@ -103,9 +103,20 @@ def test_reports_speech_in_progress_to_a_restarted_control(service: Recognizer) 
 def test_accepts_the_next_audio_after_a_flush_whatever_its_number(service: Recognizer) -> None:
     service.start_session(UNPACED)
     service.receive(replace(chunk(0, 640), acknowledge=True))
-    service.flush_session("s")
+    service.flush_session(FlushSession(session="s", request="r", token="t", sequence=4))
     service.receive(replace(chunk(4, 640), acknowledge=True))
     assert service._sessions["s"].last_sequence == 5
+
+
+def test_drops_audio_that_arrives_after_its_flush(service: Recognizer) -> None:
+    service.start_session(UNPACED)
+    session = service._sessions["s"]
+    service.flush_session(FlushSession(session="s", request="r", token="t", sequence=3))
+    for number in range(3):
+        service.receive(chunk(number, 640))
+        assert not session.audio
+    service.receive(chunk(3, 640))
+    assert session.audio.media_time == 3 * 640
 
 
 @pytest.mark.parametrize("paced", [False, True])

@@ -341,6 +341,7 @@ def test_values_of_numpy_do_not_end_the_client(control: FakeControl, client: Cli
         session.set_face(expressiveness=np.float32(1.5))  # type: ignore[arg-type]
     session.skip(np.int64(1600))  # type: ignore[arg-type]
     session.push(CHUNK)
+    assert session.media_time == 1600 + len(CHUNK) // 2
     wait_until(lambda: control.audio_messages)
     assert control.audio_messages[0].media_time == 1600
     assert not client.is_closed

@@ -92,6 +92,12 @@ def test_a_common_key_is_set_for_the_services_that_have_it(monkeypatch: pytest.M
         read_settings().load(kind.config_type)
 
 
+def test_a_services_own_value_overrides_a_common_one() -> None:
+    environment = assigned_environment({"gateway.head": "man", "common.head": "mika"})
+    assert environment["KOUXING_GATEWAY_HEAD"] == "man"
+    assert environment["KOUXING_DRIVER_HEAD"] == "mika"
+
+
 def test_more_workers_bind_other_ports_of_the_same_address() -> None:
     settings = read_settings(
         assignments={"recognizer.audio": "tcp://127.0.0.5:5560", "recognizer.instance": "ours"}

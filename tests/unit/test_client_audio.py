@@ -6,7 +6,7 @@ from array import array
 import numpy as np
 import pytest
 from kouxing_client import KouxingError
-from kouxing_client.audio import RESEND_S, AudioStream, check_channels, to_pcm
+from kouxing_client.audio import ANSWER_LIMITS_S, RESEND_S, AudioStream, check_channels, to_pcm
 
 CHUNK = 1600  # samples: 100 ms
 
@@ -48,13 +48,21 @@ def test_keeps_acknowledged_audio_for_a_limited_time() -> None:
 def test_flushed_audio_is_not_sent_but_the_end_is() -> None:
     stream = stream_of(3)
     stream.add({}, CHUNK, 0.3)
-    stream.flush()
+    assert stream.flush() == 4
     assert sent(stream) == []
     assert stream.num_unacknowledged == 0
     stream.add({"last": True}, 0, 0.4)
     stream.flush()
     stream.move(2, 0.5)
     assert sent(stream) == [5]
+
+
+def test_the_wait_for_an_acknowledgement_starts_again_after_a_flush() -> None:
+    stream = stream_of(3)
+    stream.flush()
+    stream.add({}, CHUNK, 100.0)
+    assert not stream.is_stuck(100.0 + ANSWER_LIMITS_S[0])
+    assert stream.is_stuck(100.1 + ANSWER_LIMITS_S[0])
 
 
 FLOATS = [0.0, 0.5, -1.0, 2.0]

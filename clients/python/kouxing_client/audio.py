@@ -148,7 +148,7 @@ class AudioStream:
 
     def add(self, fields: Fields, num_samples: int, now_s: float) -> None:
         """Add a chunk of ``num_samples`` samples per channel."""
-        if self.acknowledged == self.sequence:
+        if self.num_unacknowledged == 0:
             self._progress_s = now_s
         self.sequence += 1
         numbered = {**fields, "sequence": self.sequence, "media_time": self.media_time}
@@ -203,8 +203,9 @@ class AudioStream:
         self._next = next_sequence
         self._progress_s = now_s
 
-    def flush(self) -> None:
-        """Forget all audio: none of it is sent, or sent again."""
+    def flush(self) -> int:
+        """Forget all audio: none of it is sent, or sent again. Return its last number."""
         self._kept = deque(
             (message for message in self._kept if "last" in message), maxlen=MAX_KEPT_MESSAGES
         )
+        return self.sequence

@@ -13,7 +13,7 @@ from kouxing_client.core import ClientCore
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.inbox import Inbox, new_future
 from kouxing_client.keys import Key, find_key, read_key
-from kouxing_client.messages import Fields, Result
+from kouxing_client.messages import MEDIA_RATE_HZ, Fields, Result
 from kouxing_client.options import check_name, check_results
 from kouxing_client.session_core import SessionCore, Subscription
 from kouxing_client.thread import ClientThread
@@ -109,6 +109,7 @@ class BaseSession:
         self._signal = core.signal
         self._options = options
         self._num_added = 0  # audio messages
+        self._num_pushed = 0  # samples per channel, including skipped ones
         self._partial_sample = b""  # the first bytes of the next sample
         self._has_finished = False
 
@@ -129,7 +130,9 @@ class BaseSession:
     @property
     def media_time(self) -> int:
         """Media time of the next chunk, samples at 16 kHz."""
-        return 0 if self._core.stream is None else self._core.stream.media_time
+        if self._options is None:  # another program sends the audio
+            return 0
+        return self._num_pushed * MEDIA_RATE_HZ // int(self._options["sample_rate_hz"])
 
     def try_push(self, pcm: bytes) -> bool:
         """Send PCM without blocking. Return False if too much audio is unacknowledged.
@@ -162,6 +165,8 @@ class BaseSession:
         count = int(num_samples)  # NumPy integers cannot be encoded
         if count < 0:
             raise KouxingError(f"num_samples must be at least 0, not {count}")
+
+        self._num_pushed += count
 
         def skip() -> None:
             if self._core.stream is not None:
@@ -217,6 +222,7 @@ class BaseSession:
     def _add(self, pcm: bytes, num_samples: int) -> None:
         self._check_open()
         self._num_added += 1
+        self._num_pushed += num_samples
         self._thread.call(lambda: self._core.add_audio(num_samples, {"pcm": pcm}))
 
     def _finish(self) -> None:
@@ -235,9 +241,9 @@ class BaseSession:
         self._partial_sample = b""
 
         def flush(core: ClientCore) -> Future[Fields]:
-            if self._core.stream is not None:
-                self._core.stream.flush()
-            return core.request("flush-session", self.name, token=self._core.token)
+            sequence = 0 if self._core.stream is None else self._core.stream.flush()
+            fields = {"token": self._core.token, "sequence": sequence}
+            return core.request("flush-session", self.name, **fields)
 
         return self._thread.submit(flush)
 

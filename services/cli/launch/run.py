@@ -212,9 +212,15 @@ def token_environment(settings: Settings) -> dict[str, str]:
 
 
 def assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of ``--set``, which override all other sources."""
+    """Return the environment variables of ``--set``, which override all other sources.
+
+    A service's own value overrides a common one.
+    """
     environment = {}
-    for name, value in assignments.items():
+    common_first = sorted(
+        assignments.items(), key=lambda item: not item[0].startswith(f"{COMMON}.")
+    )
+    for name, value in common_first:
         table, _, key = name.partition(".")
         for service, config_type in CONFIG_TYPES.items():
             if service == table or (table == COMMON and key in key_types(config_type)):

@@ -53,7 +53,8 @@ class AudioIntake:
         session.check_open(message)
         if message.last:
             session.last_chunk = message
-        if not message.pcm and message.last:
+        is_flushed = message.sequence <= session.flushed_sequence
+        if is_flushed or (message.last and not message.pcm):
             return
         if error := session.mouth_profile_error:
             session.mouth_profile_error = ""

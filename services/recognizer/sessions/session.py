@@ -94,7 +94,7 @@ class RecognizerSession:
         self.replay_window = ReplayWindow()
         self.last_sequence = 0  # number of the newest accepted audio message
         self._gap_since_s: float | None = None  # when messages after a gap were first dropped
-        self._flushed_s: float | None = None  # time of a flush; cleared ``RESEND_WAIT_S`` later
+        self.flushed_sequence = 0  # number of the last audio message before an interruption
         self.client = NO_PEER  # sender of the newest audio
         self.last_chunk: AudioChunk | None = None  # None until it has arrived
         self.is_finished = False  # all audio up to the end is decoded
@@ -137,21 +137,19 @@ class RecognizerSession:
 
         ZeroMQ loses messages in flight when a connection ends. A client that asks for
         acknowledgements resends them. Until then, or for ``RESEND_WAIT_S``, later messages are
-        dropped, except after an interruption. Returns whether the message was accepted.
+        dropped. Returns whether the message was accepted.
         """
-        is_next = self.last_sequence in (0, message.sequence - 1)
-        if message.acknowledge and not is_next and self._flushed_s is None:
+        is_next = message.sequence - 1 in (self.last_sequence, self.flushed_sequence)
+        if message.acknowledge and self.last_sequence and not is_next:
             self._gap_since_s = now_s if self._gap_since_s is None else self._gap_since_s
             if now_s < self._gap_since_s + RESEND_WAIT_S:
                 return False
         self.last_sequence, self._gap_since_s = message.sequence, None
-        if self._flushed_s is not None and now_s > self._flushed_s + RESEND_WAIT_S:
-            self._flushed_s = None  # messages sent before the interruption have arrived by now
         return True
 
-    def on_flush(self, now_s: float) -> None:
-        """Record an interruption: the client does not send or resend older audio."""
-        self._flushed_s = now_s
+    def on_flush(self, sequence: int) -> None:
+        """Record an interruption: audio up to this message may be missing, and is not used."""
+        self.flushed_sequence = sequence
         self.silent_s = 0.0  # so that a stalled client is reported again
 
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
