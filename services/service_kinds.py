@@ -158,12 +158,15 @@ def available_port_environment(settings: Settings) -> dict[str, str]:
 def extra_worker_environments(settings: Settings, number: int) -> dict[str, dict[str, str]]:
     """Return the environments of additional workers, so that each kind has ``number`` of them.
 
-    Their names are ``recognizer-2`` and so on. They bind free ports on the first worker's host.
+    Their names are ``recognizer-2`` and so on. They bind free ports on the first worker's host,
+    and serve no metrics.
     """
     environments: dict[str, dict[str, str]] = {}
     for name in WORKERS:
         config = settings.load(KINDS[name].config_type)
-        environment = {variable_name(name, "instance"): ""}
+        environment = dict.fromkeys(
+            (variable_name(name, "instance"), variable_name(name, "metrics")), ""
+        )
         for key, bound in bound_keys(type(config)).items():
             if bound is BindAddress.ENDPOINT:
                 host = str(getattr(config, key)).rpartition(":")[0]

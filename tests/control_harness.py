@@ -26,10 +26,11 @@ ENDPOINTS_BY_SERVICE = {"recognizer": ("audio", "phones"), "synthesizer": ("phon
 
 def make_heartbeat(kind: str, address: str = "tcp://127.0.0.1:1", **fields: object) -> Heartbeat:
     """Return the heartbeat of a service whose sockets all have one address."""
-    return Heartbeat(
+    defaults = Heartbeat(
         service=kind, instance=kind, role="worker", state="ready", sent_ns=0,
-        endpoints=dict.fromkeys(ENDPOINTS_BY_SERVICE[kind], address), **fields,  # type: ignore[arg-type]
+        endpoints=dict.fromkeys(ENDPOINTS_BY_SERVICE[kind], address),
     )  # fmt: skip
+    return replace(defaults, **fields)
 
 
 class ControlHarness:

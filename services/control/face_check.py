@@ -10,11 +10,15 @@ from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import AcousticModelName
 
 
-def check_face(settings: FaceSettings, lip_models: Collection[str]) -> None:
-    """Raise ``Rejected`` if a setting has an unknown name; the text lists the names.
+def check_face(settings: FaceSettings, lip_models: Collection[str], session: str = "") -> None:
+    """Raise ``Rejected`` if a setting of a session's face is invalid.
 
-    If no ``lip_models`` are given, all names of lip models are allowed.
+    The error for an unknown name lists the known names. If no ``lip_models`` are given, all names
+    of lip models are allowed.
     """
+    if session and settings.listen_to == session:
+        text = f"face {session!r} cannot listen to itself; set listen_to to another session"
+        raise Rejected(ErrorCode.BAD_FACE, text)
     known: list[tuple[str, str | None, Collection[str]]] = [
         ("lip model", settings.lip_model if lip_models else None, lip_models),
         ("acoustic model", settings.acoustic, [*AcousticModelName]),

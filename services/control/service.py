@@ -172,7 +172,7 @@ class ControlService(Service):
                 known = None
         if known is not None and not known.is_announced:
             return None  # the services are starting
-        check_face(message.face, self._registry.lip_models())
+        check_face(message.face, self._registry.lip_models(), message.session)
         record = self._sessions.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})
         self._lifecycle.send_start(record, record.waiting_for)
@@ -190,7 +190,7 @@ class ControlService(Service):
         return _done(message)
 
     def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
-        check_face(message.face, self._registry.lip_models())
+        check_face(message.face, self._registry.lip_models(), message.session)
         if message.session == "":  # the face at rest, which only observers show
             self._resting_face.change(message.face, time.monotonic())
             for instance in self._registry.observers():

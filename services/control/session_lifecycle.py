@@ -21,7 +21,8 @@ from kouxing.shared.wire.control import EventName
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionMoved
 
-START_TIMEOUT_S = 5.0
+START_TIMEOUT_S = 5.0  # limit for the workers of a new session
+OBSERVER_TIMEOUT_S = 0.5  # limit for the observers of a new session
 MOVE_TIMEOUT_S = 20.0  # time without a worker after which a session is closed
 REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)  # delays of repeated messages: a connection may have broken
 
@@ -174,9 +175,7 @@ class SessionLifecycle:
             if waited_s > MOVE_TIMEOUT_S:
                 lost = ", ".join(sorted(record.lost))
                 self.end(record, f"{lost} is lost, and no other worker is free")
-        elif record.waiting_for and waited_s > (
-            MOVE_TIMEOUT_S if record.is_announced else START_TIMEOUT_S
-        ):
+        elif record.waiting_for and waited_s > _limit_s(record):
             self._stop_waiting(record)
         else:
             self.announce_if_started(record)
@@ -206,3 +205,10 @@ class SessionLifecycle:
         else:
             error = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text)
             self.reject(record, error)
+
+
+def _limit_s(record: SessionRecord) -> float:
+    """Return how long to wait for the services that have not started a session."""
+    if record.is_announced:
+        return MOVE_TIMEOUT_S
+    return START_TIMEOUT_S if record.missing_workers else OBSERVER_TIMEOUT_S

@@ -35,8 +35,8 @@ def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
             raise UserError(f"unknown expression {name!r}; use {', '.join(ExpressionName)}")
         if not _is_number(strength, 1.0):
             raise UserError(f"expression {name}: strength {strength} is not between 0 and 1")
-    if not _is_number(hold_s, MAX_HOLD_S):
-        raise UserError(f"hold_s is {hold_s}; it must be from 0 to {MAX_HOLD_S:g} seconds")
+    if not (_is_number(hold_s, MAX_HOLD_S) and hold_s):
+        raise UserError(f"hold_s is {hold_s}; use more than 0, and at most {MAX_HOLD_S:g} seconds")
 
 
 def _is_number(value: object, highest: float) -> bool:

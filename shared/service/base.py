@@ -1,8 +1,8 @@
 """The loop that every service runs: startup, main loop, shutdown.
 
 A service sleeps until a message arrives or periodic work is due (``on_tick``). SIGTERM or SIGINT
-ends the main loop; then the service finishes its work within a deadline. A second signal exits
-immediately. The loop sends the heartbeats, so that control detects a loop that hangs.
+ends the main loop; then the service finishes its work within a deadline. A second signal ends
+the process immediately. The loop sends the heartbeats, so that control detects a loop that hangs.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class Heartbeat(RegisteredMessage, frozen=True, kw_only=True):
     # lip models that its sessions may choose; empty: unknown
     lip_models: Annotated[list[Name], Meta(max_length=64)] = field(default_factory=list)
     build: Text = ""  # version of kouxing
-    load: Probability = 0.0  # fraction of the last seconds in which its loop was busy
+    load: Probability = 0.0  # fraction of the last 2 s in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)
     # sessions of the service
     sessions: Annotated[dict[SessionName, SessionProgress], Meta(max_length=10000)] = field(

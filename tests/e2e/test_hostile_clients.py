@@ -271,7 +271,9 @@ def pcm_of(output: Results[Sound], num_bytes: int) -> bytes:
     return pcm
 
 
-def test_an_observer_that_never_answers_delays_no_session(system: System, client: Client) -> None:
+def test_a_session_opens_without_an_observer_that_never_answers(
+    system: System, client: Client
+) -> None:
     with Bus(load_key("gateway", ("service:gateway",))) as bus:
         mute = bus.connect_dealer(system.control)
         heartbeat = Heartbeat(

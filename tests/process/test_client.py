@@ -230,6 +230,10 @@ def test_unknown_keywords_and_names_are_refused(client: Client) -> None:
     settings: dict[str, Any] = {"lip_mode": "learned"}
     with pytest.raises(TypeError, match="did you mean 'lip_model'"):
         client.set_face("s", **settings)
+    with pytest.raises(KouxingError, match="hold_s is how long expressions last"):
+        client.set_face("s", hold_s=2)
+    no_face: dict[str, Any] = {"face": None}
+    assert client.open_session("s", **no_face).name == "s"
     with pytest.raises(KouxingError, match="'a b' is not a valid session name"):
         client.set_face("a b", still=True)
 

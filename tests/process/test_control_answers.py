@@ -11,6 +11,7 @@ import pytest
 import zmq
 from kouxing_client.messages import Message, Speech
 
+from kouxing.services.control import session_lifecycle
 from kouxing.shared.fast_record import replace
 from kouxing.shared.network.bus import Bus
 from kouxing.shared.network.sockets import Socket
@@ -19,7 +20,7 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import HeartbeatReply, SessionProgress
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import CloseSession, Error, OpenSession, SessionOpened
-from tests.control_harness import IDLE_LIMIT_S, ControlHarness
+from tests.control_harness import IDLE_LIMIT_S, ControlHarness, make_heartbeat
 from tests.system import wait_until
 
 
@@ -41,6 +42,18 @@ def test_a_repeated_request_gets_the_same_answer(harness: ControlHarness) -> Non
     first = harness.open(client, "mine")
     assert isinstance(first, SessionOpened)
     assert harness.open(client, "mine") == first
+
+
+def test_a_session_opens_without_an_observer_that_does_not_answer(
+    harness: ControlHarness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_lifecycle, "START_TIMEOUT_S", 3600.0)
+    lamp = make_heartbeat("recognizer", role="observer", instance="lamp")
+    observer = harness.buses[0].connect_dealer(harness.control.endpoints["commands"])
+    observer.send(lamp)
+    harness.receive(observer)
+    client = harness.connect_client(harness.control.key and load_user_key())
+    assert isinstance(harness.open(client, "mine"), SessionOpened)
 
 
 @pytest.mark.parametrize("harness", [False], indirect=True)

@@ -36,6 +36,7 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Extend the time limits of control for slow machines."""
     monkeypatch.setattr(restart_recovery, "RECOVERY_S", 60.0)
     monkeypatch.setattr(session_lifecycle, "START_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(session_lifecycle, "OBSERVER_TIMEOUT_S", 60.0)
 
 
 def report(

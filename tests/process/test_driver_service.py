@@ -207,7 +207,7 @@ def test_reports_a_video_in_a_folder_whose_name_is_not_utf8(harness: DriverHarne
 def test_reports_a_video_that_ends_early_before_it_is_written(harness: DriverHarness) -> None:
     harness.start("film", record=True)
     harness.publish("film", 0, 100.0)
-    harness.step_until(harness.unfinished)
+    harness.wait_for_frames(1)
     videos = harness.driver.recorder
     number = videos._open["film"]
     videos._send("film", "end")

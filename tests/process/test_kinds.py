@@ -107,6 +107,7 @@ def test_more_workers_bind_other_ports_of_the_same_address() -> None:
     assert list(more) == ["recognizer-2", "recognizer-3", "synthesizer-2", "synthesizer-3"]
     assert more["recognizer-3"] == {
         "KOUXING_RECOGNIZER_INSTANCE": "",
+        "KOUXING_RECOGNIZER_METRICS": "",
         "KOUXING_RECOGNIZER_AUDIO": "tcp://127.0.0.5:*",
         "KOUXING_RECOGNIZER_PHONES": "tcp://127.0.0.1:*",
         "KOUXING_RECOGNIZER_UNPACED_AUDIO": "tcp://127.0.0.1:*",

@@ -21,6 +21,12 @@ def test_known_names_are_accepted() -> None:
     check_face(settings, [])  # no synthesizer reports its lip models
 
 
+def test_a_face_cannot_listen_to_itself() -> None:
+    check_face(FaceSettings(listen_to="b"), LIP_MODELS, "a")
+    with pytest.raises(Rejected, match="face 'a' cannot listen to itself"):
+        check_face(FaceSettings(listen_to="a"), LIP_MODELS, "a")
+
+
 @pytest.mark.parametrize(
     ("settings", "text"),
     [

@@ -61,6 +61,7 @@ def test_expressions_ease_in_stay_and_fade(name: ExpressionName) -> None:
         ("joy", float("nan"), 3.0, "joy: strength nan"),
         ("joy", True, 3.0, "joy: strength True"),
         ("joy", 0.5, -1.0, "hold_s is -1"),
+        ("joy", 0.5, 0.0, "hold_s is 0.0; use more than 0"),
         ("joy", 0.5, None, "hold_s is None"),
     ],
 )

@@ -128,7 +128,7 @@ def train_blocks(
         output,
         title="Block model: Whisper's encoder in blocks with a cached past, gently tuned",
         details=f"with Whisper's weights (Radford et al. 2023, MIT license), seed {SEED}, "
-        f"{num_steps} steps of {BATCHES_PER_STEP * BATCH_S} s of sound, aligned by `{start.name}`, "
+        f"{num_steps} steps of {BATCHES_PER_STEP * BATCH_S} s of audio, aligned by `{start.name}`, "
         f"on {len(recordings)} recordings of {minutes:.0f} minutes: those below, speech "
         "without text, and sung copies",
         recordings=examples,

@@ -205,7 +205,7 @@ def _write_model(
     write_card(
         output,
         title="Audio encoder: a recurrent network for voice and lip features",
-        details=f"with {teacher}, seed {SEED}, {num_steps} steps of {BATCH_S:.0f} s of sound",
+        details=f"with {teacher}, seed {SEED}, {num_steps} steps of {BATCH_S:.0f} s of audio",
         recordings=sources.utterances,
         errors=sources.errors,
         notes=f"It also learned from {sources.num_untranscribed} folders of speech without text.",

@@ -52,7 +52,7 @@ from kouxing.training.networks.optimizer import cross_entropy, optimize
 from kouxing.training.seed import SEED
 
 NUM_LAYERS = 6  # layers of Whisper base's encoder
-_NUM_STEPS = 600  # batches of up to 70 s of sound
+_NUM_STEPS = 600  # batches of up to 70 s of audio
 KEPT_LAYERS = (-3, -2, -1)  # indices of the layers that are read
 _PIECE_FRAMES = 2960  # with the padding, less than 30 s
 _PADDING = np.zeros(4800, np.float32)  # appended to a piece

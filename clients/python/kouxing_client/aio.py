@@ -109,7 +109,7 @@ class AsyncSession(BaseSession):
                 with contextlib.suppress(Refused):  # already closed
                     await asyncio.wrap_future(self._close())
         finally:
-            await asyncio.wrap_future(self._thread.forget(self._core))
+            await asyncio.wrap_future(self._thread.disconnect(self._core))
 
     async def frames(self) -> AsyncResults[FapFrame]:
         """Subscribe to FAP frames, as ``Session.frames``."""

@@ -122,7 +122,7 @@ class AudioStream:
         self._kept: deque[Fields] = deque(maxlen=MAX_KEPT_MESSAGES)
         self._next = 1  # number of the next message for the socket
         # sequence and time
-        self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED_MESSAGES)
+        self._send_times: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED_MESSAGES)
         self._progress_s = 0.0  # time of the last acknowledgement, or of the first open message
         self._min_answer_s = ANSWER_LIMITS_S[0] if is_paced else UNPACED_ANSWER_S
         self._answer_s = self._min_answer_s  # how long to wait before reconnecting
@@ -153,7 +153,7 @@ class AudioStream:
         self.sequence += 1
         numbered = {**fields, "sequence": self.sequence, "media_time": self.media_time}
         self._kept.append({**numbered, "acknowledge": True})
-        self._sent_s.append((self.sequence, now_s))
+        self._send_times.append((self.sequence, now_s))
         self._num_samples += num_samples
         num_acknowledged = self.acknowledged - self._kept[0]["sequence"] + 1
         if num_acknowledged > 0:
@@ -178,8 +178,8 @@ class AudioStream:
         """Mark all messages up to ``sequence`` as received."""
         if sequence <= self.acknowledged:
             return
-        while self._sent_s and self._sent_s[0][0] <= sequence:
-            number, sent_s = self._sent_s.popleft()
+        while self._send_times and self._send_times[0][0] <= sequence:
+            number, sent_s = self._send_times.popleft()
             if number == sequence:
                 measured_ms = max(round(2e3 * (now_s - sent_s)), MIN_CONNECT_MS)
                 self.round_trip_ms = min(measured_ms, self.round_trip_ms or measured_ms)

@@ -91,7 +91,7 @@ class BaseClient:
                 may_wait=False,
             )
             answer.add_done_callback(lambda _: closed.set_result(None))
-            self._thread.forget(core)
+            self._thread.disconnect(core)
 
         opened.add_done_callback(close)
 

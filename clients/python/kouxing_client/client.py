@@ -145,7 +145,7 @@ class Session(BaseSession):
                 with contextlib.suppress(Refused):  # already closed
                     self._close().result()
         finally:
-            self._thread.forget(self._core).result()
+            self._thread.disconnect(self._core).result()
 
     def frames(self) -> Results[FapFrame]:
         """Subscribe to FAP frames. Raises ``KouxingError`` if the session has ended."""

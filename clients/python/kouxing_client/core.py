@@ -258,7 +258,7 @@ class ClientCore:
         def on_status(answer: Future[Status]) -> None:
             try:
                 state = newest_session(answer.result(), session.name)
-                if not session.is_subject_of(state["session"], state["session_id"]):
+                if not session.is_about(state["session"], state["session_id"]):
                     session.end(None)  # another session has its name now
                     return
             except Refused as refusal:
@@ -305,7 +305,7 @@ class ClientCore:
             return
         subject = event.session, event.session_id
         for session, inboxes in self._inboxes.items():
-            for inbox in inboxes if session.is_subject_of(*subject) else ():
+            for inbox in inboxes if session.is_about(*subject) else ():
                 inbox.add(event)
         if event.name == "session-closed":
             for session in self._subjects(*subject):
@@ -316,7 +316,7 @@ class ClientCore:
             session.move(fields)
 
     def _subjects(self, name: str, session_id: str | None) -> list[SessionCore]:
-        return [session for session in self.sessions if session.is_subject_of(name, session_id)]
+        return [session for session in self.sessions if session.is_about(name, session_id)]
 
 
 def newest_session(status: Status, name: str) -> Fields:

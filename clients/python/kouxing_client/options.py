@@ -89,7 +89,7 @@ def open_fields(name: str, options: SessionOptions) -> Fields:
         )
     _check_integer("sample_rate_hz", fields["sample_rate_hz"], MIN_RATE_HZ, MAX_RATE_HZ)
     _check_integer("num_channels", fields["num_channels"], 1, MAX_CHANNELS)
-    face = face_fields(fields.get("face", {}))
+    face = face_fields(fields.pop("face", None) or {})
     if shapes := fields.pop("shapes", ()):
         _check_shapes(shapes)
         face["shapes"] = list(shapes)
@@ -101,9 +101,12 @@ def open_fields(name: str, options: SessionOptions) -> Fields:
 def face_fields(settings: FaceSettings) -> Fields:
     """Return the settings of a face as a dictionary.
 
-    Raises ``TypeError`` for unknown keywords, and ``KouxingError`` if ``shapes`` is a text.
+    Raises ``TypeError`` for unknown keywords, and ``KouxingError`` if ``shapes`` is a text, or if
+    there is ``hold_s`` without ``expressions``.
     """
     _check_keywords("set_face", settings, FaceSettings.__annotations__)
+    if "hold_s" in settings and "expressions" not in settings:
+        raise KouxingError("hold_s is how long expressions last; pass it with expressions")
     _check_shapes(settings.get("shapes", ()))
     return {**settings}
 

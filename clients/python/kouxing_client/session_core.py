@@ -208,7 +208,7 @@ class SessionCore:
         self._unknown: tuple[float, Refused] | None = None  # unknown to the recognizer
         self._closing: tuple[float, str] | None = None  # deadline and reason of control
 
-    def is_subject_of(self, name: str, session_id: str | None) -> bool:
+    def is_about(self, name: str, session_id: str | None) -> bool:
         """Return whether a message with this session name and id is about this session.
 
         A late message may be about an earlier session of the same name.

@@ -48,8 +48,8 @@ def connect(raw: Connection, endpoint: str, key: Key | None) -> None:
         raise KouxingError(
             f"{address} uses encryption, but this program does not: leave out 'insecure' here"
             if server
-            else f"{address} uses no encryption, but this program does: set 'insecure' here too, or"
-            " for no program"
+            else f"{address} uses no encryption, but this program does: set 'insecure' in every"
+            " program, or in none"
         )
     try:
         if key is not None:

@@ -91,7 +91,7 @@ class ClientThread:
         self.call(run)
         return answer
 
-    def forget(self, session: SessionCore) -> Future[None]:
+    def disconnect(self, session: SessionCore) -> Future[None]:
         """Close all connections of a session."""
         closed = new_future()
 

@@ -152,7 +152,8 @@ class WhipHandler:
             LOG.info("a WebRTC client is streaming", extra={"session": session.name})
             try:
                 async for num_lost, pcm, num_samples in client.peer.receive_audio():
-                    session.skip(num_lost)
+                    if num_lost:
+                        session.skip(num_lost)
                     if not rate_limit.admit(num_samples / client.peer.rate_hz):
                         continue  # a client cannot be slowed down
                     session.send(pcm, num_samples)
