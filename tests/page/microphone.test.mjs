@@ -245,7 +245,7 @@ function makeControls() {
   return { controls, microphone: controls.microphone, buttons, sound, toasts };
 }
 
-const drop = (...files) => document.ondrop({ preventDefault() {}, dataTransfer: { files } });
+const drop = (...files) => globalThis.document.ondrop({ preventDefault() {}, dataTransfer: { files } });
 
 test("sound that the user turns off stays off when the microphone or a file ends", async () => {
   const { microphone, buttons, sound } = makeControls();
