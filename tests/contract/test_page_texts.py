@@ -14,7 +14,7 @@ SOURCES = (
     *("shared/audio/audio_file.py", "shared/audio/media_file.py", "shared/audio/audio_formats.py"),
     *("shared/audio/phase_cancellation.py", "shared/audio/wav_parts.py"),
     "shared/audio/level_check.py",
-    "services/gateway/uploads/upload_handlers.py",
+    *("services/gateway/uploads/upload_handlers.py", "services/gateway/uploads/audio_decoder.py"),
     "services/gateway/viewers/viewer_handler.py",
     *("services/gateway/senders_api.py", "services/mouth_profiles/face_landmarks.py"),
     *("services/mouth_profiles/landmark_file.py", "services/mouth_profiles/learning.py"),

@@ -192,7 +192,7 @@ test("texts of the gateway are translated with their values", () => {
   );
   const empty = "a.wav: the file is empty; copy or record it again";
   assert.equal(toChinese(`${empty}\n1: unknown: why`), "a.wav：文件是空的，请重新复制或录制\n1：unknown：why");
-  assert.equal(errorToChinese("busy", "the disk is full"), "系统繁忙，请稍后再试：the disk is full");
+  assert.equal(errorToChinese("busy", "no such text"), "系统繁忙，请稍后再试：no such text");
   assert.equal(errorToChinese("new-code", "no"), "no");
   assert.equal(
     errorToChinese(

@@ -1,6 +1,7 @@
 """Uploads of mouths, with other programs in place of the real learning, and of audio files."""
 
 import asyncio
+import errno
 import io
 import json
 import os
@@ -8,6 +9,7 @@ import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.parse import unquote
 
 import aiohttp
@@ -232,6 +234,21 @@ async def test_answers_errors_as_the_commands_do(monkeypatch: pytest.MonkeyPatch
         status, data, _ = await post(media_bytes("WAV", SINE), "a.wav")
         assert status == 413
         assert b"larger than" in data
+
+
+@async_test
+async def test_a_full_disk_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (
+        "the gateway cannot store the file: the disk is full; free space in its temporary folder,"
+        " or set TMPDIR to another folder and restart the gateway"
+    )
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        async with serve(AudioUploadHandler()) as post:
+            monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: full)
+            assert await post(media_bytes("WAV", SINE), "a.wav") == error(422, text)
+    monkeypatch.setattr(upload_handlers, "_store", Mock(side_effect=OSError(errno.ENOSPC, "")))
+    async with serve(AudioUploadHandler()) as post:
+        assert await post(media_bytes("WAV", SINE), "a.wav") == error(422, text)
 
 
 @pytest.mark.parametrize(

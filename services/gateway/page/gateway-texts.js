@@ -55,6 +55,9 @@ const CHINESE = {
   "the file is larger than {size} MiB; use a smaller one": "文件大于 {size} MiB，请用较小的文件",
   "this is a big-endian WAV file; export it as wav or flac": "这是大端序的 WAV 文件，请导出为 wav 或 flac",
   "the file cannot be decoded; export it again": "文件无法解码，请重新导出",
+  "the gateway cannot store the file: {reason}; free space in its temporary folder, or set TMPDIR to another folder and restart the gateway":
+    "网关无法存储文件：{reason}；请在其临时文件夹中腾出空间，或把 TMPDIR 设为其他文件夹并重启网关",
+  "the disk is full": "磁盘已满",
   "reading the file took too long; use a shorter file": "读取时间太长，请用较短的文件",
 
   // Sessions

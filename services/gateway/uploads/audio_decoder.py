@@ -1,5 +1,7 @@
 """Process that decodes an uploaded audio file to a 16-bit WAV file on standard output."""
 
+import errno
+import os
 import resource
 import sys
 import wave
@@ -13,6 +15,16 @@ from kouxing.shared.errors import USER_ERROR, UserError
 MAX_DURATION_S = 3600
 MAX_CPU_S = 60
 MAX_MEMORY_BYTES = 4 << 30
+
+
+def storage_error(error: OSError) -> UserError:
+    """Return the error for a temporary file that cannot be written."""
+    is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    reason = "the disk is full" if is_full else error.strerror or str(error)
+    return UserError(
+        f"the gateway cannot store the file: {reason}; free space in its temporary folder, or set"
+        " TMPDIR to another folder and restart the gateway"
+    )
 
 
 def decode(path: Path) -> None:
@@ -39,3 +51,6 @@ if __name__ == "__main__":
     except UserError as error:
         print(error, file=sys.stderr)
         sys.exit(USER_ERROR)
+    except OSError as error:
+        print(storage_error(error), file=sys.stderr, flush=True)
+        os._exit(USER_ERROR)  # Python would write the rest at exit, and fail

@@ -17,6 +17,7 @@ from urllib.parse import quote
 from aiohttp import web
 
 from kouxing.services.gateway.uploads import audio_decoder
+from kouxing.services.gateway.uploads.audio_decoder import storage_error
 from kouxing.services.gateway.web.web_application import discard_body
 from kouxing.services.mouth_profiles import learning_process
 from kouxing.shared.errors import USER_ERROR, UserError
@@ -141,6 +142,11 @@ class AudioUploadHandler(UploadHandler):
                 return await self._decode_upload(Path(folder), request)
         except TimeoutError:
             return _upload_error(408, "reading the file took too long; use a shorter file")
+        except ConnectionError:
+            raise
+        except OSError as error:
+            await discard_body(request)
+            raise storage_error(error) from None
 
     async def _decode_upload(self, folder: Path, request: web.Request) -> web.StreamResponse:
         name = _NOT_IN_NAMES.sub("_", request.query.get("name", ""))[-_MAX_NAME_CHARACTERS:].lstrip(
