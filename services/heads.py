@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
 from kouxing.shared.settings.config import Check, KnownNames
 
@@ -22,9 +23,13 @@ def page_file(name: str) -> str:
 def page_heads_folder() -> Path:
     """Return ``$XDG_CACHE_HOME/kouxing/heads``, by default ``~/.cache/kouxing/heads``.
 
-    It has the page's heads of an installed package, which contains no GLB files.
+    It has the page's heads of an installed package, which contains no GLB files. Raises
+    ``UserError`` if the user has no home folder.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        raise UserError("this user has no home folder; set XDG_CACHE_HOME to a folder") from None
     return cache / "kouxing" / "heads"
 
 

@@ -85,11 +85,12 @@ def export_page_heads(folder: Path) -> None:
 
 def ensure_page_heads() -> None:
     """Export the heads to the cache folder, unless they are up to date or in the page's folder."""
-    folder = page_heads_folder()
-    if _has_current_heads(_PAGE) or _has_current_heads(folder):
+    if _has_current_heads(_PAGE):
         return
     try:
-        export_page_heads(folder)
+        folder = page_heads_folder()
+        if not _has_current_heads(folder):
+            export_page_heads(folder)
     except UserError as error:
         print_message(f"the page has no heads: {error}")
 

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import av
 import numpy as np
@@ -260,3 +261,13 @@ def test_run_exports_missing_heads_to_the_cache(
     written_ns = [file.stat().st_mtime_ns for file in files]
     page_heads.ensure_page_heads()
     assert [file.stat().st_mtime_ns for file in files] == written_ns, "they are up to date"
+
+
+def test_run_without_a_home_folder_needs_no_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError))
+    monkeypatch.setattr(page_heads, "_PAGE", tmp_path)
+    page_heads.ensure_page_heads()
+    assert "this user has no home folder; set XDG_CACHE_HOME" in capsys.readouterr().err

@@ -244,10 +244,14 @@ def _page_file(name: str, head: str, frame_ancestors: str) -> web.StreamResponse
 
 def _page_head(file: str) -> Path:
     """Return the file of a head, from the page's folder or from the cache folder."""
-    for folder in (PAGE_FOLDER, page_heads_folder()):
-        with contextlib.suppress(web.HTTPNotFound):
-            return _find(folder, file, {".glb"})
-    folder = page_heads_folder()
+    with contextlib.suppress(web.HTTPNotFound):
+        return _find(PAGE_FOLDER, file, {".glb"})
+    try:
+        folder = page_heads_folder()
+    except UserError as error:
+        raise web.HTTPNotFound(text=f"head {file} is missing: {error}\n") from None
+    with contextlib.suppress(web.HTTPNotFound):
+        return _find(folder, file, {".glb"})
     command = f"mkdir -p {folder} && kouxing head export {folder}"
     raise web.HTTPNotFound(text=f"head {file} is missing; create all heads with '{command}'\n")
 
