@@ -8,12 +8,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from kouxing.shared.errors import UserError
 from kouxing.shared.settings.keys import MAX_KEY_SHARE
 
 if TYPE_CHECKING:
     from kouxing.shared.network.peer_connection import PeerConnection
 
 MAX_CONNECTIONS = 400  # limit for clients; libzmq takes up to 0.1 MB for each
+MIN_CONNECTIONS = 16  # with fewer, even the services of one machine could not connect
 FILES_PER_CLIENT = 6  # one for the client, one for a service, and four in the tarpit
 RESERVED_FILES = 256  # files for models, pages and outgoing connections
 BUDGET = 5000.0  # work of a connection
@@ -26,13 +28,15 @@ class PeerQuota:
 
     The limit of clients is ``MAX_CONNECTIONS`` plus ``extra_connections``. The limit of services is
     the same number plus the connections that clients do not use. ``is_service`` returns whether a
-    key belongs to a service.
+    key belongs to a service. Raises ``UserError`` if this process can open too few files.
     """
 
     def __init__(self, extra_connections: int, is_service: Callable[[str], bool]) -> None:
         max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         max_clients = (max_files - RESERVED_FILES) // FILES_PER_CLIENT
-        self.max_clients = max(1, min(MAX_CONNECTIONS + extra_connections, max_clients))
+        if max_clients < MIN_CONNECTIONS:
+            raise UserError(f"the limit of open files is {max_files}; raise it: ulimit -n 1024")
+        self.max_clients = min(MAX_CONNECTIONS + extra_connections, max_clients)
         self._is_service = is_service
 
     def excess(self, connections: Sequence[PeerConnection]) -> Iterator[tuple[PeerConnection, str]]:

@@ -7,6 +7,7 @@ from unittest import mock
 
 import pytest
 
+from kouxing.shared.errors import UserError
 from kouxing.shared.network import connection_limits, kernel_sockets, peer_quota
 from kouxing.shared.network.bus import AUDIO_LIMITS
 from kouxing.shared.network.connection_limits import (
@@ -269,3 +270,11 @@ def test_a_reused_descriptor_is_another_connection(harness: SocketHarness) -> No
 )
 def test_the_addresses_of_one_host_count_as_one(first: str, second: str, is_one: bool) -> None:
     assert (kernel_sockets.get_network(first) == kernel_sockets.get_network(second)) == is_one
+
+
+def test_a_process_that_can_open_too_few_files_does_not_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("resource.getrlimit", lambda _: (64, 64))
+    with pytest.raises(UserError, match="open files is 64; raise it: ulimit -n 1024"):
+        ConnectionLimiter(is_service=lambda _: False)
