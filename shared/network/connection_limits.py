@@ -16,6 +16,7 @@ import contextlib
 import math
 import resource
 import struct
+import sys
 import threading
 import time
 from collections import Counter, deque
@@ -45,6 +46,7 @@ MAX_ENDED_CONNECTIONS = 1024  # that a service has not handled yet
 MAX_SUBSCRIPTION_BYTES = 128
 MAX_TOPICS_BYTES = 32 * KIB  # of a connection's subscriptions: 64 sessions
 MAX_ALL_TOPICS_BYTES = 192 * KIB  # of all connections; libzmq takes up to 120 times as much memory
+MAX_FILES_MACOS = 10240  # OPEN_MAX: macOS allows less than it reports
 TRIMS_S = (0.2, 1.0, 3.0)  # delays after a disconnect, because libzmq frees memory later
 NUM_ENDED_BEFORE_TRIM = 50  # connections, about 1 MB; freeing memory takes up to 60 ms
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED  # events that a monitor reports
@@ -312,5 +314,6 @@ def _disconnect_heaviest(
 def raise_file_limit() -> None:
     """Raise this process's limit of open files as far as the system allows."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(ValueError, OSError):  # macOS allows less than it reports
-        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    soft = min(hard, MAX_FILES_MACOS) if sys.platform == "darwin" else hard
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
