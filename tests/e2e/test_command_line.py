@@ -167,7 +167,7 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
         (["express", "heard", "joy=2"], "between 0 and 1"),
-        (["express", "heard", "joy=1", "--hold", "-1"], "0 to 3600"),
+        (["express", "heard", "joy=1", "--hold", "-1"], "at most 3600"),
         (["express", "nobody", "joy=1"], "'nobody' does not exist (open sessions: none); to"),
     ],
 )

@@ -84,7 +84,7 @@ def test_trains_resumes_and_writes_model_and_card(
     frames = WhisperMel().accept_waveform(HELLO)
     assert len(stream.score(frames)) + len(stream.score(None)) == len(frames)
     card = output.with_suffix(".md").read_text()
-    assert "3 steps of 256 s of sound, aligned by `blocks.npz`, on 8 recordings" in card
+    assert "3 steps of 256 s of audio, aligned by `blocks.npz`, on 8 recordings" in card
     assert "CC0-1.0" in card
     left = {path.name for path in tmp_path.iterdir() if path.is_file()}
     assert left == {"blocks.npz", "blocks.md"}
