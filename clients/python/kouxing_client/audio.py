@@ -204,7 +204,7 @@ class AudioStream:
         self._progress_s = now_s
 
     def flush(self) -> int:
-        """Forget all audio: none of it is sent, or sent again. Return its last number."""
+        """Forget all audio: none of it is sent, or sent again. Return the newest number."""
         self._kept = deque(
             (message for message in self._kept if "last" in message), maxlen=MAX_KEPT_MESSAGES
         )
