@@ -138,7 +138,7 @@ def _moho_switches(cues: Iterable[Cue], rate_hz: float, names: dict[str, str]) -
 
 
 def _print_result(result: str) -> None:
-    """Print all of the result now: plug-ins read it when the success is reported."""
+    """Print and flush the result, because plug-ins read it when success is reported."""
     try:
         print(result, end="", flush=True)
     except OSError as error:

@@ -13,8 +13,8 @@ from kouxing.shared.wire.speech import AcousticModelName
 def check_face(settings: FaceSettings, lip_models: Collection[str], session: str = "") -> None:
     """Raise ``Rejected`` if a setting of a session's face is invalid.
 
-    The error for an unknown name lists the known names. If no ``lip_models`` are given, all names
-    of lip models are allowed.
+    The error for an unknown name lists the known names. If ``lip_models`` is empty, any name of
+    a lip model is allowed.
     """
     if session and settings.listen_to == session:
         text = f"face {session!r} cannot listen to itself; set listen_to to another session"

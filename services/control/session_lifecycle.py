@@ -21,8 +21,8 @@ from kouxing.shared.wire.control import EventName
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import CloseSession, Error, ErrorCode, SessionMoved
 
-START_TIMEOUT_S = 5.0  # limit for the workers of a new session, and the driver that records it
-OBSERVER_TIMEOUT_S = 0.5  # limit for the other observers of a new session
+START_TIMEOUT_S = 5.0  # how long a new session waits for its workers, or a driver that records it
+OBSERVER_TIMEOUT_S = 0.5  # how long a new session waits for other observers
 MOVE_TIMEOUT_S = 20.0  # time without a worker after which a session is closed
 REPEAT_AFTER_S = (1.0, 2.0, 4.0, 8.0)  # delays of repeated messages: a connection may have broken
 

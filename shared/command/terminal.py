@@ -29,9 +29,9 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file for the
 
 
 def replace_closed_streams() -> None:
-    """Replace a closed standard input or output (``<&-``, ``>&-``) by an empty one."""
+    """Replace a closed standard input or output (``<&-``, ``>&-``) with the null device."""
     if sys.stdin is None:
-        sys.stdin = open(os.devnull)  # noqa: SIM115, PTH123 (until the end)
+        sys.stdin = open(os.devnull)  # noqa: SIM115, PTH123 (open until exit)
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 

@@ -2,7 +2,7 @@
 
 A service sleeps until a message arrives or periodic work is due (``on_tick``). SIGTERM or SIGINT
 ends the main loop; then the service finishes its work within a deadline. A second signal ends
-the process immediately. The loop sends the heartbeats, so that control detects a loop that hangs.
+the process immediately. The loop sends the heartbeats, so control detects a hung loop.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ class AudioStream:
         self._progress_s = now_s
 
     def flush(self) -> int:
-        """Forget all audio: none of it is sent, or sent again. Return the newest number."""
+        """Discard all audio without sending or resending it. Return the newest sequence number."""
         self._kept = deque(
             (message for message in self._kept if "last" in message), maxlen=MAX_KEPT_MESSAGES
         )

@@ -241,7 +241,7 @@ class Follower:
 
     @property
     def _caught_up_at_s(self) -> float:
-        """When the messages that were queued during the last suspension have arrived."""
+        """Time by which messages queued during the last suspension have arrived."""
         return self._transport.resumed_at_s + CATCH_UP_S
 
     def _receive(self, message: Message) -> None:

@@ -61,7 +61,7 @@ export class SpeechControls {
     this.microphone.start();
   }
 
-  /** Stop the microphone, mute the sound and ignore dropped files, for Learn my mouth. */
+  /** Stop the microphone, mute the sound, and ignore dropped files while Learn my mouth is open. */
   pause() {
     this.#isPaused = true;
     this.microphone.stop();

@@ -103,7 +103,7 @@ export const TEXTS = {
     zh: "没有找到麦克风。请接上后再按“麦克风”。",
   },
   microphoneMuted: {
-    en: "The microphone is muted. Unmute it in the system, in the browser, or on the microphone.",
+    en: "The microphone is muted. Unmute it in the system settings, in the browser, or on the microphone itself.",
     zh: "麦克风已静音。请在系统、浏览器或麦克风上取消静音。",
   },
   microphoneUnplugged: {
@@ -127,11 +127,11 @@ export const TEXTS = {
     zh: "网关关闭了连接。请重新选择文件。",
   },
   fileUnreadable: {
-    en: "The browser cannot read {file}. It may be a folder, or it was moved or deleted. Choose the file again.",
+    en: "The browser cannot read {file}. It may be a folder, or it may have been moved or deleted. Choose the file again.",
     zh: "浏览器无法读取 {file}。它可能是文件夹，或者已被移动或删除。请重新选择文件。",
   },
   severalFiles: {
-    en: "One file plays at a time: {file}. Drop the others when it has ended.",
+    en: "Only one file plays at a time. Playing {file}; drop the others when it ends.",
     zh: "一次只能播放一个文件：{file}。请在播放结束后再拖入其他文件。",
   },
   fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },

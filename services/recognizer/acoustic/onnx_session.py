@@ -18,7 +18,7 @@ import numpy as np
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"  # read during the import
 import onnxruntime
 
-# An ONNX file with one node, MatMulInteger: c = a b. a is unsigned, (1, 2); b is signed, (2, 1).
+# An ONNX model with one MatMulInteger node: c = a @ b; a is uint8, (1, 2), and b is int8, (2, 1).
 _PRODUCT = (
     b'\x08\x04:[\n\x18\n\x01a\n\x01b\x12\x01c"\rMatMulInteger\x12\x00'
     b"Z\x13\n\x01a\x12\x0e\n\x0c\x08\x02\x12\x08\n\x02\x08\x01\n\x02\x08\x02"
