@@ -25,7 +25,7 @@ from kouxing.services.cli.options import Assignments, ConfigFile, Panel
 from kouxing.services.cli.recordings import commands as recordings
 from kouxing.services.cli.system import commands as system
 from kouxing.services.service_kinds import KINDS
-from kouxing.shared.command.terminal import print_message, replace_closed_streams
+from kouxing.shared.command.terminal import discard_output, print_message, replace_closed_streams
 from kouxing.shared.errors import USER_ERROR, UserError
 from kouxing.shared.files.output_file import write_error
 from kouxing.shared.interrupt import clear_interrupt, is_interrupted
@@ -210,7 +210,7 @@ def _run_command() -> None:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
         text = str(write_error(Path(error.filename or "the output"), error))
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes the rest at exit
+        discard_output()
     else:
         sys.exit(status or 0)
     if text:

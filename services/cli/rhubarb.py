@@ -8,7 +8,6 @@ import argparse
 import io
 import json
 import math
-import os
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import redirect_stderr
@@ -21,7 +20,12 @@ from kouxing.services.cli.recordings.animation import FaceMotion, animate
 from kouxing.services.cli.recordings.cue_files import format_cues
 from kouxing.services.cli.texts.spoken_text import MAX_TEXT_BYTES
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.command.terminal import check_output, replace_closed_streams, write_text
+from kouxing.shared.command.terminal import (
+    check_output,
+    discard_output,
+    replace_closed_streams,
+    write_text,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import DEFAULT_LIP_MODEL
 from kouxing.shared.face.mouth_shapes import REST, Cue, mouth_cues
@@ -142,7 +146,7 @@ def _print_result(result: str) -> None:
     try:
         print(result, end="", flush=True)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes the rest at exit
+        discard_output()
         raise write_error(Path("standard output"), error) from None
 
 

@@ -36,6 +36,11 @@ def replace_closed_streams() -> None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
+def discard_output() -> None:
+    """Discard buffered standard output, which Python would otherwise write at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
 def print_message(text: str, style: str | None = None) -> None:
     """Print a message to standard error, because standard output is for results.
 

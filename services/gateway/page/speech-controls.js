@@ -11,7 +11,7 @@ export class SpeechControls {
   session = null;
   #sound;
   #handlers;
-  #isPaused = false; // by Learn my mouth
+  #isPaused = false; // while Learn my mouth is open
   #wasSoundWanted = false; // whether sound was on before the microphone or Learn my mouth muted it
 
   /**

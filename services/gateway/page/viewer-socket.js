@@ -2,8 +2,8 @@
 
 const RETRY_MS = { min: 300, max: 5000 };
 const TICK_MS = 1000;
-// Faces arrive all the time, also at rest. Without any, the network is down, which a socket reports after minutes. Ticks
-// are counted, because a busy page or one that was frozen receives late.
+// Faces arrive continuously, even at rest. If none arrives, the network is down, which the socket reports only after
+// minutes. Ticks are counted instead of time, because a busy or previously frozen page receives messages late.
 const MAX_SILENT_TICKS = 5;
 const [FAPS, SOUND, REST, SHAPES, REST_SHAPES] = [1, 2, 3, 4, 5]; // types of binary messages
 const HEADER_BYTES = 16;

@@ -17,7 +17,6 @@ from urllib.parse import quote
 from aiohttp import web
 
 from kouxing.services.gateway.uploads import audio_decoder
-from kouxing.services.gateway.uploads.audio_decoder import storage_error
 from kouxing.services.gateway.web.web_application import discard_body
 from kouxing.services.mouth_profiles import learning_process
 from kouxing.shared.errors import USER_ERROR, UserError
@@ -146,7 +145,7 @@ class AudioUploadHandler(UploadHandler):
             raise
         except OSError as error:
             await discard_body(request)
-            raise storage_error(error) from None
+            raise audio_decoder.storage_error(error) from None
 
     async def _decode_upload(self, folder: Path, request: web.Request) -> web.StreamResponse:
         name = _NOT_IN_NAMES.sub("_", request.query.get("name", ""))[-_MAX_NAME_CHARACTERS:].lstrip(

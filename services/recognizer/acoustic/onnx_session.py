@@ -5,8 +5,8 @@ thread can also keep a process from ending (onnxruntime-genai, pull request 2363
 
 Integer products are exact on every processor. By default, their partial sums overflow on x86
 processors without VNNI instructions (onnxruntime, issue 14642). In conversation, a third of the
-phones would then be wrong, instead of a fifth. The option that prevents it makes other processors
-a third slower.
+phones would then be wrong, instead of a fifth. The option that prevents this overflow slows down
+other processors by a third.
 """
 
 import os
