@@ -8,6 +8,7 @@ import socket
 from kouxing.shared.errors import UserError
 
 WILDCARDS = {"*", "0.0.0.0", "[::]"}  # noqa: S104 - compared, not bound
+_INTERNET = ("192.0.2.1", "2001:db8::1")  # any addresses that are reached over the default route
 _ENDPOINT = re.compile(
     r"tcp://(?P<host>\[[0-9a-fA-F:]{2,45}\]|\*|\w[\w.-]{0,189}):(?P<port>\d{1,5}|\*)", re.ASCII
 )
@@ -70,13 +71,13 @@ def with_host(endpoint: str, host: str) -> str:
     return f"tcp://{host}:{port}"
 
 
-def local_address(destination: str = "192.0.2.1") -> str:
+def local_address(destination: str = _INTERNET[0]) -> str:
     """Return the local address for connections to a host. Nothing is sent.
 
     Without a host, or if it cannot be reached, this is the address of the default route, or
     127.0.0.1 if there is no route.
     """
-    for host in dict.fromkeys((destination, "192.0.2.1")):
+    for host in dict.fromkeys((destination, *_INTERNET)):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect((host.strip("[]"), 9))

@@ -37,6 +37,14 @@ def test_a_failed_look_up_is_explained(error: Exception, reason: str) -> None:
     assert reason in explain_unreachable("lab", "7700", LIMIT_S, look_up=look_up)
 
 
+def test_a_name_with_only_ipv6_addresses_is_reported() -> None:
+    def look_up(*_: Any, **__: Any) -> list[tuple[Any, ...]]:
+        return [(socket.AF_INET6, socket.SOCK_STREAM, 0, "", ("fd77::1", 7700, 0, 0))]
+
+    reason = explain_unreachable("lab", "7700", LIMIT_S, is_zeromq=True, look_up=look_up)
+    assert "write its IPv6 address in brackets: [fd77::1]" in reason
+
+
 def test_all_addresses_of_a_host_are_tried() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))

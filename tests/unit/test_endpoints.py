@@ -5,6 +5,7 @@ from typing import Self
 import pytest
 from kouxing_client.field_types import MAX_ENDPOINT
 
+from kouxing.services.control.config import ControlConfig
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.settings.endpoints import local_address, with_key
 
@@ -48,6 +49,15 @@ def test_advertises_the_address_on_the_way_to_control(
     assert SynthesizerConfig(control=control).advertised_endpoint(bound) == advertised
     monkeypatch.setattr(Probe, "routes", {})
     assert local_address("10.77.0.1") == "127.0.0.1", "a host without network reaches itself"
+
+
+def test_control_on_a_host_without_ipv4_advertises_its_ipv6_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("socket.socket", Probe)
+    monkeypatch.setattr(Probe, "routes", {"2001:db8::1": "fd77::2"})
+    config = ControlConfig(control="tcp://[::]:5550", events="tcp://[::]:5551")
+    assert config.advertised_endpoint(config.events) == "tcp://[fd77::2]:5551"
 
 
 def test_the_longest_host_name_fits_into_a_message() -> None:

@@ -35,6 +35,12 @@ def explain_unreachable(
         )
     except OSError as error:
         return _reason_for(error)
+    families = {family for family, *_ in addresses}
+    if is_zeromq and ":" not in host and families == {socket.AF_INET6}:
+        return (
+            f"the host name {host!r} has no IPv4 address; write its IPv6 address in brackets:"
+            f" [{addresses[0][4][0]}]"
+        )
     reason = ""
     for family, kind, protocol, _, address in addresses:
         try:
