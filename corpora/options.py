@@ -13,7 +13,6 @@ OptionalClips = Annotated[Path | None, _CLIPS]
 Sounds = Annotated[list[Path], _SOUNDS]
 OptionalSounds = Annotated[list[Path] | None, _SOUNDS]
 EmotionalSpeech = Annotated[
-    Path,
-    typer.Option("--recordings", help="Folder of speech whose manifest names emotions."),
+    Path, typer.Option("--recordings", help="Folder of speech whose manifest names emotions.")
 ]
 Picture = Annotated[Path | None, typer.Option(help="Picture file (.png) to write.")]

@@ -9,24 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kouxing.corpora.options import (
-    Clips,
-    EmotionalSpeech,
-    OptionalClips,
-    OptionalSounds,
-    Picture,
-)
+from kouxing.corpora.options import Clips, EmotionalSpeech, OptionalClips, OptionalSounds, Picture
 from kouxing.evaluation.source_tree import SAMPLE
 from kouxing.evaluation.system.commands import attacks, faults
 from kouxing.evaluation.tables import figures_table, show_results
 from kouxing.services.cli.options import ACOUSTIC_MODEL
-from kouxing.shared.command.terminal import (
-    Force,
-    JsonFile,
-    check_output,
-    plural,
-    print_message,
-)
+from kouxing.shared.command.terminal import Force, JsonFile, check_output, plural, print_message
 from kouxing.shared.errors import UserError
 
 if TYPE_CHECKING:
@@ -163,11 +151,7 @@ def voice(
 
 
 @app.command(rich_help_panel=_SYSTEM)
-def face(
-    recordings: EmotionalSpeech,
-    json_file: JsonFile = None,
-    force: Force = False,
-) -> None:
+def face(recordings: EmotionalSpeech, json_file: JsonFile = None, force: Force = False) -> None:
     """Measure the motion of a face apart from its lips: emotion, nods, brows, blinks, stillness."""
     from kouxing.corpora.emotions import read_emotions
     from kouxing.evaluation.face_motion import measure_face
@@ -184,9 +168,7 @@ def _read_sounds(folders: list[Path] | None) -> list[Sound]:
     return read_sounds(folders or (), any_license=True)
 
 
-def _models(
-    names: list[str] | None,
-) -> Iterator[tuple[str, AcousticModel, OutputRuleConfig]]:
+def _models(names: list[str] | None) -> Iterator[tuple[str, AcousticModel, OutputRuleConfig]]:
     """Yield name, model and default output rule of each model."""
     from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_model
     from kouxing.services.recognizer.config import RecognizerConfig
@@ -241,10 +223,7 @@ def lips(
 
 @app.command(name="lips-package", rich_help_panel=_LIPS)
 def lips_package(
-    clips: Clips,
-    corpus: OptionalCorpus = None,
-    json_file: JsonFile = None,
-    force: Force = False,
+    clips: Clips, corpus: OptionalCorpus = None, json_file: JsonFile = None, force: Force = False
 ) -> None:
     """Compare the package kouxing-lips with the server: lips of clips, and phones of a corpus.
 
@@ -405,11 +384,7 @@ def schemes(
 
 
 @app.command(rich_help_panel=_LIPS)
-def ferguson(
-    clips: Clips,
-    json_file: JsonFile = None,
-    force: Force = False,
-) -> None:
+def ferguson(clips: Clips, json_file: JsonFile = None, force: Force = False) -> None:
     """Compare lip models with tracked lips at several speaking rates, as in Zhang et al. 2021."""
     from kouxing.evaluation.lips.speaking_rates import score_rates
     from kouxing.evaluation.report.paper_tables import ferguson_table
@@ -421,10 +396,7 @@ def ferguson(
 
 @app.command(rich_help_panel=_LIPS)
 def visemes(
-    clips: Clips,
-    picture: Picture = None,
-    json_file: JsonFile = None,
-    force: Force = False,
+    clips: Clips, picture: Picture = None, json_file: JsonFile = None, force: Force = False
 ) -> None:
     """Measure how well the visemes fit held-out lips, as in Wang & Cai 2003."""
     from kouxing.corpora.figures import save_figure

@@ -13,10 +13,7 @@ from kouxing.shared.command.terminal import Force, check_output
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-)
+app = typer.Typer(no_args_is_help=True, add_completion=False)
 
 _CORPORA = typer.Option("--corpus", help="Corpus folder or manifest; repeatable.")
 Corpora = Annotated[list[Path], _CORPORA]
@@ -271,12 +268,7 @@ def refined_encoder(
 
 
 @app.command()
-def visemes(
-    context: typer.Context,
-    clips: Clips,
-    output: Model,
-    force: Force = False,
-) -> None:
+def visemes(context: typer.Context, clips: Clips, output: Model, force: Force = False) -> None:
     """Train the parameters of the dynamic visemes (.json) on tracked lips."""
     from kouxing.training.visemes.recipe import train_visemes
 
@@ -285,12 +277,7 @@ def visemes(
 
 
 @app.command()
-def lips(
-    context: typer.Context,
-    clips: Clips,
-    output: Model,
-    force: Force = False,
-) -> None:
+def lips(context: typer.Context, clips: Clips, output: Model, force: Force = False) -> None:
     """Train the lip model learned (.npz) on tracked lips, and write its model card."""
     with _neural_training(output, force=force):
         from kouxing.training.lips.recipe import train_lips
@@ -300,11 +287,7 @@ def lips(
 
 @app.command()
 def ferguson(
-    context: typer.Context,
-    clips: Clips,
-    corpora: Corpora,
-    output: Model,
-    force: Force = False,
+    context: typer.Context, clips: Clips, corpora: Corpora, output: Model, force: Force = False
 ) -> None:
     """Train the lip model ferguson (.tsv): its openings, durations and influence factors."""
     from kouxing.training.ferguson.recipe import train_ferguson

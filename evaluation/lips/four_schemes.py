@@ -126,10 +126,7 @@ def recognize_all(
         outputs = {
             tested.name: RecognizerOutput(
                 analyze_recording(
-                    samples,
-                    recognize_recording(tested.model, samples),
-                    lips,
-                    is_text_known=False,
+                    samples, recognize_recording(tested.model, samples), lips, is_text_known=False
                 ),
                 live_events(tested.model, samples, lips, _DELAYS_S, tested.config),
                 tested.uses_paper_rule,

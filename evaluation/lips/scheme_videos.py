@@ -110,9 +110,7 @@ def _frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
 
 
 def _frames_with_mouth(
-    condition: Condition,
-    mouth_of: FapsFunction,
-    sentence: RecognizedSentence,
+    condition: Condition, mouth_of: FapsFunction, sentence: RecognizedSentence
 ) -> list[Frame]:
     """Replace the mouth of a condition's face; keep its blinks and head motion."""
     times_s, faps = zip(*_frames(condition, sentence), strict=True)

@@ -27,9 +27,7 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the video
 
 
 @app.command()
-def new(
-    folder: Folder,
-) -> None:
+def new(folder: Folder) -> None:
     """Create a study from videos named CONDITION/SENTENCE.mp4.
 
     A condition with the name reference is the hidden reference, and anchor is the low anchor.
@@ -37,10 +35,7 @@ def new(
     from kouxing.evaluation.mos.study import new_study
 
     study = new_study(folder)
-    sizes = (
-        plural(len(study.sentences), "sentence"),
-        plural(len(study.conditions), "condition"),
-    )
+    sizes = (plural(len(study.sentences), "sentence"), plural(len(study.conditions), "condition"))
     print_message(f"created a study of {' in '.join(sizes)}; next: kouxing mos serve {folder}")
 
 
@@ -68,11 +63,7 @@ def heads(
 
 
 @app.command()
-def serve(
-    folder: Folder,
-    config: ConfigFile = None,
-    assignments: Assignments = None,
-) -> None:
+def serve(folder: Folder, config: ConfigFile = None, assignments: Assignments = None) -> None:
     """Serve the page of a study until Ctrl-C, with the settings of the gateway."""
     import asyncio
 
@@ -95,11 +86,7 @@ def serve(
 
 
 @app.command()
-def report(
-    folder: Folder,
-    json_file: JsonFile = None,
-    force: Force = False,
-) -> None:
+def report(folder: Folder, json_file: JsonFile = None, force: Force = False) -> None:
     """Print mean opinion scores with 95 % confidence intervals, with and without outliers."""
     from kouxing.evaluation.mos.report import make_report, opinions_table
     from kouxing.evaluation.mos.store import read_answers

@@ -249,9 +249,7 @@ def score_live(model: AcousticModel, samples: Samples) -> list[tuple[float, list
 
 
 def recognize_live(
-    model: AcousticModel,
-    scored: Sequence[tuple[float, list[ScoreEvent]]],
-    rule: OutputRuleConfig,
+    model: AcousticModel, scored: Sequence[tuple[float, list[ScoreEvent]]], rule: OutputRuleConfig
 ) -> Recognition:
     """Decode the scores of ``score_live``, chunk by chunk."""
     decoder = LiveDecoder(model.topology, rule)

@@ -86,16 +86,8 @@ STEPS: Mapping[str, Step] = {
         ),
         (),
     ),
-    "lips": Step(
-        (_LIP_SCORES,),
-        _LIP_SCORES_CODE,
-        (_LIP_SCORES + " --condition clean",),
-    ),
-    "delay": Step(
-        (f"{_LIP_SCORES} --condition clean {_DELAYS}",),
-        _LIP_SCORES_CODE,
-        (),
-    ),
+    "lips": Step((_LIP_SCORES,), _LIP_SCORES_CODE, (_LIP_SCORES + " --condition clean",)),
+    "delay": Step((f"{_LIP_SCORES} --condition clean {_DELAYS}",), _LIP_SCORES_CODE, ()),
     "rivals": Step(
         (
             "evaluate rivals {rivals} --clips {lips}",
@@ -146,7 +138,6 @@ STEPS: Mapping[str, Step] = {
         (),
     ),
     "sizes": Step(
-        ("bench sizes",),
-        ("services/recognizer/models/*.npz", "evaluation/system/sizes.py"),
+        ("bench sizes",), ("services/recognizer/models/*.npz", "evaluation/system/sizes.py")
     ),
 }

@@ -106,11 +106,7 @@ def measure(path: Path, console: Console) -> list[AttackResult]:
 
 
 def _result(
-    system: LocalSystem,
-    name: str,
-    target: str,
-    source: str,
-    speech: NDArray[np.float32],
+    system: LocalSystem, name: str, target: str, source: str, speech: NDArray[np.float32]
 ) -> AttackResult:
     with connect_client(system.control) as client:
         services = client.status().services

@@ -43,10 +43,7 @@ app = typer.Typer(
 
 @app.command(name="latency")
 def measure_latency(
-    audio: AudioFile,
-    language: Language = None,
-    json_file: JsonFile = None,
-    force: Force = False,
+    audio: AudioFile, language: Language = None, json_file: JsonFile = None, force: Force = False
 ) -> None:
     """Measure latency, CPU time and frames per second of the whole pipeline on this machine.
 
@@ -68,10 +65,7 @@ def measure_latency(
 
 @app.command(name="lips-page")
 def lips_page(
-    audio: AudioFile,
-    clips: OptionalClips = None,
-    json_file: JsonFile = None,
-    force: Force = False,
+    audio: AudioFile, clips: OptionalClips = None, json_file: JsonFile = None, force: Force = False
 ) -> None:
     """Compare lip sync in the browser: kouxing-lips, HeadAudio, wLipSync, wawa-lipsync.
 
@@ -129,11 +123,7 @@ def load(
     steps = {str(step["num_asked"]): step for step in results["steps"]}
     summary = {"value": {"machine_load": figures.machine_load, **figures.summary}}
     show_results(
-        json_file,
-        results,
-        figures_table(steps),
-        system_table(load=results),
-        figures_table(summary),
+        json_file, results, figures_table(steps), system_table(load=results), figures_table(summary)
     )
     if picture is not None:
         save_figure(draw(figures), picture)
@@ -173,10 +163,7 @@ def busy(
     )
 
 
-def attacks(
-    json_file: JsonFile = None,
-    force: Force = False,
-) -> None:
+def attacks(json_file: JsonFile = None, force: Force = False) -> None:
     """Measure what attackers cost the services (memory) and other clients (delay)."""
     from kouxing.evaluation.report.system_tables import attacks_table
     from kouxing.evaluation.system.attacks import measure

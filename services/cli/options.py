@@ -32,8 +32,7 @@ def _find_language(name: str | None) -> str | None:
 HeadName = Annotated[
     str,
     typer.Option(
-        "--head",
-        help=f"Head: {', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz).",
+        "--head", help=f"Head: {', '.join(HEAD_NAMES)}, or an avatar (.glb, .gltf, .vrm or .npz)."
     ),
 ]
 AudioTrack = Annotated[

@@ -9,12 +9,7 @@ from kouxing.shared.fast_record import replace
 from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import CurrentFace
-from kouxing.shared.wire.session import (
-    OpenSession,
-    SessionMoved,
-    SessionOpened,
-    session_id_of,
-)
+from kouxing.shared.wire.session import OpenSession, SessionMoved, SessionOpened, session_id_of
 
 
 @dataclass(slots=True)

@@ -23,12 +23,7 @@ class StatusReporter:
         self._sessions = sessions
 
     def report(
-        self,
-        message: StatusRequest,
-        now_s: float,
-        *,
-        resting_face: FaceSettings,
-        shows_token: bool,
+        self, message: StatusRequest, now_s: float, *, resting_face: FaceSettings, shows_token: bool
     ) -> StatusReport:
         """Return one page, or the state of one session and its services.
 

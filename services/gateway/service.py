@@ -74,12 +74,7 @@ class GatewayService(SessionService):
         self._audio_client = AudioClient(self.control_endpoint, self.key, self.warn)
         self._sample = SampleSentence(self._audio_client)
         self._viewers = ViewerHandler(
-            self._web_sockets,
-            share,
-            self.metrics,
-            self._sample,
-            self._set_face,
-            self.waker.wake,
+            self._web_sockets, share, self.metrics, self._sample, self._set_face, self.waker.wake
         )
         self._microphones = MicrophoneHandler(self._web_sockets, share, self._audio_client)
         self._whip_handler = WhipHandler(

@@ -15,12 +15,7 @@ from urllib.parse import SplitResult, parse_qsl, quote, urlsplit, urlunsplit
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.live_link import LiveLinkConnection
 from kouxing.services.senders.osc import OscConnection
-from kouxing.services.senders.target import (
-    Target,
-    TrackerPortError,
-    is_host,
-    parse_delay_s,
-)
+from kouxing.services.senders.target import Target, TrackerPortError, is_host, parse_delay_s
 from kouxing.services.senders.vmc import VmcConnection
 from kouxing.services.senders.vtube_studio import VTubeStudioConnection
 from kouxing.shared.errors import UserError

@@ -41,20 +41,10 @@ from kouxing.shared.service.overload import CATCH_UP_S, MAX_LATE_FOR_S
 from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.settings.endpoints import key_of
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
-from kouxing.shared.wire.events import (
-    SpeechMessage,
-    is_state_report,
-    message_to_event,
-    split_batch,
-)
+from kouxing.shared.wire.events import SpeechMessage, is_state_report, message_to_event, split_batch
 from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.session import ErrorCode, FlushSession
-from kouxing.shared.wire.speech import (
-    AudioState,
-    NewestFrame,
-    Progress,
-    Results,
-)
+from kouxing.shared.wire.speech import AudioState, NewestFrame, Progress, Results
 
 MAX_BURST_S = 0.06  # frames of one session at a time, so that a gap does not delay other sessions
 MAX_QUEUED_EVENTS = 200  # events of a session; the recognizer resends later ones
@@ -101,11 +91,7 @@ class SynthesizerService(SessionService):
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
             session = SynthesizerSession(
-                start,
-                self._face_maker.make(start),
-                self._input,
-                self._faps,
-                self._config.max_lag_s,
+                start, self._face_maker.make(start), self._input, self._faps, self._config.max_lag_s
             )
             self._sessions[start.session] = session
         session.start = start

@@ -58,11 +58,7 @@ class AudioSource:
 
 
 def open_audio(
-    path: Path,
-    block_s: float = BLOCK_S,
-    *,
-    track: int | None = None,
-    raw: RawFormat | None = None,
+    path: Path, block_s: float = BLOCK_S, *, track: int | None = None, raw: RawFormat | None = None
 ) -> AudioSource:
     """Open an audio file, the audio of a video, or a pipe, for reading block by block.
 

@@ -143,9 +143,7 @@ def write_json(path: Path | None, results: object) -> None:
 
 
 def check_output(
-    *outputs: Path | Sequence[Path] | None,
-    inputs: Iterable[Path | None] = (),
-    force: bool = False,
+    *outputs: Path | Sequence[Path] | None, inputs: Iterable[Path | None] = (), force: bool = False
 ) -> None:
     """Check that output files can be written. Call this before long work; None is skipped.
 

@@ -86,10 +86,7 @@ class Bus:
         return self._bind(zmq.ROUTER, endpoint, key, limits)
 
     def bind_publisher(
-        self,
-        endpoint: str,
-        key: str,
-        on_subscribe: OnSubscribe | None = None,
+        self, endpoint: str, key: str, on_subscribe: OnSubscribe | None = None
     ) -> Socket:
         """Bind a socket that many peers subscribe to.
 

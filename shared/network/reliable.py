@@ -84,10 +84,7 @@ class ReliableReceiver:
     """
 
     def __init__(
-        self,
-        socket: Socket,
-        session: str,
-        make_acknowledgement: Callable[[], Acknowledge],
+        self, socket: Socket, session: str, make_acknowledgement: Callable[[], Acknowledge]
     ) -> None:
         self._socket = socket
         self._session = session

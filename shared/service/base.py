@@ -35,12 +35,7 @@ from kouxing.shared.service.service_kind import ServiceKind
 from kouxing.shared.settings.config import ServiceConfig
 from kouxing.shared.settings.endpoints import is_loopback, split_endpoint, with_key
 from kouxing.shared.settings.keys import Grant, load_key, rejection_hint, save_grants
-from kouxing.shared.wire.control import (
-    AllowedKey,
-    Heartbeat,
-    HeartbeatReply,
-    SessionProgress,
-)
+from kouxing.shared.wire.control import AllowedKey, Heartbeat, HeartbeatReply, SessionProgress
 from kouxing.shared.wire.session import Error
 
 if TYPE_CHECKING:
@@ -124,10 +119,7 @@ class Service(MessageLoop):
 
     def control_handlers(self) -> dict[type[Message], Handler]:
         """Return the handlers of control's messages; subclasses add theirs."""
-        return {
-            HeartbeatReply: self.on_heartbeat_reply,
-            Error: self.on_error,
-        }
+        return {HeartbeatReply: self.on_heartbeat_reply, Error: self.on_error}
 
     def session_progress(self) -> dict[str, SessionProgress]:
         """Return the input progress of each session."""

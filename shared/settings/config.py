@@ -120,9 +120,7 @@ def _check_metrics(value: str) -> str:
 Endpoint = Annotated[str, Check(_check_endpoint), ValueHint("an endpoint, tcp://HOST:PORT")]
 BoundEndpoint = Annotated[Endpoint, BindAddress.ENDPOINT]
 Host = Annotated[
-    str,
-    Check(_check_host),
-    ValueHint("a host name of at most 190 characters, or an address"),
+    str, Check(_check_host), ValueHint("a host name of at most 190 characters, or an address")
 ]
 BoundHost = Annotated[Host, BindAddress.HOST]
 BoundPort = Annotated[int, Meta(ge=0, le=65535), BindAddress.PORT]

@@ -29,10 +29,7 @@ from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.acoustic.model_file import (
-    Archive,
-    parse_topology,
-)
+from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, count_frames
 from kouxing.shared.audio.pcm import as_floats, as_integers

@@ -24,12 +24,7 @@ from scipy.optimize import lsq_linear
 
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, openings_of, read_clips
-from kouxing.corpora.speech_corpus import (
-    RowErrors,
-    Utterance,
-    read_corpus,
-    syllables_of,
-)
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.slices import measure_slices

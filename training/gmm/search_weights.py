@@ -49,11 +49,7 @@ def choose_search_weights(
     """
     try:
         dev = load_examples(
-            corpora,
-            RowErrors(),
-            model.inventory,
-            split="dev",
-            any_license=any_license,
+            corpora, RowErrors(), model.inventory, split="dev", any_license=any_license
         )
     except UserError:
         print_message("no dev recordings; acoustic scale and phone penalty keep their defaults")

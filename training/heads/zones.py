@@ -133,11 +133,7 @@ class FaceFields:
     """
 
     def __init__(
-        self,
-        skin: Skin,
-        cavity: NDArray[np.bool_],
-        blink: list[Float],
-        squint: list[Float],
+        self, skin: Skin, cavity: NDArray[np.bool_], blink: list[Float], squint: list[Float]
     ) -> None:
         self.skin = skin
         self.cavity = cavity

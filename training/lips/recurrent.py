@@ -84,11 +84,7 @@ class SpeechExample:
 
 
 def train_network(
-    examples: Sequence[SpeechExample],
-    *,
-    num_epochs: int,
-    seed: int,
-    both_ways: bool = False,
+    examples: Sequence[SpeechExample], *, num_epochs: int, seed: int, both_ways: bool = False
 ) -> tuple[LipNetwork, list[float]]:
     """Train; return the network and the mean loss of each epoch.
 

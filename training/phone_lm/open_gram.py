@@ -59,10 +59,7 @@ class _Level:
 
 
 def draw_phones(
-    folder: Path,
-    inventory: PhoneInventory,
-    *,
-    num_words: int = 30_000_000,
+    folder: Path, inventory: PhoneInventory, *, num_words: int = 30_000_000
 ) -> PhoneStream:
     """Draw about ``num_words`` words; return their phones, with pauses between sentences.
 

@@ -92,10 +92,7 @@ def train_universal(
     universal = replace(
         model,
         topology=replace(
-            topology,
-            lm_scale=_LM_SCALE,
-            phone_penalty=_PHONE_PENALTY,
-            rate_weight=_RATE_WEIGHT,
+            topology, lm_scale=_LM_SCALE, phone_penalty=_PHONE_PENALTY, rate_weight=_RATE_WEIGHT
         ),
         network=np.concatenate([model.network, extension]),
         log_prior=log_prior,

@@ -6,12 +6,7 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from kouxing_client.base import (
-    LAST_ANSWER_S,
-    BaseClient,
-    BaseResults,
-    BaseSession,
-)
+from kouxing_client.base import LAST_ANSWER_S, BaseClient, BaseResults, BaseSession
 from kouxing_client.errors import Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
 from kouxing_client.options import FaceSettings, SessionOptions, face_fields, open_fields

@@ -8,12 +8,7 @@ from concurrent.futures import TimeoutError as FutureTimeout
 from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from kouxing_client.base import (
-    LAST_ANSWER_S,
-    BaseClient,
-    BaseResults,
-    BaseSession,
-)
+from kouxing_client.base import LAST_ANSWER_S, BaseClient, BaseResults, BaseSession
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
 from kouxing_client.options import FaceSettings, SessionOptions, face_fields, open_fields

@@ -179,12 +179,7 @@ class SessionCore:
     """
 
     def __init__(
-        self,
-        sockets: Sockets,
-        opened: Fields,
-        options: Fields | None,
-        *,
-        is_paced: bool,
+        self, sockets: Sockets, opened: Fields, options: Fields | None, *, is_paced: bool
     ) -> None:
         self.sockets = sockets
         self.endpoints = opened

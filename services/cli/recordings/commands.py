@@ -47,8 +47,7 @@ Outputs = Annotated[
     ),
 ]
 Acoustic = Annotated[
-    str | None,
-    typer.Option(help=f"{ACOUSTIC_MODEL}. Default: the model of the language."),
+    str | None, typer.Option(help=f"{ACOUSTIC_MODEL}. Default: the model of the language.")
 ]
 
 

@@ -199,8 +199,7 @@ def send(
     targets: Annotated[
         list[str],
         typer.Argument(
-            metavar="URL",
-            help="Addresses of programs that show the face, such as vmc://HOST:PORT.",
+            metavar="URL", help="Addresses of programs that show the face, such as vmc://HOST:PORT."
         ),
     ],
     session: Annotated[

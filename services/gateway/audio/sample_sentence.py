@@ -72,9 +72,7 @@ class SampleSentence:
     async def _speak(self, name: str) -> None:
         source = open_audio(SAMPLE_FILE)
         async with self._audio_client.open(
-            session=name,
-            sample_rate_hz=source.sample_rate_hz,
-            num_channels=source.num_channels,
+            session=name, sample_rate_hz=source.sample_rate_hz, num_channels=source.num_channels
         ) as session:
             try:
                 await self._stream(source, session)

@@ -125,11 +125,7 @@ class OpenWebSockets:
 
 
 def make_application(
-    *,
-    head: str,
-    routes: Collection[web.RouteDef],
-    access: AccessPolicy,
-    frame_ancestors: str = "",
+    *, head: str, routes: Collection[web.RouteDef], access: AccessPolicy, frame_ancestors: str = ""
 ) -> web.Application:
     """Return the web application.
 

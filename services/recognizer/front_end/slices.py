@@ -78,8 +78,7 @@ class SliceMeter:
 
 
 def measure_slices(
-    samples: NDArray[np.float32],
-    with_progress: Callable[[Sequence[int]], Iterable[int]] = iter,
+    samples: NDArray[np.float32], with_progress: Callable[[Sequence[int]], Iterable[int]] = iter
 ) -> list[Progress]:
     """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does.
 

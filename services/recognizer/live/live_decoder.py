@@ -23,10 +23,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     empty_scores,
 )
 from kouxing.services.recognizer.front_end.features import frame_time_s
-from kouxing.services.recognizer.live.speech_scorer import (
-    FrameScores,
-    ScoreEvent,
-)
+from kouxing.services.recognizer.live.speech_scorer import FrameScores, ScoreEvent
 from kouxing.services.recognizer.live.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.services.recognizer.search.decoder import Decoder, PathSegment
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig

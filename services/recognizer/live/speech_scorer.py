@@ -31,13 +31,7 @@ from kouxing.services.recognizer.live.speech_segmenter import (
     SpeechStart,
 )
 from kouxing.shared.fast_record import Record, replace
-from kouxing.shared.phones.events import (
-    AudioSkipped,
-    EndOfSound,
-    LipPositions,
-    Progress,
-    Waveform,
-)
+from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Progress, Waveform
 
 
 class FrameScores(Record, frozen=True):

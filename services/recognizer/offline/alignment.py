@@ -113,10 +113,7 @@ def align_syllables(
 
 
 def _score_recording(
-    model: AcousticModel,
-    samples: NDArray[np.float32],
-    num_frames: int,
-    with_progress: WithProgress,
+    model: AcousticModel, samples: NDArray[np.float32], num_frames: int, with_progress: WithProgress
 ) -> Floats:
     """Score a recording second by second; return the scores of all frames, (frames, states)."""
     front_end, stream = model.create_front_end(), model.create_stream()
@@ -142,11 +139,7 @@ def _best_phone_scores(scores: Floats, topology: Topology) -> Floats:
 
 
 def _fit(
-    graph: UtteranceGraph,
-    path: NDArray[np.int64],
-    scores: Floats,
-    topology: Topology,
-    silence: int,
+    graph: UtteranceGraph, path: NDArray[np.int64], scores: Floats, topology: Topology, silence: int
 ) -> float:
     """Compare a path's states with the best phone of each frame.
 

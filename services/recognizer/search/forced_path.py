@@ -44,11 +44,7 @@ class UtteranceGraph:
 
 
 def build_utterance_graph(
-    phones: Sequence[int],
-    syllables: Sequence[int],
-    first_state: NDArray[np.int64],
-    *,
-    silence: int,
+    phones: Sequence[int], syllables: Sequence[int], first_state: NDArray[np.int64], *, silence: int
 ) -> UtteranceGraph:
     """Lay out the states of an utterance, with an optional pause at each syllable boundary.
 

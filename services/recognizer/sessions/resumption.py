@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 from kouxing.services.recognizer.live.live_decoder import StreamOutput
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.fast_record import replace
-from kouxing.shared.phones.events import (
-    LipPositions,
-    Phone,
-    Progress,
-    SpeechChange,
-    Waveform,
-)
+from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange, Waveform
 from kouxing.shared.phones.inventory import SILENCE
 from kouxing.shared.wire import speech
 from kouxing.shared.wire.final_time import FinalTimeTracker

@@ -86,13 +86,7 @@ def log_weights(
     before = timeline.apex_start_s[:, None, None] + sequence.offset_s - time
     after = timeline.apex_end_s[:, None, None] + sequence.offset_s - time
     tau = np.maximum(before, 0.0) + np.minimum(after, 0.0)  # (E, F, P)
-    spoken = log_dominance(
-        tau,
-        sequence.log_alpha,
-        sequence.theta_minus,
-        sequence.theta_plus,
-        c,
-    )
+    spoken = log_dominance(tau, sequence.log_alpha, sequence.theta_minus, sequence.theta_plus, c)
     edges_s = np.array([timeline.silence_start_s, timeline.silence_end_s])[..., None, None]
     inside_s = edges_s + p.silence_offset_s - time  # (2, S, F, P)
     inside_s[1] *= -1.0  # speech follows this edge
