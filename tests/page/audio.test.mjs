@@ -145,6 +145,18 @@ test("chunks are dropped and reported while the network is too slow", () => {
   assert.deepEqual(socket.sent.slice(4), [{ skip: 640 }, 640], "a busy page sent them too late");
 });
 
+test("a network that accepts nothing for 5 s is down; a slow one is not", () => {
+  const socket = new FakeSocket();
+  const uplink = new AudioUplink(socket, 16000);
+  for (let ms = 20; ms <= 5060; ms += 20) {
+    socket.bufferedAmount = ms === 40 ? 0 : 1 << 20;
+    uplink.send(ms, ms, new Int16Array(320));
+    assert.ok(!uplink.isDown(ms), `after ${ms} ms`);
+  }
+  uplink.send(5080, 5080, new Int16Array(320));
+  assert.ok(uplink.isDown(5080));
+});
+
 test("the age of sound counts from its recording, even if chunks are late", () => {
   const uplink = new AudioUplink(new FakeSocket(), 48000);
   assert.equal(uplink.ageMs(0, 0), null);

@@ -142,6 +142,29 @@ test("a file continues in another session if the connection is interrupted", asy
   assert.equal(states.at(-1), "off");
 });
 
+test("a microphone reconnects if its network is down, although the socket does not report it", async (t) => {
+  const port = {};
+  globalThis.AudioWorkletNode = class {
+    port = port;
+  };
+  const { microphone, states } = makeMicrophone();
+  await microphone.start();
+  const dead = FakeWebSocket.newest;
+  dead.openSession("first");
+  dead.bufferedAmount = 1 << 20;
+  let nowMs = 0;
+  t.mock.method(performance, "now", () => nowMs);
+  for (; nowMs <= 6000 && states.at(-1) === "on"; nowMs += 20) {
+    port.onmessage({ data: { chunk: new Int16Array(960), rms: 0, recordedMs: Date.now() } });
+  }
+  assert.equal(states.at(-1), "interrupted");
+  assert.equal(dead.readyState, 3);
+  t.mock.timers.tick(500);
+  FakeWebSocket.newest.openSession("second");
+  dead.onclose();
+  assert.equal(states.at(-1), "on");
+});
+
 test("the browser's reason has no period of its own", async () => {
   navigator.mediaDevices.getUserMedia = async () => {
     throw new Error("The object can not be found here.");

@@ -102,8 +102,18 @@ export class Microphone {
   #capture({ context, stream }) {
     capture(context, stream, (chunk, rms, recordedMs) => {
       this.#handlers.level(rms);
-      this.#uplink?.send(performance.now(), recordedMs, chunk);
+      if (this.#uplink !== null) this.#send(performance.now(), recordedMs, chunk);
     });
+  }
+
+  /** Send a chunk. Reconnect if the network is down, which the socket reports only after minutes. */
+  #send(nowMs, recordedMs, chunk) {
+    this.#uplink.send(nowMs, recordedMs, chunk);
+    if (!this.#uplink.isDown(nowMs)) return;
+    const socket = this.#socket;
+    this.#socket = null;
+    socket.close();
+    this.#onClosed(null);
   }
 
   stop() {
