@@ -4,6 +4,7 @@ import assert from "node:assert/strict";
 import test from "node:test";
 
 const elements = {};
+let trackerFrame = null; // the newest frame of a face tracker
 let focused = null; // step of the section that has the focus
 const sections = ["intro", "reading", "learning", "result", "problem"].map((step) => ({
   dataset: { step },
@@ -21,13 +22,15 @@ const makeElement = () => ({
     this.open = true;
   },
   play: async () => {},
+  requestVideoFrameCallback() {},
 });
 globalThis.document = {
   documentElement: { lang: "en" },
   body: { append() {} },
-  createElement: () => ({ remove() {} }),
+  createElement: () => (trackerFrame = { contentWindow: {}, remove() {} }),
   getElementById: (id) => (elements[id] ??= makeElement()),
 };
+const { translate } = await import("../../services/gateway/page/language.js");
 const { LearnMouthDialog } = await import("../../services/gateway/page/learn-mouth.js");
 
 /** Open the dialog and start a recording; return the dialog element and allow(), which grants the camera. */
@@ -42,7 +45,8 @@ function startRecording() {
     audioWorklet = { addModule: async () => {} };
     async close() {}
   };
-  globalThis.addEventListener = globalThis.removeEventListener = () => {};
+  globalThis.addEventListener = (_, receive) => (trackerFrame.receive = receive);
+  globalThis.removeEventListener = () => {};
   const dialog = new LearnMouthDialog({ current: null }, { opened() {}, closed() {}, profileChanged() {} });
   dialog.open();
   elements["learn-start"].onclick();
@@ -73,6 +77,21 @@ test("a dialog that is closed while the tracker loads turns the camera off at on
   assert.ok(camera.isOn);
   dialog.close();
   assert.ok(!camera.isOn);
+});
+
+test("a recording ends with the reason if the page is hidden, because its camera then takes no images", async () => {
+  const { allow } = startRecording();
+  const { camera, stream } = makeCamera();
+  allow(stream);
+  await settle();
+  trackerFrame.receive({ source: trackerFrame.contentWindow, data: { lips: [] } });
+  await settle();
+  globalThis.document.hidden = true;
+  globalThis.document.onvisibilitychange();
+  await settle();
+  assert.equal(elements["learn-problem"].textContent, translate("learnHidden"));
+  assert.ok(!camera.isOn);
+  assert.equal(globalThis.document.onvisibilitychange, null);
 });
 
 test("the focus moves to the step that is shown", () => {

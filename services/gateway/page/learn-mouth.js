@@ -123,6 +123,7 @@ export class LearnMouthDialog {
     let stream = null;
     let context = null;
     const stop = () => {
+      document.onvisibilitychange = null;
       for (const track of stream?.getTracks() ?? []) track.stop();
       if (context?.state !== "closed") context?.close();
     };
@@ -183,7 +184,10 @@ export class LearnMouthDialog {
         resolve({});
       };
       signal.addEventListener("abort", this.#finish);
-      for (const track of stream.getTracks()) track.onended = () => reject(new UserError(translate("cameraUnplugged")));
+      const fail = (text) => reject(new UserError(translate(text)));
+      for (const track of stream.getTracks()) track.onended = () => fail("cameraUnplugged");
+      // browsers take no images of a camera for a hidden page
+      document.onvisibilitychange = () => document.hidden && fail("learnHidden");
     });
     const take = (previousMs) => nextImage(video, this.#isSlow ? { previousMs, ...SLOW_IMAGE } : {});
     let next = take();

@@ -278,6 +278,10 @@ export const TEXTS = {
     zh: "摄像头或麦克风被其他程序占用。请关闭后重试。",
   },
   cameraUnplugged: { en: "The camera or the microphone was unplugged. Plug it in and try again.", zh: "摄像头或麦克风断开了。请接上后重试。" },
+  learnHidden: {
+    en: "The recording stopped because this page was hidden. Keep the page in front while you read, and try again.",
+    zh: "页面被隐藏，录制已停止。朗读时请让本页保持在最前面，然后重试。",
+  },
   trackerFailed: {
     en: "Face tracking does not work in this browser: {reason}. Use a current version of Chrome, Edge or Firefox.",
     zh: "此浏览器无法跟踪面部：{reason}。请用最新版的 Chrome、Edge 或 Firefox。",
