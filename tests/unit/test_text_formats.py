@@ -213,7 +213,7 @@ def test_words_in_brackets_are_text(text: str) -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["[S1]", "[uv_break]", "[laugh_0]", "[laughs harder]", "[/emphasis]", "[clears throat]"],
+    ["[S1]", "[uv_break]", "[laugh_0]", "[laughs harder]", "[/emphasis]", "[mischievously]"],
 )
 def test_commands_of_synthesizers_are_not_text(command: str) -> None:
     spoken, name = extract_text(f"Hello {command} world")

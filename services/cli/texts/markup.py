@@ -11,6 +11,8 @@ _COMMANDS = (
     "laugh|laughs|laughing|laughter|chuckles|giggles|sigh|sighs|cough|gasps|sobs|crying|wheezing"
     "|snorts|clears|starts|whispers|whispering|breath|quick_breath|inhales|exhales|hissing|clucking"
     "|lipsmack|noise|vocalized-noise|music|accent|mn|angry|curious|excited|happy|sad|sarcastic"
+    "|angrily|calmly|cheerfully|curiously|dramatically|excitedly|gently|happily|hesitantly|loudly"
+    "|mischievously|nervously|playfully|quickly|quietly|sadly|sarcastically|slowly|softly"
     "|pause|silence|break|uv_break|lbreak|oral|speed|emphasis|strong|spk_emb|[SEP]tts|S[1-9]"
 )
 COMMAND = re.compile(  # [laughter], [pause:500], [S1], <#0.5#>, <|zh|>, and prosody: #1 to #4
