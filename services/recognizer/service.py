@@ -226,12 +226,13 @@ class RecognizerService(SessionService):
         return now_s + SESSION_TICK_S if self._sessions else self._free_memory_at_s
 
     def _report_stalled(self, now_s: float) -> None:
-        """Report stalled live clients to their synthesizers."""
+        """Report stalled live clients to their synthesizers, once their audio is decoded."""
         tick_s, self._last_stall_check_s = min(now_s - self._last_stall_check_s, MAX_TICK_S), now_s
-        if self._has_live_audio or self._audio.wait(0.0):
+        if self._audio.wait(0.0):
             return
         for session in self._sessions.values():
-            session.check_stalled(tick_s, now_s)
+            if not session.is_decoding:
+                session.check_stalled(tick_s, now_s)
 
     def on_drain(self) -> bool:
         """Hand sessions over to other recognizers; finish the remaining ones."""
