@@ -217,18 +217,10 @@ def encoder(
     the run is stored next to the output, and deleted at the end.
     """
     with _neural_training(output, force=force):
-        from kouxing.training.encoder.recipe import train_encoder
+        from kouxing.training.encoder.recipe import read_sources, train_encoder
 
-    train_encoder(
-        corpora,
-        output,
-        whisper=whisper,
-        clips=clips,
-        untranscribed=untranscribed or [],
-        sounds=sounds,
-        num_steps=steps,
-        any_license=context.obj,
-    )
+    sources = read_sources(corpora, clips, untranscribed or [], sounds, any_license=context.obj)
+    train_encoder(sources, output, whisper=whisper, num_steps=steps)
 
 
 @app.command()
@@ -253,18 +245,10 @@ def refined_encoder(
     the run is stored next to the output, and deleted at the end.
     """
     with _neural_training(output, force=force):
-        from kouxing.training.encoder.recipe import refine_encoder
+        from kouxing.training.encoder.recipe import read_sources, refine_encoder
 
-    refine_encoder(
-        corpora,
-        output,
-        start=start_from,
-        clips=clips,
-        untranscribed=untranscribed or [],
-        sounds=sounds,
-        num_steps=steps,
-        any_license=context.obj,
-    )
+    sources = read_sources(corpora, clips, untranscribed or [], sounds, any_license=context.obj)
+    refine_encoder(sources, output, start=start_from, num_steps=steps)
 
 
 @app.command()

@@ -19,7 +19,7 @@ from kouxing.training.encoder import batches, lip_teacher, recipe, targets, trai
 from kouxing.training.encoder.batches import BatchSource, draw_batch, draw_excerpts, network_inputs
 from kouxing.training.encoder.export import export_onnx, rebuild_encoder, save_encoder
 from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
-from kouxing.training.encoder.recipe import refine_encoder, train_encoder
+from kouxing.training.encoder.recipe import read_sources, refine_encoder, train_encoder
 from kouxing.training.encoder.refinement import imitation_loss, refine
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, SourceRecording, TargetColumns
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
@@ -130,15 +130,11 @@ def test_trains_resumes_and_writes_a_model(
     write_training_clip(clips, clip_name_for("choice"), "berta", "MIT")
     output = tmp_path / "encoder.npz"
     sounds = [write_noises(tmp_path / "sounds")]
-    train = partial(
-        train_encoder,
-        [corpus],
-        output,
-        whisper=whisper,
-        clips=clips,
-        sounds=sounds,
-        any_license=False,
-    )
+
+    def train(untranscribed: list[Path], num_steps: int) -> None:
+        sources = read_sources([corpus], clips, untranscribed, sounds, any_license=False)
+        train_encoder(sources, output, whisper=whisper, num_steps=num_steps)
+
     with monkeypatch.context() as patch:
         patch.setattr(recipe, "save_encoder", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -223,16 +219,14 @@ def test_refines_resumes_and_writes_a_model(
     clips = tmp_path / "clips"
     clips.mkdir()
     write_training_clip(clips, clip_name_for("train"), "anna", "CC0")
-    train = partial(
-        refine_encoder,
+    sources = read_sources(
         [write_speech(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})],
-        output,
-        start=start,
-        clips=clips,
-        untranscribed=[],
-        sounds=[write_noises(tmp_path / "sounds")],
+        clips,
+        [],
+        [write_noises(tmp_path / "sounds")],
         any_license=False,
     )
+    train = partial(refine_encoder, sources, output, start=start)
     with monkeypatch.context() as patch:
         patch.setattr(recipe, "save_encoder", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -245,18 +239,7 @@ def test_refines_resumes_and_writes_a_model(
 
 
 @pytest.mark.parametrize(("name", "problem"), [("a", "no music or noise"), ("d", "no usable rec")])
-def test_training_needs_speech_and_sounds(
-    tmp_path: Path, whisper: Path, name: str, problem: str
-) -> None:
+def test_training_needs_speech_and_sounds(tmp_path: Path, name: str, problem: str) -> None:
     corpus = write_speech(tmp_path / "corpus", {name: HELLO})
     with pytest.raises(UserError, match=problem):
-        train_encoder(
-            [corpus],
-            tmp_path / "encoder.npz",
-            whisper=whisper,
-            clips=tmp_path,
-            untranscribed=[],
-            sounds=[],
-            num_steps=1,
-            any_license=False,
-        )
+        read_sources([corpus], tmp_path, [], [], any_license=False)

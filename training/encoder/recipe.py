@@ -69,26 +69,24 @@ def load_teachers(whisper: Path) -> tuple[Teachers, PhoneInventory]:
     return Teachers(blocks, whisper), blocks.inventory
 
 
-def train_encoder(
-    corpora: Sequence[Path],
-    output: Path,
-    *,
-    whisper: Path,
-    clips: Path,
-    untranscribed: Sequence[Path],
-    sounds: Sequence[Path],
-    num_steps: int,
-    any_license: bool,
-) -> None:
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """What an audio encoder is trained on."""
+
+    utterances: Sequence[Utterance]
+    num_untranscribed: int  # folders of speech without text
+    clips: Sequence[LipClip]
+    recordings: Sequence[SourceRecording]  # all speech, and other sounds of a voice
+    backgrounds: Sequence[Samples]
+    errors: RowErrors
+
+
+def train_encoder(sources: Sources, output: Path, *, whisper: Path, num_steps: int) -> None:
     """Train the audio encoder, and write it with its model card.
 
-    The arguments are the options of ``kouxing train encoder``. Raises ``UserError`` if there is
-    nothing to train on, or a file cannot be read.
+    ``whisper`` is the folder of Whisper's model. Raises ``UserError`` if a file cannot be read.
     """
     teachers, inventory = load_teachers(whisper)
-    sources = _read_sources(
-        corpora, clips, untranscribed, sounds, inventory, any_license=any_license
-    )
     folder, checkpoint = (output.with_suffix(end) for end in (".targets", ".checkpoint.pt"))
     folder.mkdir(parents=True, exist_ok=True)
     lip_teacher = _load_lip_teacher(folder / "lip_teacher.pt", sources.clips, teachers)
@@ -103,27 +101,12 @@ def train_encoder(
     shutil.rmtree(folder)
 
 
-def refine_encoder(
-    corpora: Sequence[Path],
-    output: Path,
-    *,
-    start: Path,
-    clips: Path,
-    untranscribed: Sequence[Path],
-    sounds: Sequence[Path],
-    num_steps: int,
-    any_license: bool,
-) -> None:
-    """Refine an audio encoder with more disturbances, and write it with its model card.
+def refine_encoder(sources: Sources, output: Path, *, start: Path, num_steps: int) -> None:
+    """Refine the audio encoder ``start`` with more disturbances, and write it with its model card.
 
-    The arguments are the options of ``kouxing train refined-encoder``. Raises ``UserError`` if
-    there is nothing to train on, or a file cannot be read.
+    Raises ``UserError`` if a file cannot be read.
     """
     torch.set_num_threads(1)  # reproducible sums on every machine
-    inventory = load_inventory(DEFAULT_LANGUAGE)
-    sources = _read_sources(
-        corpora, clips, untranscribed, sounds, inventory, any_license=any_license
-    )
     recordings, checkpoint = (output.with_suffix(end) for end in (".samples.npz", ".checkpoint.pt"))
     refined = refine(
         rebuild_encoder(start),
@@ -140,27 +123,16 @@ def refine_encoder(
         path.unlink()
 
 
-@dataclass(frozen=True, slots=True)
-class _Sources:
-    utterances: Sequence[Utterance]
-    num_untranscribed: int  # folders of speech without text
-    clips: Sequence[LipClip]
-    recordings: Sequence[SourceRecording]  # all speech, and other sounds of a voice
-    backgrounds: Sequence[Samples]
-    errors: RowErrors
-
-
-def _read_sources(
+def read_sources(
     corpora: Sequence[Path],
     clips: Path,
     untranscribed: Sequence[Path],
     sounds: Sequence[Path],
-    inventory: PhoneInventory,
     *,
     any_license: bool,
-) -> _Sources:
+) -> Sources:
     """Find what to train on; raises ``UserError`` if there is no speech, clip or background."""
-    errors = RowErrors()
+    errors, inventory = RowErrors(), load_inventory(DEFAULT_LANGUAGE)
     utterances = [
         utterance
         for corpus in corpora
@@ -194,11 +166,11 @@ def _read_sources(
         raise no_clip_error(clips)
     paths = [clips / f"{clip.name}.flac" for clip in filmed]
     recordings = [*_speech_of(utterances, untranscribed, paths), *others]
-    return _Sources(utterances, len(untranscribed), filmed, recordings, backgrounds, errors)
+    return Sources(utterances, len(untranscribed), filmed, recordings, backgrounds, errors)
 
 
 def _write_model(
-    output: Path, encoder: AudioEncoder, teacher: str, num_steps: int, sources: _Sources
+    output: Path, encoder: AudioEncoder, teacher: str, num_steps: int, sources: Sources
 ) -> None:
     """Write the model with its card, and report the recordings that could not be used."""
     save_encoder(output, encoder)
