@@ -36,6 +36,7 @@ LABEL = (  # times of Audacity or CTM, or the name of a recording
 )
 SPEAKER = (  # number of a speaker, such as SPEAKER_00: or 说话人 1：
     rf"[ \t]*(?:[A-Za-z]+[ _]?|(?:说话人|說話人|发言人|發言人)[ ]?)\d+(?:[ \t]+{CLOCK})?[ \t]*[:：]"
+    r"(?!\d\d(?!\d))"  # PM 3:30 is a time
 )
 _STRING = re.compile(r'"((?:[^"]|"")*)"')
 _CHINESE = re.compile("[〇\u3400-\u9fff]")
