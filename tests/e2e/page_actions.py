@@ -33,8 +33,8 @@ A_FACE, B_FACE = face(A_VALUES), face(B_VALUES)
 
 
 def write_tone(path: Path) -> None:
-    """Write a second of a pulsed 300 Hz tone, which no noise suppression removes."""
-    time_s = np.arange(48000) / 48000
+    """Write three seconds of a pulsed 300 Hz tone, which no noise suppression removes."""
+    time_s = np.arange(3 * 48000) / 48000
     tone = 0.4 * np.sin(2 * np.pi * 300 * time_s) * (np.sin(2 * np.pi * 2 * time_s) > 0)
     soundfile.write(path, tone, 48000)
 
