@@ -187,13 +187,12 @@ class RecognizerService(SessionService):
     def flush_session(self, message: FlushSession) -> None:
         """Drop the current speech; the next audio starts a new segment."""
         if (flushed := self._sessions.get(message.session)) is not None:
-            if flushed.is_paced:
-                self._live.decode_all([flushed])
             flushed.audio.clear()
+            self._live.decode_all([flushed])  # what the network's thread has
             flushed.link.forget()
-            flushed.on_flush(message.sequence)
             flushed.stream.flush()
             self._send_results(flushed)
+            flushed.on_flush(message.sequence, time.monotonic())
             if flushed.last_chunk is not None:
                 self._finish(flushed)
 

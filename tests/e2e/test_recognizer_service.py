@@ -7,14 +7,15 @@ from itertools import pairwise
 
 import pytest
 from kouxing_client.field_types import MAX_AUDIO_BYTES
-from kouxing_client.messages import Message, SessionFacts
+from kouxing_client.messages import Message, SessionFacts, Speech
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.service import RecognizerService
+from kouxing.services.recognizer.service import MAX_TICK_S, RecognizerService
 from kouxing.services.recognizer.sessions import pending_sessions
 from kouxing.services.recognizer.sessions.live_batch_decoder import MAX_BATCH_S
+from kouxing.services.recognizer.sessions.session import STALLED_AFTER_S
 from kouxing.services.recognizer.sessions.unpaced_decoder import MAX_UNPACED_S
 from kouxing.shared.errors import UserError
 from kouxing.shared.fast_record import replace
@@ -23,7 +24,7 @@ from kouxing.shared.network.peer import Peer
 from kouxing.shared.wire.control import EventName, StartSession
 from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.session import AudioChunk, Error, FlushSession
-from kouxing.shared.wire.speech import AcousticModelName
+from kouxing.shared.wire.speech import AcousticModelName, AudioState, Progress
 from tests.live_streams import START
 from tests.samples import with_opening
 from tests.system import LIMIT_S, free_port, wait_until
@@ -117,6 +118,57 @@ def test_drops_audio_that_arrives_after_its_flush(service: Recognizer) -> None:
         assert not session.audio
     service.receive(chunk(3, 640))
     assert session.audio.media_time == 3 * 640
+
+
+@pytest.mark.parametrize("paced", [False, True])
+def test_a_flush_drops_audio_that_is_not_decoded(service: Recognizer, paced: bool) -> None:
+    service.start_session(with_opening(UNPACED, paced=paced))
+    service.receive(chunk(0, MAX_AUDIO_BYTES))
+    service._live.decode(service._live_sessions)
+    session = service._sessions["s"]
+    accepted = session.stream.next_media_time
+    service.flush_session(FlushSession(session="s", request="r", token="t", sequence=1))
+    assert not session.audio
+    assert session.stream.next_media_time == accepted
+
+
+def test_after_a_flush_the_last_report_is_that_the_client_has_stalled(
+    service: Recognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.start_session(with_opening(UNPACED, paced=True))
+    session = service._sessions["s"]
+    session.stream._is_speaking = True
+    sent: list[Message] = []
+    monkeypatch.setattr(session.link, "send", lambda message, _: sent.append(message))
+    service.flush_session(FlushSession(session="s", request="r", token="t", sequence=1))
+    speech, report = sent
+    assert isinstance(speech, Speech)
+    assert isinstance(report, Progress)
+    assert report.state == AudioState.STALLED
+
+
+def test_reports_a_stalled_client_while_others_send_audio(
+    service: Recognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stalled: list[str] = []
+    for name in ("silent", "sending", "decoding"):
+        service.start_session(replace(with_opening(UNPACED, paced=True), session=name))
+
+        def record(message: Message, _now_s: float, name: str = name) -> None:
+            assert isinstance(message, Progress)
+            assert message.state == AudioState.STALLED
+            stalled.append(name)
+
+        monkeypatch.setattr(service._sessions[name].link, "send", record)
+    start_s = service._last_stall_check_s
+    service.receive(chunk(0, 640, "sending"))
+    service._sessions["decoding"].is_scoring = True
+    for number in range(1, round(STALLED_AFTER_S / MAX_TICK_S) + 2):
+        service._report_stalled(start_s + number * MAX_TICK_S)
+    assert stalled == ["silent"]
+    service._sessions["decoding"].is_scoring = False
+    service._report_stalled(start_s + 1.0)
+    assert stalled == ["silent"], "the time of decoding does not count"
 
 
 @pytest.mark.parametrize("paced", [False, True])

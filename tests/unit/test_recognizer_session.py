@@ -241,6 +241,16 @@ def test_reports_a_live_client_that_stalls_and_resumes() -> None:
     )
 
 
+@pytest.mark.parametrize(("paced", "expected"), [(True, ["stalled", "resumed"]), (False, [])])
+def test_a_live_client_that_interrupts_has_stalled(paced: bool, expected: list[str]) -> None:
+    session = make_session(paced=paced)
+    reports: list[Progress] = []
+    cast(Any, session.link).send = lambda message, _: reports.append(message)
+    session.on_flush(6, 60.0)
+    session.on_new_audio(60.1)
+    assert [report.state for report in reports] == expected
+
+
 def test_a_mouth_profile_that_does_not_fit_is_not_used() -> None:
     session = make_session(mouth_profile=b"not a profile")
     assert "the mouth profile is not used" in session.mouth_profile_error
@@ -292,7 +302,7 @@ def test_continues_after_a_gap_that_is_not_filled_in_time() -> None:
 def test_does_not_wait_for_audio_from_before_an_interruption() -> None:
     session = make_session()
     assert take(session, 1, 2, now_s=5.0) == [1, 2]
-    session.on_flush(6)
+    session.on_flush(6, 60.0)
     assert take(session, 3, 7, now_s=60.0) == [3, 7]  # 3 was on its way; 4 to 6 were never sent
     assert take(session, 8, 10, now_s=60.1) == [8], "a later gap is filled again"
 

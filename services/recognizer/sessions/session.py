@@ -147,10 +147,14 @@ class RecognizerSession:
         self.last_sequence, self._gap_since_s = message.sequence, None
         return True
 
-    def on_flush(self, sequence: int) -> None:
-        """Record an interruption: audio up to this message may be missing, and is not used."""
+    def on_flush(self, sequence: int, now_s: float) -> None:
+        """Record an interruption: audio up to this message may be missing, and is not used.
+
+        The client has stopped sending, so the face must return to rest at once.
+        """
         self.flushed_sequence = sequence
         self.silent_s = 0.0  # so that a stalled client is reported again
+        self.check_stalled(math.inf, now_s)
 
     def check_sender(self, message: AudioChunk, socket: Socket) -> None:
         """Raise ``Rejected`` if the sender may not send this message here."""
