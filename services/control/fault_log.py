@@ -10,7 +10,7 @@ MAX_FAULTS = 1000
 
 @dataclass(slots=True)
 class _Fault:
-    begin_s: float
+    start_s: float
     text: str
     is_warned: bool = False
 
@@ -32,7 +32,7 @@ class FaultLog:
     def warn(self, now_s: float) -> None:
         """Warn about each fault that has lasted longer than ``WARN_AFTER_S``."""
         for fault in self._faults.values():
-            if not fault.is_warned and now_s - fault.begin_s > WARN_AFTER_S:
+            if not fault.is_warned and now_s - fault.start_s > WARN_AFTER_S:
                 fault.is_warned = True
                 LOG.warning(fault.text)
 
@@ -44,7 +44,7 @@ class FaultLog:
         fault = self._faults.pop(instance, None)
         if fault is None:
             return 0.0
-        lasted_s = now_s - fault.begin_s
+        lasted_s = now_s - fault.start_s
         log = LOG.warning if fault.is_warned else LOG.info
         log("%s is back after %.1f s", instance, lasted_s)
         return lasted_s

@@ -106,7 +106,10 @@ class Placement:
 
 
 def _no_worker(endpoint: str, language: str | None) -> Rejected:
-    """Return the rejection if no worker with a language provides an endpoint; None: any."""
+    """Return the rejection for an endpoint that no worker provides.
+
+    ``language`` is set if there are workers for the endpoint, but none has this language.
+    """
     kind = PROVIDERS.get(endpoint)
     if language is not None:
         text = f"no {kind} has the language {language}; choose another one"
@@ -119,5 +122,5 @@ def _no_worker(endpoint: str, language: str | None) -> Rejected:
 
 def _can_serve(record: ServiceRecord, language: str | None) -> bool:
     stated, others = record.heartbeat.facts.language, record.heartbeat.languages
-    is_known = language is None or stated in (None, language) or language in others
-    return record.state == "ready" and is_known
+    has_language = language is None or stated in (None, language) or language in others
+    return record.state == "ready" and has_language

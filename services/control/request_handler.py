@@ -33,21 +33,21 @@ Request: TypeAlias = OpenSession | CloseSession | FlushSession | SetFace | Statu
 class RequestHandler:
     """Handles requests on control's socket.
 
-    While ``defers`` returns True, requests that fail with a temporary error wait for
+    While ``may_defer`` returns True, requests that fail with a temporary error wait for
     ``retry_deferred``.
     """
 
     def __init__(
-        self, bus: Bus, commands: Socket, metrics: Metrics, defers: Callable[[], bool]
+        self, bus: Bus, commands: Socket, metrics: Metrics, may_defer: Callable[[], bool]
     ) -> None:
         self._bus = bus
         self._commands = commands
         self._metrics = metrics
-        self._defers = defers
+        self._may_defer = may_defer
         self._answers: OrderedDict[tuple[Peer, int, str], Message] = OrderedDict()
         self._deferred: list[tuple[Handler, Request, Peer]] = []
 
-    def handler(self, handle: Callable[[Any, Peer], Message | None], *roles: str) -> Handler:
+    def make_handler(self, handle: Callable[[Any, Peer], Message | None], *roles: str) -> Handler:
         """Return a handler that answers a request with the result of ``handle``.
 
         If roles are given, the sender's key must have one of them.
@@ -125,7 +125,7 @@ class RequestHandler:
 
     def _can_defer(self, rejection: Rejected) -> bool:
         return (
-            self._defers()
+            self._may_defer()
             and rejection.code in TEMPORARY_ERRORS
             and len(self._deferred) < MAX_DEFERRED
         )

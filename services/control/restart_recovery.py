@@ -19,7 +19,7 @@ class RestartRecovery:
         self.end_s = now_s + RECOVERY_S
         self._registry = registry
         self._reported: dict[str, StartSession] = {}  # sessions that are not restored yet
-        self._observed: dict[str, Collection[str]] = {}  # sessions by observer
+        self._sessions_by_observer: dict[str, Collection[str]] = {}
 
     def add_reported_session(self, start: StartSession, instance: str) -> bool:
         """Add a session that a service reports; return False if the service may not report it."""
@@ -45,7 +45,7 @@ class RestartRecovery:
     def record_observer(self, heartbeat: Heartbeat) -> None:
         """Record the sessions that an observer already takes part in."""
         if self.is_active and heartbeat.role == "observer":
-            self._observed[heartbeat.instance] = heartbeat.sessions.keys()
+            self._sessions_by_observer[heartbeat.instance] = heartbeat.sessions.keys()
 
     def pop_complete(self) -> list[StartSession]:
         """Remove and return the sessions whose workers are all back; at the end, all sessions."""
@@ -64,5 +64,5 @@ class RestartRecovery:
         return {
             instance
             for instance in self._registry.observers()
-            if session not in self._observed.get(instance, ())
+            if session not in self._sessions_by_observer.get(instance, ())
         }

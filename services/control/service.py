@@ -91,7 +91,7 @@ class ControlService(Service):
             for name, socket in (("commands", self._commands), ("events", self._events))
         }
         requests = self._requests = RequestHandler(
-            self.bus, self._commands, self.metrics, defers=lambda: self._recovery.is_active
+            self.bus, self._commands, self.metrics, may_defer=lambda: self._recovery.is_active
         )
         self._lifecycle = SessionLifecycle(
             self._registry,
@@ -105,11 +105,11 @@ class ControlService(Service):
         self.register(
             self._commands,
             {
-                OpenSession: requests.handler(self._open_session, "client"),
-                CloseSession: requests.handler(self._close_session, "client"),
-                FlushSession: requests.handler(self._flush_session, "client"),
-                SetFace: requests.handler(self._set_face, "client", "operator"),
-                StatusRequest: requests.handler(self._report_status),
+                OpenSession: requests.make_handler(self._open_session, "client"),
+                CloseSession: requests.make_handler(self._close_session, "client"),
+                FlushSession: requests.make_handler(self._flush_session, "client"),
+                SetFace: requests.make_handler(self._set_face, "client", "operator"),
+                StatusRequest: requests.make_handler(self._report_status),
                 Heartbeat: self._on_heartbeat,
                 SessionStarted: self._service_handler(self._on_session_started),
                 Error: self._service_handler(self._on_start_rejected),
@@ -143,9 +143,9 @@ class ControlService(Service):
             if instance := self._registry.instance_by_connection(connection):
                 has_stopped = self._registry[instance].state == "draining"
                 reason = STOPPED if has_stopped else "its connection closed"
-                self._on_service_lost(instance, reason)
+                self._remove_service(instance, reason)
         for instance in self._registry.overdue_services(now_s):
-            self._on_service_lost(instance, "no heartbeat")
+            self._remove_service(instance, "no heartbeat")
         self._faults.warn(now_s)
         moves_due_s = self._lifecycle.on_tick(now_s)
         due_s = min(now_s + CHECK_S, self._registry.next_overdue_s(), moves_due_s)
@@ -237,7 +237,7 @@ class ControlService(Service):
             self._commands.send(Error(code=rejection.code, text=rejection.text), to=sender)
             return
         if is_other:
-            self._on_service_lost(instance, "it restarted")
+            self._remove_service(instance, "it restarted")
         is_new = instance not in self._registry
         is_gone = heartbeat.state == "draining" or self._registry.is_stale(instance, sender)
         if is_new and is_gone:
@@ -265,7 +265,7 @@ class ControlService(Service):
         if heartbeat.state == "draining" and heartbeat.role == "worker":
             self._move_sessions_of(instance)  # the worker serves its sessions until they have moved
         elif heartbeat.state == "draining":
-            self._on_service_lost(instance, STOPPED)
+            self._remove_service(instance, STOPPED)
 
     def _on_new_service(
         self, heartbeat: Heartbeat, sender: Peer, replaced: str | None, *, was_lost: bool
@@ -280,7 +280,7 @@ class ControlService(Service):
             EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}"
         )
         if replaced is not None:
-            self._on_service_lost(replaced, f"{heartbeat.instance} took its place")
+            self._remove_service(replaced, f"{heartbeat.instance} took its place")
         missed_start = []
         if was_lost:
             self._registry.adapt_timeout(lasted_s, now_s)
@@ -357,7 +357,8 @@ class ControlService(Service):
         else:
             self.warn("event", f"{instance} may not publish {event.name!r}", event.session)
 
-    def _on_service_lost(self, instance: str, reason: str) -> None:
+    def _remove_service(self, instance: str, reason: str) -> None:
+        """Remove a service that stopped, restarted or is lost, and move its sessions."""
         self._registry.remove(instance)
         self._keys.forget(instance)
         if reason == STOPPED:

@@ -52,8 +52,8 @@ class ServiceRegistry:
         # services except control, oldest heartbeat first: workers with sessions, and others
         self._busy: OrderedDict[str, ServiceRecord] = OrderedDict()
         self._idle: OrderedDict[str, ServiceRecord] = OrderedDict()
-        self._usual_limit_s = self._limit_s = lost_after_s
-        self._late_at_s = -math.inf
+        self._usual_timeout_s = self._timeout_s = lost_after_s
+        self._last_late_s = -math.inf
         self._paused_s = 0.0  # total time in which control itself did not run
         self._observers: set[str] = set()
         self._by_peer: dict[Peer, str] = {}
@@ -73,7 +73,7 @@ class ServiceRegistry:
     def __getitem__(self, instance: str) -> ServiceRecord:
         return self._services[instance]
 
-    def sorted(self) -> list[ServiceRecord]:
+    def interleaved_by_kind(self) -> list[ServiceRecord]:
         """Return all services: one of each kind, then the second of each kind, and so on."""
         counts: Counter[str] = Counter()
         ranked = []
@@ -272,8 +272,8 @@ class ServiceRegistry:
         Otherwise, sessions on a busy machine would move from one late worker to the next.
         """
         if after_s < MAX_LATE_S:
-            self._limit_s = min(2 * self._limit_s, max(MAX_LATE_S, self._usual_limit_s))
-            self._late_at_s = now_s
+            self._timeout_s = min(2 * self._timeout_s, max(MAX_LATE_S, self._usual_timeout_s))
+            self._last_late_s = now_s
 
     def age_s(self, instance: str, now_s: float) -> float:
         """Return the age of a service's newest heartbeat, without control's own pauses."""
@@ -291,8 +291,8 @@ class ServiceRegistry:
 
     def overdue_services(self, now_s: float) -> list[str]:
         """Return the services whose newest heartbeat is too old."""
-        if now_s > self._late_at_s + TIMEOUT_RESET_S:
-            self._limit_s = self._usual_limit_s
+        if now_s > self._last_late_s + TIMEOUT_RESET_S:
+            self._timeout_s = self._usual_timeout_s
         overdue = []
         for services, max_age_s in self._max_ages_s():
             for instance in services:
@@ -304,8 +304,8 @@ class ServiceRegistry:
     def _max_ages_s(self) -> Iterable[tuple[Mapping[str, ServiceRecord], float]]:
         """Return services by heartbeat interval, oldest heartbeat first, with their age limit."""
         return (
-            (self._busy, self._limit_s),
-            (self._idle, self._limit_s + IDLE_HEARTBEAT_S - HEARTBEAT_S),
+            (self._busy, self._timeout_s),
+            (self._idle, self._timeout_s + IDLE_HEARTBEAT_S - HEARTBEAT_S),
         )
 
 

@@ -85,8 +85,8 @@ class SessionTable:
         record = self._by_request.get((client, opening.request))
         if record is None:
             return None
-        same = replace(record.opening, session=opening.session, face=opening.face) == opening
-        return record if same else None
+        is_same = replace(record.opening, session=opening.session, face=opening.face) == opening
+        return record if is_same else None
 
     def sessions_from(self, number: int) -> list[SessionRecord]:
         """Return the sessions with this number or more. Newer sessions have greater numbers."""
@@ -280,7 +280,11 @@ class SessionTable:
         The recognizer is notified last. By then the synthesizer has reported its final phones, or a
         new synthesizer has the session, so the recognizer can resume the face there.
         """
-        remaining = {name: i for name, i in record.workers.items() if i not in record.lost}
+        remaining = {
+            endpoint: instance
+            for endpoint, instance in record.workers.items()
+            if instance not in record.lost
+        }
         try:
             workers = self._placement.place(
                 remaining, now_s, record.facts.language, excluded=record.rejected_by

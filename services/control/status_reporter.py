@@ -66,7 +66,7 @@ class StatusReporter:
             return
         first = message.after
         if first < FIRST_SESSION:
-            yield from enumerate(self._registry.sorted()[first:], first)
+            yield from enumerate(self._registry.interleaved_by_kind()[first:], first)
         for session in self._sessions.sessions_from(first - FIRST_SESSION):
             yield FIRST_SESSION + session.number, session
 

@@ -10,9 +10,10 @@ While they are silent, it does not fall below this value.
 
 from collections import deque
 
+from kouxing.shared.monitoring.metrics import LOAD_PERIOD_S
+
 EQUAL_LOAD = 0.05  # loads that differ by less are equal
 MIN_SESSIONS = 2  # always accepted, because every session seems expensive on a busy machine
-MEASURED_S = 2.0  # period over which a worker measures its load
 DEFAULT_COST = 0.1  # cost of a session until it is measured; typical of a slow machine
 COST_HALF_LIFE_S = 60.0  # half-life of the highest measured cost
 SPEAKING_HALF_LIFE_S = 4.0  # half-life of the cost while speaking sessions cost less
@@ -26,9 +27,9 @@ class WorkerLoad:
         self.num_sessions = 0
         self._num_unpaced = 0
         self._unpaced_until_s = 0.0
-        self._measured = 0.0
-        self._measured_s = 0.0
-        self._idle: float | None = None  # lowest load without sessions
+        self._measured_load = 0.0
+        self._measured_at_s = 0.0
+        self._idle_load: float | None = None  # lowest load without sessions
         self._cost: float | None = None
         self._speaking_cost = 0.0  # cost of a session, when most sessions last spoke
         self._placed_s: deque[float] = deque()  # times of recent placements
@@ -51,19 +52,19 @@ class WorkerLoad:
         self._ended_s.append(now_s)
         if not paced:
             self._num_unpaced -= 1
-            self._unpaced_until_s = now_s + MEASURED_S
+            self._unpaced_until_s = now_s + LOAD_PERIOD_S
 
     def measure(self, load: float, now_s: float, num_speaking: int = 0) -> None:
         """Update the cost from the load in a heartbeat. The load includes silent sessions."""
         if self._is_unpaced(now_s):
             return
-        passed_s = now_s - self._measured_s
-        self._measured, self._measured_s = load, now_s
+        passed_s = now_s - self._measured_at_s
+        self._measured_load, self._measured_at_s = load, now_s
         num_measured = self.num_sessions + _num_recent(self._ended_s, now_s)
         if not num_measured:
-            self._idle = load if self._idle is None else min(load, self._idle)
+            self._idle_load = load if self._idle_load is None else min(load, self._idle_load)
         else:
-            sessions_load = max(0.0, load - (self._idle or 0.0))
+            sessions_load = max(0.0, load - (self._idle_load or 0.0))
             mean = sessions_load / num_measured
             if 2 * num_speaking >= num_measured:
                 self._speaking_cost = mean
@@ -78,7 +79,7 @@ class WorkerLoad:
         if self._is_unpaced(now_s):
             return sessions_load
         num_new = _num_recent(self._placed_s, now_s) - _num_recent(self._ended_s, now_s)
-        return max(sessions_load, self._measured + num_new * self.cost)
+        return max(sessions_load, self._measured_load + num_new * self.cost)
 
     def has_room(self, num_new: int, now_s: float, max_load: float) -> bool:
         """Return whether more sessions stay within a limit; the first sessions always do."""
@@ -93,6 +94,6 @@ class WorkerLoad:
 
 def _num_recent(times_s: deque[float], now_s: float) -> int:
     """Drop the times that the measured load already includes; return the number of later times."""
-    while times_s and times_s[0] <= now_s - MEASURED_S:
+    while times_s and times_s[0] <= now_s - LOAD_PERIOD_S:
         times_s.popleft()
     return len(times_s)

@@ -17,6 +17,7 @@ WINDOW = 1000  # number of newest values that percentiles are computed from
 PERCENTS = (50, 95, 99)
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # upper limits
 _STATM = Path("/proc/self/statm")
+LOAD_PERIOD_S = 2.0  # a service measures its load over this time
 _ARENA_MAX = -8  # glibc's M_ARENA_MAX, a parameter of mallopt
 
 

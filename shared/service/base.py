@@ -25,7 +25,7 @@ from kouxing_client.messages import Message, SessionFacts
 from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.logs import LOG
-from kouxing.shared.monitoring.metrics import LoadMeter, memory_mb, trim_heap
+from kouxing.shared.monitoring.metrics import LOAD_PERIOD_S, LoadMeter, memory_mb, trim_heap
 from kouxing.shared.network.bus import Bus, ProbeResult
 from kouxing.shared.network.peer import Peer
 from kouxing.shared.network.sockets import Socket
@@ -51,7 +51,6 @@ RESYNC_AFTER_S = 0.55  # delay of a heartbeat after which control may have moved
 REPLY_TIMEOUT_S = 0.5
 NO_REPLY_S = 10.0  # after this time without a reply from control, the reason is logged
 FIRST_REPLY_S = 3.0  # limit at startup
-LOAD_PERIOD_S = 2.0
 DRAIN_TIMEOUT_S = 5.0
 HAND_OVER_S = 3.0  # time for control to move the sessions of a stopping worker
 MAX_LATE_S = 5.0  # delay of a heartbeat above which a service is not healthy

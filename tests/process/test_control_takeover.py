@@ -195,7 +195,7 @@ def test_speech_may_end_while_a_session_moves_to_another_synthesizer(
     harness.step_until(lambda: client.wait(0.0))
     record = harness.control._sessions.find("mine")
     record.is_speaking = True
-    harness.control._on_service_lost("synthesizer", "no heartbeat")
+    harness.control._remove_service("synthesizer", "no heartbeat")
     assert record.epoch == 2  # the recognizer does not have this epoch yet
     recognizer.send(Speech(session="mine", epoch=1, sequence=1, active=False))
     harness.step_until(lambda: not record.is_speaking)
@@ -215,7 +215,7 @@ def test_a_session_leaves_a_worker_that_rejects_its_move(
     harness.step_until(lambda: client.wait(0.0))
     harness.receive(client)
     record = harness.control._sessions.find("mine")
-    harness.control._on_service_lost("synthesizer", "no heartbeat")
+    harness.control._remove_service("synthesizer", "no heartbeat")
     for epoch, synthesizer in enumerate(free, 2):
         (start,) = harness.receive(synthesizer)
         assert isinstance(start, StartSession)
@@ -246,7 +246,7 @@ def test_an_observer_that_was_lost_learns_what_it_missed(
         harness.step_until(lambda: client.wait(0.0))
         (opened,) = harness.receive(client)
         assert isinstance(opened, SessionOpened)
-    harness.control._on_service_lost("lamp", "no heartbeat")
+    harness.control._remove_service("lamp", "no heartbeat")
     record = harness.control._sessions.find("mine")
     if missed.startswith("move"):
         assert harness.control._sessions.move(record, time.monotonic())
