@@ -66,6 +66,31 @@ def test_the_errors_by_language_are_those_of_the_report(file: str, text: str, to
     assert text.format(**ranges) in (ROOT / file).read_text("utf-8")
 
 
+LIPS_ENGLISH = (
+    "is only {opening:.2f}. - In Mandarin, the learned lips reproduce {recall:.0f} % of the real lip "
+    "closures, at {precision:.0f} % precision. For the newsreader, precision is only {new:.0f} %."
+)
+LIPS_CHINESE = (
+    "只有 {opening:.2f}。 - 普通话中真实的闭唇，学习式唇形重现了 {recall:.0f} %，"
+    "精确率 {precision:.0f} %；对该播音员，精确率只有 {new:.0f} %。"
+)
+
+
+@pytest.mark.parametrize(
+    ("file", "text"), [("README.md", LIPS_ENGLISH), ("README.zh.md", LIPS_CHINESE)]
+)
+def test_the_limits_of_the_learned_lips_are_those_of_the_report(file: str, text: str) -> None:
+    scores = RESULTS["rivals"]["result"]["learned, 60 ms"]["clean"]
+    mandarin, newsreader = scores["zh"], scores["zh new"]
+    expected = text.format(
+        opening=newsreader["r_opening"],
+        recall=100 * mandarin["closure_recall"],
+        precision=100 * mandarin["closure_precision"],
+        new=100 * newsreader["closure_precision"],
+    )
+    assert expected in " ".join((ROOT / file).read_text("utf-8").split())
+
+
 def test_the_page_was_written_from_these_results(tmp_path: Path) -> None:
     write_page(ROOT / "docs" / "results", tmp_path / "results.md")
     page = (ROOT / "docs" / "results.md").read_text("utf-8")
