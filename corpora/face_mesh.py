@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
+from kouxing.shared.arrays import Doubles, Floats
 
-Floats = NDArray[np.float32]
-Array = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 NUM_LANDMARKS = 468
@@ -35,11 +34,11 @@ _RIGHT_EYE, _LEFT_EYE = 33, 263  # landmarks: the outer corners
 class _Square:
     """A square in an image."""
 
-    center: Array  # (2,) px
+    center: Doubles  # (2,) px
     side: float  # px
     angle: float  # clockwise, radians
 
-    def to_pixels(self, points: Array) -> Array:
+    def to_pixels(self, points: Doubles) -> Doubles:
         """Convert points, (..., 2), from units of the side, relative to the center, to pixels."""
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         rotated = points @ np.array([[cos, sin], [-sin, cos]])
@@ -97,7 +96,7 @@ class FaceMesh:
         return _face_square(origin, whole_image.side * size / _DETECTOR_PX, left_eye - right_eye)
 
 
-def _anchors() -> Array:
+def _anchors() -> Doubles:
     """Return the centers of the detector's anchors, in units of its input's side, (896, 2)."""
     grids = []
     for stride_px, num_anchors in _STRIDES_PX.items():
@@ -107,7 +106,7 @@ def _anchors() -> Array:
     return np.concatenate(grids)
 
 
-def _face_square(center: Array, size: Array, right_to_left_eye: Array) -> _Square:
+def _face_square(center: Doubles, size: Doubles, right_to_left_eye: Doubles) -> _Square:
     x, y = right_to_left_eye
     return _Square(center, _MARGIN * float(size.max()), float(np.arctan2(y, x)))
 

@@ -20,6 +20,7 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio import audio_file
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
@@ -47,7 +48,7 @@ def load_or_compute(
         return dict(file)
 
 
-def read_audio(path: Path) -> NDArray[np.float32]:
+def read_audio(path: Path) -> Floats:
     """Read a recording as 16 kHz mono; UserError if it cannot be read."""
     return to_16_khz(*audio_file.read_audio(path))
 
@@ -81,7 +82,7 @@ def _cached(
     utterances: Sequence[Utterance],
     kind: str,
     empty: NDArray[Any],
-    compute_block: Callable[[NDArray[np.float32]], NDArray[Any]],
+    compute_block: Callable[[Floats], NDArray[Any]],
 ) -> list[NDArray[Any]]:
     """Return a memory-mapped block of every utterance, from the cache or computed.
 

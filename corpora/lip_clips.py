@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.feature_cache import read_audio
@@ -32,14 +31,13 @@ from kouxing.services.recognizer.lips.lip_predictor import LIP_FAPS, OTHER_SIDE
 from kouxing.services.recognizer.offline.alignment import align_text
 from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import fap_columns
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS, PROTRUSION_FAPS
 from kouxing.shared.files.output_file import write_error
 from kouxing.shared.files.user_file import check_content, parse_json, read_text, split_lines
 from kouxing.shared.phones.events import Phone
-
-Array = NDArray[np.float64]
 
 _MAX_BYTES = 64 << 20  # limit for a table
 _MAX_ROWS = 1_000_000
@@ -95,9 +93,9 @@ class LipClip:
     is_filmed: bool = True  # otherwise captured with sensors, or animated
     is_rig: bool = False  # an animator's rig, whose mouth rests at 0
     transcript: str = ""  # empty if unknown
-    time_s: Array  # (num_frames,)
-    faps: Array  # (num_frames, num_mouth_faps), FAP units, NaN if not measured
-    samples: NDArray[np.float32]  # 16 kHz mono
+    time_s: Doubles  # (num_frames,)
+    faps: Doubles  # (num_frames, num_mouth_faps), FAP units, NaN if not measured
+    samples: Floats  # 16 kHz mono
 
     @property
     def source(self) -> str:
@@ -219,7 +217,7 @@ def _read_clip(
         )
 
 
-def _tracked_faps(tracks: dict[str, Array]) -> Array:
+def _tracked_faps(tracks: dict[str, Doubles]) -> Doubles:
     faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
     for name, values in tracks.items():
         number = name[1:].partition("_")[0]
@@ -229,7 +227,7 @@ def _tracked_faps(tracks: dict[str, Array]) -> Array:
     return faps
 
 
-def _rig_faps(tracks: dict[str, Array]) -> Array:
+def _rig_faps(tracks: dict[str, Doubles]) -> Doubles:
     faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
     faps[:, fap_columns(LIP_FAPS)] = 0.0
     for shape, effect in _RIG_SHAPES.items():
@@ -254,20 +252,20 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
     return faps
 
 
-def opening_of(faps: Array) -> Array:
+def opening_of(faps: Doubles) -> Doubles:
     """Return the opening between the inner lips relative to the neutral face, (num_frames,)."""
     return np.asarray(-faps[:, fap_columns((4, 5))].sum(axis=1))
 
 
 def openings_of(
-    speakers: Sequence[str], mouths: Sequence[Array]
-) -> tuple[list[Array], dict[str, float]]:
+    speakers: Sequence[str], mouths: Sequence[Doubles]
+) -> tuple[list[Doubles], dict[str, float]]:
     """Return the opening of each frame of mouth FAPs, and each speaker's widest one, FAP units.
 
     The widest opening is the 98th percentile of all frames of a speaker, at least 1.
     """
     openings = [opening_of(faps) for faps in mouths]
-    by_speaker: dict[str, list[Array]] = defaultdict(list)
+    by_speaker: dict[str, list[Doubles]] = defaultdict(list)
     for speaker, opening in zip(speakers, openings, strict=True):
         by_speaker[speaker].append(opening)
     return openings, {

@@ -17,6 +17,7 @@ from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.audio_file import MAX_FILE_BYTES, check_video
 from kouxing.shared.audio.media_file import OPTIONS, start_of
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -32,7 +33,7 @@ MAX_SIDE_PX = 960  # larger images are reduced
 
 def read_video(
     path: Path, on_image: Callable[[float, NDArray[np.uint8]], None], track: int | None = None
-) -> NDArray[np.float32]:
+) -> Floats:
     """Read a video of any format that FFmpeg supports; return the audio, 16 kHz mono, (n,).
 
     ``on_image`` is called with each image: its time in the audio, seconds, and upright RGB,
@@ -82,7 +83,7 @@ def track_video(video: Path, clip: Path, audio_track: int | None) -> tuple[int, 
     """
     mesh = FaceMesh()
     times: list[float] = []
-    landmarks_by_image: list[NDArray[np.float32] | None] = []
+    landmarks_by_image: list[Floats | None] = []
 
     def track_image(time_s: float, image: NDArray[np.uint8]) -> None:
         landmarks = mesh.track(image)
@@ -124,7 +125,7 @@ def track_video(video: Path, clip: Path, audio_track: int | None) -> tuple[int, 
     return int(has_face.sum()), len(has_face)
 
 
-def _format_tracks(time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> str:
+def _format_tracks(time_s: Doubles, faps: Doubles) -> str:
     columns = [index for index in range(faps.shape[1]) if not np.isnan(faps[:, index]).all()]
     names = [f"F{MOUTH_FAPS[index]}_{FAPS[MOUTH_FAPS[index] - 1].name}" for index in columns]
     table = io.StringIO()

@@ -20,7 +20,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 from scipy.signal import find_peaks
 from scipy.stats import spearmanr
@@ -33,13 +32,13 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import configured_face
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.arrays import Doubles, Floats, Mask
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
 from kouxing.shared.phones.events import Progress
 
-Floats = NDArray[np.float32]
-Times = NDArray[np.float64]  # (n,) media times, seconds
+Times = Doubles  # (n,) media times, seconds
 
 _PAUSE_S = 0.6  # pause between recordings
 _CHUNK = MEDIA_RATE_HZ // 10
@@ -176,7 +175,7 @@ def _animate(
 
 
 def _correlations(
-    sessions: Sequence[_Session], labels: Sequence[NDArray[np.float64]], rate_hz: float
+    sessions: Sequence[_Session], labels: Sequence[Doubles], rate_hz: float
 ) -> dict[str, float]:
     correlations: dict[str, list[float]] = {}
     for session, label in zip(sessions, labels, strict=True):
@@ -239,14 +238,14 @@ def _blink_durations_s(faps: Floats, rate_hz: float) -> Times:
     return durations
 
 
-def _is_still(faps: Floats) -> NDArray[np.bool_]:
+def _is_still(faps: Floats) -> Mask:
     """Return whether each frame, except the first, looks like the previous frame."""
     limits = np.full(faps.shape[1], _STILL_UNITS)
     limits[_ANGLES] = _STILL_DEG * DEGREE
-    still: NDArray[np.bool_] = np.all(np.abs(np.diff(faps, axis=0)) <= limits, axis=1)
+    still: Mask = np.all(np.abs(np.diff(faps, axis=0)) <= limits, axis=1)
     return still
 
 
-def _longest_run(mask: NDArray[np.bool_]) -> int:
+def _longest_run(mask: Mask) -> int:
     changes = np.flatnonzero(~np.concatenate([[False], mask, [False]]))
     return int(np.diff(changes).max() - 1)

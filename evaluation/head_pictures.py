@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from kouxing.services.driver.config import Framing
@@ -17,11 +16,10 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
 from kouxing.shared.files.output_file import create_folder, open_output
-
-Float32 = NDArray[np.float32]
 
 _YAWS_DEG, _PROFILE_DEG = (0.0, 40.0), 80.0
 _HEAD_PX, _VISEME_PX, _THUMBNAIL_PX = (240, 200), (160, 160), (160, 160)
@@ -115,9 +113,7 @@ def _draw_expressiveness() -> Image.Image:
     )
 
 
-def _viseme_faps(
-    viseme: str, expressiveness: float = SynthesizerConfig().expressiveness
-) -> Float32:
+def _viseme_faps(viseme: str, expressiveness: float = SynthesizerConfig().expressiveness) -> Floats:
     """Return the FAPs (68,) of a viseme's target."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
@@ -128,7 +124,7 @@ def _viseme_faps(
 def _draw(
     label: str,
     name: str,
-    faps: Float32,
+    faps: Floats,
     size: tuple[int, int],
     yaw_deg: float = 0.0,
     framing: Framing = Framing.FACE,

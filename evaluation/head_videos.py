@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.evaluation.lips.scheme_videos import VIDEO_PX, write_video
@@ -17,6 +16,7 @@ from kouxing.services.live_pipeline import LivePipeline
 from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
@@ -41,7 +41,7 @@ def write_head_videos(folder: Path, model: AcousticModel, recordings: Sequence[P
             write_video(folder / name / "minute.mp4", frames, samples, renderer)
 
 
-def join_recordings(recordings: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+def join_recordings(recordings: Sequence[Floats]) -> Floats:
     """Join recordings (n,), 16 kHz mono, to a minute with equal pauses around them.
 
     Raises ``UserError`` if the recordings leave no time for pauses.

@@ -1,10 +1,11 @@
 """Percentiles of measured values."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from kouxing.shared.arrays import Doubles
 
 
-def percentiles(values: NDArray[np.float64]) -> dict[str, float]:
+def percentiles(values: Doubles) -> dict[str, float]:
     """Return the 50th and the 95th percentile, ``p50`` and ``p95``; empty without values."""
     if not values.size:
         return {}

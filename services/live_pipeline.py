@@ -5,9 +5,6 @@ between them. Offline rendering and evaluation use this pipeline. Its frames equ
 services bit for bit.
 """
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lips.lip_prediction import LipPredictor
@@ -18,13 +15,14 @@ from kouxing.services.recognizer.offline.offline_recognition import WithProgress
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import Frame, configured_face
 from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import SoundEvent, Waveform
 
 
 def recognize_events(
     model: AcousticModel,
-    samples: NDArray[np.float32],
+    samples: Floats,
     lip_predictor: LipPredictor | None,
     face_delay_s: float = 0.0,
     config: RecognizerConfig | None = None,
@@ -74,7 +72,7 @@ class LivePipeline:
         )
         self._face = configured_face(lip_model, synthesizer)
 
-    def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:
+    def accept_waveform(self, samples: Floats) -> list[Frame]:
         """Process finite samples, shape (n,), and return the frames that are due."""
         self._stream.accept_waveform(samples)
         return self._animate()
@@ -84,9 +82,7 @@ class LivePipeline:
         self._stream.input_finished()
         return self._animate()
 
-    def animate(
-        self, samples: NDArray[np.float32], with_progress: WithProgress = iter
-    ) -> list[Frame]:
+    def animate(self, samples: Floats, with_progress: WithProgress = iter) -> list[Frame]:
         """Process a whole recording, shape (n,), a second at a time; return all frames.
 
         The sample rate is 16 kHz. ``with_progress`` wraps the loop to show progress.

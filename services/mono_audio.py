@@ -5,19 +5,17 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.audio_file import limited_blocks, open_audio
 from kouxing.shared.audio.level_check import LevelCheck
 from kouxing.shared.audio.phase_cancellation import Samples
 from kouxing.shared.command.terminal import print_message
 
 
-def read_mono_16k(
-    path: Path, track: int | None = None, progress: Progress | None = None
-) -> NDArray[np.float32]:
+def read_mono_16k(path: Path, track: int | None = None, progress: Progress | None = None) -> Floats:
     """Return a file's samples, 16 kHz mono, shape ``(n,)``.
 
     Prints a message if the file is truncated, has a wrong level, or has other tracks. Raises

@@ -16,7 +16,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.features import frame_time_s
 from kouxing.services.recognizer.front_end.slices import SliceMeter
@@ -34,6 +33,7 @@ from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, Fram
 from kouxing.services.synthesizer.lips.learned.closure_rule import ClosureRule
 from kouxing.services.synthesizer.lips.learned.model import LearnedLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (
@@ -66,7 +66,7 @@ class AnalyzedRecording:
 
 
 def analyze_recording(
-    samples: NDArray[np.float32],
+    samples: Floats,
     phones: Sequence[Phone],
     lip_predictor: LipPredictor | None = None,
     *,

@@ -17,7 +17,6 @@ They matter only for phones that no connected speech contains.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
     AFTER_PAUSE,
@@ -27,6 +26,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
 )
 from kouxing.services.recognizer.front_end.features import HOP_S
 from kouxing.services.recognizer.search.decoder import PathSegment
+from kouxing.shared.arrays import Floats
 from kouxing.shared.phones.inventory import PhoneInventory
 
 _PRIOR_COUNT = 10.0  # n0
@@ -69,7 +69,7 @@ class PhoneDurations:
             frames = segment.end - segment.start
             self._sums[:, position, segment.phone] += (weight, weight * frames, weight * frames**2)
 
-    def mean_and_spread_s(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def mean_and_spread_s(self) -> tuple[Floats, Floats]:
         """Compute mean and standard deviation of the durations, (3, num_phones) each, seconds."""
         second_moment = _UNSEEN_MEAN_FRAMES**2 + _UNSEEN_SPREAD_FRAMES**2
         unseen = np.array((1.0, _UNSEEN_MEAN_FRAMES, second_moment))

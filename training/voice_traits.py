@@ -40,14 +40,12 @@ from kouxing.services.recognizer.acoustic.encoder import (
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.live.voice_traits import MIN_VOICE, VoiceReadout
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.model_card import write_card
 from kouxing.training.model_files import save_voice_readout
 from kouxing.training.networks.augmentation import disturb, scale_level
 from kouxing.training.seed import SEED
-
-Floats = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 _FEELING_RIDGE, _SOUND_RIDGE = 1.0, 1e-4
 _SOUND_WEIGHT = 5.0  # weight of an encoder frame in laughter or breath
@@ -136,8 +134,8 @@ def _mean_state(outputs: Sequence[EncoderOutput], states: Floats) -> Floats:
 
 
 def _ridge(
-    states: Floats, targets: NDArray[Any], weight: Array, ridge: float
-) -> tuple[Array, Array]:
+    states: Floats, targets: NDArray[Any], weight: Doubles, ridge: float
+) -> tuple[Doubles, Doubles]:
     """Return W and b for raw states, (rows, width), and targets, (rows, 2)."""
     center = np.average(states, axis=0, weights=weight)
     deviation = np.maximum(states.std(axis=0), _MIN_DEVIATION)
@@ -149,7 +147,9 @@ def _ridge(
     return weights, mean - center @ weights
 
 
-def _test_speakers(states: Floats, feelings: Array, speakers: NDArray[Any]) -> tuple[float, float]:
+def _test_speakers(
+    states: Floats, feelings: Doubles, speakers: NDArray[Any]
+) -> tuple[float, float]:
     """Return the mean rank correlations of arousal and valence over held-out speakers."""
     correlations = []
     for speaker in np.unique(speakers):

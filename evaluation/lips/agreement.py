@@ -3,14 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.evaluation.lips.closures import DetectionCounts, closures
 from kouxing.evaluation.lips.curves import LAGS_S, Moments, best_lag, pooled_moments
 from kouxing.evaluation.lips.mouths import CURVES, Mouth
 
-Array = NDArray[np.float64]
 MouthPair = tuple[Mouth, Mouth]  # the predicted and the real mouth
 
 

@@ -8,13 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.curves import is_near
 from kouxing.evaluation.lips.mouths import Mouth
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from kouxing.shared.arrays import Doubles, Mask
 
 WINDOW_S = 0.04
 _MIN_OPEN = 100.0  # opening of predicted lips in FAP units: 3 mm on a face
@@ -65,11 +62,11 @@ class Contact:
     is_true: bool  # real lips are closed within 40 ms of one of these frames
 
 
-def real_closures(mouth: Mouth) -> Array:
+def real_closures(mouth: Mouth) -> Doubles:
     """Return when real lips close, seconds: minima of closed lips near an opening."""
     before, here, after = mouth.opening[:-2], mouth.opening[1:-1], mouth.opening[2:]
     is_minimum = (here <= before) & (here < after) & mouth.is_closed[1:-1]
-    events_s: Array = mouth.time_s[1:-1][is_minimum]
+    events_s: Doubles = mouth.time_s[1:-1][is_minimum]
     if not len(events_s):
         return events_s
     low, high = np.percentile(mouth.opening, [1, 99])
@@ -77,7 +74,7 @@ def real_closures(mouth: Mouth) -> Array:
     return np.asarray(events_s[is_near(events_s, opening_times_s, _OPEN_WINDOW_S)])
 
 
-def is_closed_at(events_s: Array, mouth: Mouth) -> Mask:
+def is_closed_at(events_s: Doubles, mouth: Mouth) -> Mask:
     """Whether lips close within 40 ms of each moment and are open within 0.2 s."""
     near = is_near(events_s, mouth.time_s[mouth.is_closed], WINDOW_S)
     return near & is_near(events_s, mouth.time_s[mouth.opening > _MIN_OPEN], _OPEN_WINDOW_S)

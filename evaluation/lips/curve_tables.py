@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import ARKIT, OCULUS
 from kouxing.shared.files.user_file import check_content, read_text, split_lines
-
-Array = NDArray[np.float64]
 
 TIME, OPENING = "t", "opening"
 _MAX_BYTES = 64 << 20
@@ -33,11 +31,11 @@ _LOWER_LIP = FAP_NUMBER["raise_b_midlip"] - 1
 class CurveTable:
     """Curves of a clip."""
 
-    time_s: Array  # (num_rows,), ascending
+    time_s: Doubles  # (num_rows,), ascending
     names: tuple[str, ...]
-    values: Array  # (num_rows, num_curves)
+    values: Doubles  # (num_rows, num_curves)
 
-    def at(self, known_s: Array) -> Array:
+    def at(self, known_s: Doubles) -> Doubles:
         """Return the newest rows, (..., num_curves), that need no audio after the given times."""
         index = np.searchsorted(self.time_s, known_s + 1e-6, side="right") - 1
         return np.asarray(self.values[np.clip(index, 0, None)])
@@ -47,10 +45,10 @@ class CurveTable:
 class FapConversion:
     """Converts curves to FAPs: ``basis`` (num_curves, 68) and ``offset`` (68,)."""
 
-    basis: Array
-    offset: Array
+    basis: Doubles
+    offset: Doubles
 
-    def faps(self, curves: Array) -> Array:
+    def faps(self, curves: Doubles) -> Doubles:
         """Return FAPs (num_frames, 68) of curves (num_frames, num_curves)."""
         return np.asarray(curves @ self.basis + self.offset)
 
@@ -116,7 +114,7 @@ def fap_conversion(folder: Path, tables: Collection[CurveTable]) -> FapConversio
         scale = _MAX_OPENING / max(float(high - low), 1e-9)
         basis[column, _LOWER_LIP], offset[_LOWER_LIP] = -scale, scale * low
         return FapConversion(basis, offset)
-    known: Mapping[str, NDArray[np.float32]] = {
+    known: Mapping[str, Floats] = {
         name: row
         for shapes in (ARKIT, OCULUS)
         for name, row in zip(shapes.names, shapes.basis, strict=True)

@@ -4,10 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from kouxing.shared.arrays import Doubles, Mask
 
 LAGS_S = np.arange(-30, 31) / 100.0
 _NO_POWER = 1e-12  # per frame: what filters leave of a constant curve
@@ -39,7 +37,7 @@ class Moments:
         return float(np.sqrt(max(squares, 0.0) / self.num_frames))
 
 
-def pooled_moments(pairs: Iterable[tuple[Array, Array]]) -> Moments:
+def pooled_moments(pairs: Iterable[tuple[Doubles, Doubles]]) -> Moments:
     """Compare predicted and real curves, a pair per clip. NaN values are ignored.
 
     >>> predicted, real = np.array([1.0, 2.0, 3.0]), np.array([10.0, 12.0, 11.0])
@@ -70,7 +68,7 @@ def best_lag(lagged: Sequence[Moments]) -> float | None:
     return best[1] if best in candidates[1:-1] else None
 
 
-def num_turns(curve: Array) -> int:
+def num_turns(curve: Doubles) -> int:
     """Count the changes of direction of a curve.
 
     >>> num_turns(np.array([0.0, 1.0, 1.0, 2.0, 1.0, 3.0]))
@@ -80,13 +78,13 @@ def num_turns(curve: Array) -> int:
     return int((np.diff(direction[direction != 0.0]) != 0.0).sum())
 
 
-def rms_jerk(curves: Sequence[Array], rate_hz: float) -> float | None:
+def rms_jerk(curves: Sequence[Doubles], rate_hz: float) -> float | None:
     """Root mean square of the third derivative of curves; None if none has four frames."""
     jerks = np.concatenate([np.zeros(0), *(np.diff(curve, n=3) for curve in curves)]) * rate_hz**3
     return float(np.sqrt(np.mean(jerks**2))) if len(jerks) else None
 
 
-def is_near(events_s: Array, others_s: Array, window_s: float) -> Mask:
+def is_near(events_s: Doubles, others_s: Doubles, window_s: float) -> Mask:
     """Whether one of the others, which are sorted, is within a window around each moment."""
     if not len(others_s):
         return np.zeros(len(events_s), dtype=bool)

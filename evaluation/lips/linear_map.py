@@ -20,16 +20,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.closures import DetectionCounts, closures
 from kouxing.evaluation.lips.curve_tables import CurveTable
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import CURVES, clip_mouth, predicted_mouth, real_faps
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.face.faps import NUM_FAPS
-
-Array = NDArray[np.float64]
 
 _HISTORY_S = 0.02 * np.arange(10)
 _RIDGE = 1000.0  # strength of the regularization, frames
@@ -43,11 +41,11 @@ class LinearMap:
     """A fitted map."""
 
     delay_s: float
-    weights: Array  # (10 * num_curves, 3)
+    weights: Doubles  # (10 * num_curves, 3)
     opening: float  # constant, FAP units
     correlation: float  # correlation of the opening on the clips of the fit
 
-    def faps(self, table: CurveTable, time_s: Array) -> Array:
+    def faps(self, table: CurveTable, time_s: Doubles) -> Doubles:
         """Return FAPs (num_frames, 68) at given times."""
         opening, width, jaw = (_stack_history(table, time_s + self.delay_s) @ self.weights).T
         faps = np.zeros((len(time_s), NUM_FAPS))
@@ -56,7 +54,7 @@ class LinearMap:
         return faps
 
 
-def _stack_history(table: CurveTable, known_s: Array) -> Array:
+def _stack_history(table: CurveTable, known_s: Doubles) -> Doubles:
     return table.at(known_s[:, None] - _HISTORY_S).reshape(len(known_s), -1)
 
 

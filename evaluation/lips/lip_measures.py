@@ -18,7 +18,7 @@ from functools import cached_property, partial
 from statistics import median
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kouxing.evaluation.lips.agreement import lag_ms
 from kouxing.evaluation.lips.closures import (
@@ -33,9 +33,7 @@ from kouxing.evaluation.lips.curves import num_turns, pooled_moments
 from kouxing.evaluation.lips.misalignment import misalignment_s
 from kouxing.evaluation.lips.mouths import CURVES, Mouth
 from kouxing.evaluation.lips.references import PAUSE, Reference
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from kouxing.shared.arrays import Doubles, Mask
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class ScoredClip:
         return self.reference.is_speech(self.real.time_s)
 
     @cached_property
-    def opening_in_speech(self) -> Array:
+    def opening_in_speech(self) -> Doubles:
         """The opening during speech, at the times of the real frames."""
         return self.predicted.at("opening", self.real.time_s)[self.in_speech]
 
@@ -231,7 +229,7 @@ def correlate_by_speaker(
     return total / num_clips if num_clips else None
 
 
-def opening_range(opening: Array) -> float:
+def opening_range(opening: Doubles) -> float:
     """Return the range of an opening from its 5th to its 95th percentile."""
     low, high = np.percentile(opening, [5, 95])
     return float(high - low)
@@ -271,12 +269,12 @@ def phone_spread(clips: ScoredClips) -> float | None:
     return float(np.sqrt(np.mean(deviations**2))) if len(deviations) else None
 
 
-def _measured_middles_s(clip: ScoredClip) -> Array:
+def _measured_middles_s(clip: ScoredClip) -> Doubles:
     """Return the midpoints of the phones during which the real lips were tracked."""
     if not len(clip.real.time_s):
         return np.zeros(0)
     phones = clip.reference.phones
-    middles_s: Array = np.array([phone.onset_s + 0.5 * phone.duration_s for phone in phones])
+    middles_s: Doubles = np.array([phone.onset_s + 0.5 * phone.duration_s for phone in phones])
     is_measured = (middles_s >= clip.real.time_s[0]) & (middles_s <= clip.real.time_s[-1])
     return np.asarray(middles_s[is_measured])
 

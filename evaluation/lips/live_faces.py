@@ -7,7 +7,6 @@ from itertools import zip_longest
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.scoring import is_emitted
 from kouxing.services.live_pipeline import recognize_events
@@ -20,9 +19,10 @@ from kouxing.services.recognizer.lips.lip_prediction import (
 )
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent
 
-Samples = NDArray[np.float32]
+Samples = Floats
 FRAME_RATE_HZ = 50.0
 
 
@@ -69,9 +69,7 @@ def live_events(
     }
 
 
-def live_frames(
-    lips: LipModel, events: Sequence[SoundEvent], delay_s: float
-) -> NDArray[np.float64]:
+def live_frames(lips: LipModel, events: Sequence[SoundEvent], delay_s: float) -> Doubles:
     """Return frames (num_frames, 68) of the live pipeline, without idle motion."""
     face = FaceAnimator(lips, frame_rate_hz=FRAME_RATE_HZ, delay_s=delay_s)
     return np.array([faps for _, faps in animate_live(face, events)], dtype=float)

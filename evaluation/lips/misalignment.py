@@ -15,8 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
 from kouxing.evaluation.lips.mouths import Mouth
-
-Array = NDArray[np.float64]
+from kouxing.shared.arrays import Doubles
 
 RATE_HZ = 30.0
 _SMOOTHING, _SEGMENT_FRAMES = 2.0, 240  # frames
@@ -39,7 +38,7 @@ def misalignment_s(predicted: Mouth, real: Mouth) -> float | None:
     return float(np.mean(np.abs(offsets))) / RATE_HZ if offsets else None
 
 
-def match_extrema(predicted: Array, real: Array) -> list[int]:
+def match_extrema(predicted: Doubles, real: Doubles) -> list[int]:
     """Return the lag of predicted extrema behind the matching real extrema, frames.
 
     >>> match_extrema(np.array([0.0, 0, 1, 4, 1, 0, 2, 2]), np.array([0.0, 1, 4, 1, 0, 2, 2, 1]))
@@ -58,7 +57,7 @@ def match_extrema(predicted: Array, real: Array) -> list[int]:
     return offsets
 
 
-def _find_extrema(curve: Array) -> NDArray[np.int_]:
+def _find_extrema(curve: Doubles) -> NDArray[np.int_]:
     """Return 1 for maxima, -1 for minima, 0 otherwise. A plateau counts once, at its middle."""
     kind = np.zeros(len(curve), dtype=int)
     kind[find_peaks(curve)[0]] = 1
@@ -66,7 +65,7 @@ def _find_extrema(curve: Array) -> NDArray[np.int_]:
     return kind
 
 
-def warping_path(first: Array, second: Array) -> list[tuple[int, int]]:
+def warping_path(first: Doubles, second: Doubles) -> list[tuple[int, int]]:
     """Pair the values of two sequences with the least sum of absolute differences, in order."""
     rows, columns = len(first), len(second)
     total = np.full((rows + 1, columns + 1), np.inf)

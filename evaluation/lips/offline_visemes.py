@@ -7,7 +7,6 @@ schemes 1 (phones of a forced alignment) and 2 (recognized phones with their tim
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
@@ -17,6 +16,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.modifiers.amplitude import AmplitudeModifier
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone
@@ -31,7 +31,7 @@ def synthesize(
     num_frames: int,
     frame_rate_hz: float = 50.0,
     levels: Sequence[tuple[float, float]] = (),
-) -> NDArray[np.float32]:
+) -> Floats:
     """Return the FAP frames (num_frames, 68) of an utterance.
 
     The phones have their true times; gaps and silences are pauses. ``levels`` has times in seconds

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips.agreement import moments
@@ -18,11 +17,11 @@ from kouxing.evaluation.lips.curve_tables import CurveTable, fap_conversion, rea
 from kouxing.evaluation.lips.linear_map import fit_map
 from kouxing.evaluation.lips.live_faces import FRAME_RATE_HZ
 from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
-Array = NDArray[np.float64]
 MouthFunction = Callable[[LipClip], Mouth]
-FapsFunction = Callable[[LipClip, Array], Array]  # clip, times (n,) in s; FAPs (n, 68)
+FapsFunction = Callable[[LipClip, Doubles], Doubles]  # clip, times (n,) in s; FAPs (n, 68)
 
 _DELAYS_S = tuple(step / 50.0 for step in range(16))  # 0 to 0.3 s
 _TAIL_S = 0.5  # frames after the end of a clip's audio
@@ -58,7 +57,7 @@ def _program_faps(
     """Return the FAPs of a face, and its delay, seconds."""
     shipped = fap_conversion(folder, [*tables.values()])
 
-    def faps(clip: LipClip, time_s: Array, delay_s: float) -> Array:
+    def faps(clip: LipClip, time_s: Doubles, delay_s: float) -> Doubles:
         return shipped.faps(tables[clip.name].at(time_s + delay_s))
 
     reals = [clip_mouth(clip) for clip in fitting]
@@ -91,6 +90,6 @@ def _mouths_of(
     return mouths
 
 
-def _frames_s(clip: LipClip) -> Array:
+def _frames_s(clip: LipClip) -> Doubles:
     duration_s = max(float(clip.time_s[-1]), len(clip.samples) / MEDIA_RATE_HZ)
     return np.arange(int((duration_s + _TAIL_S) * FRAME_RATE_HZ)) / FRAME_RATE_HZ

@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip, read_clips, training_clips
 from kouxing.corpora.scoring import final_hypothesis
@@ -16,14 +15,12 @@ from kouxing.evaluation.lips.curves import is_near
 from kouxing.evaluation.lips.mouths import CURVES, Mouth, clip_mouth, real_faps
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import training_clip_names
+from kouxing.shared.arrays import Doubles, Mask
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 PAUSE = "pause"
 _SPEECH_RANGE_DB, _SPEECH_MARGIN_S = 30.0, 0.1
@@ -44,7 +41,7 @@ class Reference:
     visemes: Mapping[str, Sequence[tuple[str, float]]]  # by phone, with fractions of it
 
     @cached_property
-    def loud_s(self) -> Array:
+    def loud_s(self) -> Doubles:
         """When the sound is less than 30 dB below the loudest, seconds."""
         end_s, level_db = np.array(measure_levels(self.clip.samples)).reshape(-1, 2).T
         if not len(end_s):
@@ -57,7 +54,7 @@ class Reference:
         """Root mean square of the samples."""
         return float(np.sqrt(np.mean(np.square(self.clip.samples, dtype=float))))
 
-    def is_speech(self, time_s: Array) -> Mask:
+    def is_speech(self, time_s: Doubles) -> Mask:
         """Whether there is speech at the given times.
 
         Voice activity is on, and a loud sound is within 0.1 s. Voice activity alone spans pauses of
@@ -90,7 +87,7 @@ class Reference:
         """Return the phones b p m."""
         return [phone for phone in self.phones if self.visemes[phone.symbol][0][0] == _LABIAL]
 
-    def quietest_times(self, phones: Sequence[Phone]) -> Array:
+    def quietest_times(self, phones: Sequence[Phone]) -> Doubles:
         """Return when each phone is quietest, seconds."""
         hop = round(_POWER_STEP_S * MEDIA_RATE_HZ)
         samples = self.clip.samples

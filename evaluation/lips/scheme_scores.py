@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.scoring import align_symbols
@@ -36,11 +35,10 @@ from kouxing.evaluation.percentiles import percentiles
 from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.offline.alignment import drop_pauses
 from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent
 from kouxing.shared.phones.inventory import PhoneInventory
-
-Array = NDArray[np.float64]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -82,7 +80,7 @@ def score_schemes(
     return scores
 
 
-def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array | None:
+def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Doubles | None:
     config = SynthesizerConfig(
         lips=condition.lips, idle_motion=False, expressiveness=1.0, feeling=0.0
     )
@@ -92,8 +90,8 @@ def _mouth_frames(condition: Condition, sentence: RecognizedSentence) -> Array |
 
 def _score_condition(
     condition: Condition,
-    frames: Sequence[Array | None],
-    aligned: Sequence[Array | None],
+    frames: Sequence[Doubles | None],
+    aligned: Sequence[Doubles | None],
     clips: Sequence[LipClip],
     delays_s: Sequence[float],
 ) -> ConditionScore:

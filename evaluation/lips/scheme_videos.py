@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip
@@ -24,6 +23,7 @@ from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video import film
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import Frame
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.files.output_file import create_folder
 
@@ -65,9 +65,7 @@ def write_videos(
     return [path for _, _, path in missing]
 
 
-def write_video(
-    path: Path, frames: list[Frame], samples: NDArray[np.float32], renderer: Renderer
-) -> None:
+def write_video(path: Path, frames: list[Frame], samples: Floats, renderer: Renderer) -> None:
     """Write a video for a listening test, with its folder; UserError if that fails."""
     create_folder(path.parent)
     film.render_video(frames, path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples)
@@ -119,7 +117,7 @@ def _frames_with_mouth(
     return list(zip(times_s, frames, strict=True))
 
 
-def tracked_frames(clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def tracked_frames(clip: LipClip, times_s: Doubles) -> Doubles:
     """Return the tracked mouth at the given times, FAPs (n, 68).
 
     If the outer contour was not measured, it follows the inner one.
@@ -134,5 +132,5 @@ def tracked_frames(clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.fl
     return faps
 
 
-def _mouth_at_rest(_clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mouth_at_rest(_clip: LipClip, times_s: Doubles) -> Doubles:
     return np.zeros((len(times_s), NUM_FAPS))

@@ -25,7 +25,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip, openings_of, read_clips
@@ -43,15 +42,15 @@ from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, bui
 from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING, load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import Syllable
 from kouxing.shared.phones.syllable_captions import group_syllables
 
-Array = NDArray[np.float64]
-Samples = NDArray[np.float32]
-MouthCurve = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
+Samples = Floats
+MouthCurve = Callable[[Doubles], Doubles]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
 
 RATES = (0.8, 1.0, 1.5, 2.0)
 _MIN_MOUTHS = 3
@@ -74,7 +73,7 @@ class RateScore:
     of_phones: dict[str, float]  # accuracy over the mean mouths of phones, by method
 
 
-def accuracy_of(predicted: Array, real: Array) -> float:
+def accuracy_of(predicted: Doubles, real: Doubles) -> float:
     """Compare mouth FAPs, (num_frames, num_mouth_faps) each; NaN where not measured."""
     predicted, real = predicted[:, _LIP_COLUMNS], real[:, _LIP_COLUMNS]
     difference, size = np.abs(predicted - real), np.abs(real)
@@ -92,13 +91,13 @@ def score_rates(folder: Path) -> list[RateScore]:
 
 
 def _score_rate(
-    model: AcousticModel, clips: Sequence[LipClip], real: Sequence[Array], rate: float
+    model: AcousticModel, clips: Sequence[LipClip], real: Sequence[Doubles], rate: float
 ) -> RateScore:
     num_syllables, seconds = 0, 0.0
     symbols: list[str] = []
-    real_onsets: list[Array] = []
-    frames: dict[str, list[Array]] = defaultdict(list)
-    onsets: dict[str, list[Array]] = defaultdict(list)
+    real_onsets: list[Doubles] = []
+    frames: dict[str, list[Doubles]] = defaultdict(list)
+    onsets: dict[str, list[Doubles]] = defaultdict(list)
     progress = track(clips, description=f"{rate:g} times the rate")
     for clip, faps in zip(progress, real, strict=True):
         samples = clip.samples if rate == 1.0 else change_speed(clip.samples, rate)
@@ -115,7 +114,7 @@ def _score_rate(
     frames_of = {name: np.concatenate(mouths) for name, mouths in frames.items()}
     means_of = {name: mean_mouths(symbols, np.concatenate(faps)) for name, faps in onsets.items()}
 
-    def method_accuracies(predicted: Mapping[str, Array], real: Array) -> dict[str, float]:
+    def method_accuracies(predicted: Mapping[str, Doubles], real: Doubles) -> dict[str, float]:
         return {name: accuracy_of(mouths, real) for name, mouths in predicted.items()}
 
     return RateScore(
@@ -126,7 +125,7 @@ def _score_rate(
     )
 
 
-def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
+def mean_mouths(symbols: Sequence[str], mouths: Doubles) -> Doubles:
     """Return the mean mouth of each phone that occurs at least 3 times, NaN where never measured.
 
     ``symbols`` has the phone of each mouth; mouths are FAPs (num_mouths, num_mouth_faps).
@@ -141,7 +140,7 @@ def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
     return np.array(means).reshape(-1, mouths.shape[1])
 
 
-def scale_openings(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
+def scale_openings(speakers: Sequence[str], mouths: Sequence[Doubles]) -> list[Doubles]:
     """Scale FAPs (num_frames, num_mouth_faps) so that every speaker's widest opening is R = 5."""
     full = -float(opening_to_faps([MAX_OPENING])[0, _MIDDLE_LIP_COLUMNS].sum())
     _, widest = openings_of(speakers, mouths)
@@ -185,5 +184,5 @@ def _curves_of(motion: KeyFrames) -> MouthCurve:
     return lambda times_s: opening_to_faps(motion.openings_at(times_s))
 
 
-def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:
+def _interpolate(times_s: Doubles, frame_s: Doubles, mouths: Doubles) -> Doubles:
     return np.stack([np.interp(times_s, frame_s, column) for column in mouths.T], axis=1)

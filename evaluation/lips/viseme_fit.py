@@ -27,10 +27,9 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisem
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-
-Array = NDArray[np.float64]
 
 _SENTENCE_S = 6.0
 
@@ -54,10 +53,10 @@ class FittedClip:
     clip: LipClip
     phones: list[Phone]
     inventory: PhoneInventory
-    learned: Array  # (num_frames, 68)
-    guessed: Array  # (num_frames, 68)
+    learned: Doubles  # (num_frames, 68)
+    guessed: Doubles  # (num_frames, 68)
 
-    def curves(self, measure: str) -> tuple[Array, Array, Array]:
+    def curves(self, measure: str) -> tuple[Doubles, Doubles, Doubles]:
         """Return measured, learned and guessed values, (num_frames,), without the clip's means."""
         real = CURVES[measure](real_faps(self.clip))
         is_known = ~np.isnan(real)
@@ -86,7 +85,7 @@ def fit_clip(
 ) -> FittedClip:
     """Model a clip's lips with learned and with initial parameters."""
 
-    def curves(lips: DynamicVisemes) -> Array:
+    def curves(lips: DynamicVisemes) -> Doubles:
         num_frames = int(max(clip.time_s[-1], 0.0) * FRAME_RATE_HZ) + 2
         frames = synthesize(lips, phones, num_frames, FRAME_RATE_HZ)
         frame_s = np.arange(num_frames) / FRAME_RATE_HZ
@@ -131,7 +130,7 @@ def _nearest_visemes(fitted: FittedClip) -> NDArray[np.intp]:
     return np.where(is_quiet, rest, timeline.viseme[np.argmin(distance, axis=1)])
 
 
-def _rms(error: Array) -> float:
+def _rms(error: Doubles) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 

@@ -12,12 +12,13 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from kouxing.evaluation.mos.store import Answer
 from kouxing.evaluation.mos.study import SCALES, Study
 from kouxing.evaluation.tables import Table
+from kouxing.shared.arrays import Mask
 from kouxing.shared.errors import UserError
 
 FENCE_RANGES = 1.5  # distance of the fences from the quartiles, in interquartile ranges
@@ -64,7 +65,7 @@ def make_report(study: Study, answers: Iterable[Answer]) -> list[Opinion]:
     return opinions
 
 
-def is_within_fences(scores: ArrayLike) -> NDArray[np.bool_]:
+def is_within_fences(scores: ArrayLike) -> Mask:
     """Return which scores (n,) are not outliers; quartiles are interpolated linearly."""
     values = np.asarray(scores, float)
     lower, upper = np.quantile(values, [0.25, 0.75])

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Integers
 from kouxing.shared.audio.audio_file import check_video
 from kouxing.shared.command.terminal import write_json
 from kouxing.shared.errors import UserError
@@ -88,7 +88,7 @@ def _parse(folder: Path, content: Any) -> Study:
     return Study(root, sentences, conditions, files)
 
 
-def williams_design(num_conditions: int) -> NDArray[np.int64]:
+def williams_design(num_conditions: int) -> Integers:
     """Return orders of conditions as rows: shape (n, n), for an odd n > 1 (2 n, n)."""
     n = num_conditions
     steps = np.arange(n)

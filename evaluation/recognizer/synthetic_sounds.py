@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from scipy.signal import butter, lfilter, sosfiltfilt
 
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.shared.arrays import Doubles, Floats
 
-Samples = NDArray[np.float32]  # (n,), 16 kHz, in [-1, 1]
+Samples = Floats  # (n,), 16 kHz, in [-1, 1]
 _TWELFTH = 2 ** (1 / 12)
 
 _FORMANTS_HZ = {  # formants of a male voice
@@ -45,7 +46,7 @@ _TILT = 0.9  # pole of the pulses' low-pass filter
 _ASPIRATION = 0.02  # noise, relative to the pulses
 
 
-def pink_noise(num_samples: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def pink_noise(num_samples: int, rng: np.random.Generator) -> Doubles:
     """Return noise with equal power in every octave and an RMS of 1."""
     spectrum = np.fft.rfft(rng.normal(size=num_samples))
     frequency = np.maximum(np.fft.rfftfreq(num_samples), 20 / SAMPLE_RATE_HZ)
@@ -150,7 +151,7 @@ def _vowel(
     seconds: float,
     rng: np.random.Generator,
     vibrato: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Doubles:
     """Synthesize a vowel. ``size`` scales the formants; ``vibrato`` is in semitones."""
     num_samples = round(seconds * SAMPLE_RATE_HZ)
     time_s = np.arange(num_samples) / SAMPLE_RATE_HZ
@@ -166,11 +167,11 @@ def _vowel(
         poles = [1.0, -2 * radius * np.cos(angle), radius**2]
         sound = lfilter([sum(poles)], poles, sound)
     distance_s = np.minimum(time_s, time_s[::-1])  # from the start or the end
-    faded: NDArray[np.float64] = sound * np.minimum(1.0, distance_s / _FADE_S)
+    faded: Doubles = sound * np.minimum(1.0, distance_s / _FADE_S)
     return faded
 
 
-def _normalize(sound: NDArray[np.float64]) -> Samples:
+def _normalize(sound: Doubles) -> Samples:
     """Scale to -26 dB full scale, the level of speech near a microphone."""
     return as_samples(sound / np.sqrt(np.mean(sound**2)) * 0.05)
 

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.sounds import Sound, held_out
@@ -26,11 +25,11 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.slices import SLICE_SAMPLES, split_slices
 from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.shared.arrays import Mask
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.phones.events import Phone, Progress, SpeechChange
 
-Mask = NDArray[np.bool_]  # (slices,)
 # a kind of audio, and its recordings, each with a mask of the slices with a voice
 LabeledAudio = tuple[str, Sequence[tuple[Samples, Mask]]]
 

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 from scipy.signal import resample_poly
 
@@ -29,11 +28,10 @@ from kouxing.corpora.lip_clips import LipClip, label_clip
 from kouxing.evaluation.lips.curve_tables import read_table
 from kouxing.evaluation.lips.references import read_parts
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import create_folder
-
-Array = NDArray[np.float64]
 
 FOLDER = Path(__file__).parent
 NODE_PROGRAMS = ("headaudio", "wlipsync", "wawa", "live2d")
@@ -123,7 +121,7 @@ def _wlipsync_profile(clips: Sequence[LipClip]) -> dict[str, Any]:
     model = load_model()
     # wLipSync computes N coefficients for a profile with N phonemes
     blank = _profile({str(k): np.zeros(_NUM_CEPSTRA) for k in range(_NUM_CEPSTRA)})
-    windows: dict[str, list[Array]] = defaultdict(list)
+    windows: dict[str, list[Doubles]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as name:
         _run("wlipsync", clips, Path(name), blank)
         for clip in track(clips, description="profile of wLipSync", transient=True):
@@ -139,7 +137,7 @@ def _wlipsync_profile(clips: Sequence[LipClip]) -> dict[str, Any]:
     return _profile({name: found.mean(axis=0) for name, found in joined.items() if len(found)})
 
 
-def _profile(cepstra: dict[str, Array]) -> dict[str, Any]:
+def _profile(cepstra: dict[str, Doubles]) -> dict[str, Any]:
     phonemes = [{"name": name, "values": values.tolist()} for name, values in cepstra.items()]
     return {**_PROFILE, "mfccs": phonemes}
 

@@ -20,7 +20,6 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.percentiles import percentiles
@@ -30,6 +29,7 @@ from kouxing.evaluation.system.systems import LocalSystem, run_all_services
 from kouxing.evaluation.system.wait import wait_until
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.client_connection import connect_client
@@ -106,7 +106,7 @@ def measure(path: Path, console: Console) -> list[AttackResult]:
 
 
 def _result(
-    system: LocalSystem, name: str, target: str, source: str, speech: NDArray[np.float32]
+    system: LocalSystem, name: str, target: str, source: str, speech: Floats
 ) -> AttackResult:
     with connect_client(system.control) as client:
         services = client.status().services
@@ -132,7 +132,7 @@ def _result(
     return AttackResult(name, target, has_key, growth_mb, kept_mb, restarted, delays_ms)
 
 
-def _delays_ms(control: str, speech: NDArray[np.float32]) -> dict[str, float | None]:
+def _delays_ms(control: str, speech: Floats) -> dict[str, float | None]:
     """Stream a session through all phases; return the 95th percentile of its delays by phase."""
     with connect_client(control) as client, client.open_session(encoding="f32le") as session:
         times_s, delays_s, _ = stream(session, speech)

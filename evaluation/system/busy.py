@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 from kouxing_client import Client
-from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.load import SETTLE_S, LoadGenerator, Speaker
 from kouxing.evaluation.system.systems import run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.command.client_connection import connect_client
@@ -123,7 +123,7 @@ def measure(
 
 @contextlib.contextmanager
 def _speaker(
-    client: Client, speech: NDArray[np.float32], language: str | None
+    client: Client, speech: Floats, language: str | None
 ) -> Iterator[tuple[LoadGenerator, float]]:
     """Open a session, speak until frames arrive; yield the speaker and the time reached."""
     generator = LoadGenerator(client, speech, 1, language)
@@ -143,11 +143,7 @@ def _speaker(
 
 
 def _run(
-    client: Client,
-    speech: NDArray[np.float32],
-    num_programs: int,
-    load_s: float,
-    language: str | None,
+    client: Client, speech: Floats, num_programs: int, load_s: float, language: str | None
 ) -> BusyRun:
     with _speaker(client, speech, language) as (generator, quiet_s):
         start_s = quiet_s + QUIET_S
@@ -178,16 +174,14 @@ def _frames(speaker: Speaker) -> list[tuple[float, float]]:
     )
 
 
-def _ages_s(
-    frames: Sequence[tuple[float, float]], from_s: float, until_s: float
-) -> NDArray[np.float64]:
+def _ages_s(frames: Sequence[tuple[float, float]], from_s: float, until_s: float) -> Doubles:
     """Return the time since the audio of the newest frame was due, every ``STEP_S``."""
     due_s, arrived_s = np.array(frames).T
     order = np.argsort(arrived_s)
     newest_s = np.maximum.accumulate(due_s[order])
     times_s = np.arange(from_s, until_s, STEP_S)
     known = np.searchsorted(arrived_s[order], times_s, side="right") - 1
-    ages_s: NDArray[np.float64] = times_s - newest_s[np.maximum(known, 0)]
+    ages_s: Doubles = times_s - newest_s[np.maximum(known, 0)]
     return ages_s
 
 

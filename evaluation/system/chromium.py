@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
-import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.evaluation.system.wait import wait_until
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 
@@ -221,7 +220,7 @@ def serve_folder(folder: Path) -> Iterator[str]:
             thread.join()
 
 
-def write_wav(path: Path, samples: NDArray[np.float32], rate_hz: int) -> None:
+def write_wav(path: Path, samples: Floats, rate_hz: int) -> None:
     """Write samples (num_samples, num_channels) to a WAV file of 16 bits."""
     with wave.open(str(path), "wb") as file:
         file.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.scoring import count_errors
 from kouxing.evaluation.system.live import ReceivedResults
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
 MIN_STEP = 1.0  # FAP units; a smaller step is invisible
@@ -71,7 +71,7 @@ def worst(faces: Sequence[Continuity]) -> Continuity:
     return Continuity(**{name: max(getattr(face, name) for face in faces) for name in names})
 
 
-def _late_until_s(due_s: NDArray[np.float64], late_s: NDArray[np.float64], fault_s: float) -> float:
+def _late_until_s(due_s: Doubles, late_s: Doubles, fault_s: float) -> float:
     """Return when the last frame arrived that the fault made late."""
     until_s = fault_s
     for due, late in sorted(zip(due_s, late_s, strict=True)):
@@ -82,7 +82,7 @@ def _late_until_s(due_s: NDArray[np.float64], late_s: NDArray[np.float64], fault
     return until_s
 
 
-def largest_steps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
+def largest_steps(faps: Floats) -> Floats:
     """Return the largest change of each FAP from one frame to the next, shape (68,)."""
-    steps: NDArray[np.float32] = np.abs(np.diff(faps, axis=0)).max(axis=0)
+    steps: Floats = np.abs(np.diff(faps, axis=0)).max(axis=0)
     return steps

@@ -22,6 +22,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lips.lip_predictor import GruLipPredictor, load_lip_predictor
 from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level_faps import VISEMES
@@ -51,10 +52,7 @@ def measure_sessions(path: Path) -> dict[str, float]:
 
 
 def _cpu_s(
-    recognizer: Recognizer,
-    lips: GruLipPredictor | None,
-    samples: NDArray[np.float32],
-    num_sessions: int,
+    recognizer: Recognizer, lips: GruLipPredictor | None, samples: Floats, num_sessions: int
 ) -> float:
     """Run every session once through the recording, each from another starting point."""
     streams = [recognizer.create_stream(lip_predictor=lips) for _ in range(num_sessions)]
@@ -114,10 +112,10 @@ def measure_images() -> RenderingCosts:
     return RenderingCosts(opengl, rates, stages, size_bytes, load_s)
 
 
-def _moving_face(number: int) -> NDArray[np.float32]:
+def _moving_face(number: int) -> Floats:
     """Return the FAPs (68,) of an image: one viseme after another, blinks and nods."""
     amount = np.float32(0.5 - 0.5 * np.cos(number * 0.7))
-    faps: NDArray[np.float32] = VISEMES[1 + number // 5 % 14] * amount
+    faps: Floats = VISEMES[1 + number // 5 % 14] * amount
     faps[18:20] = 500 * amount
     faps[47] = 3000 * np.sin(number * 0.3)
     return faps

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from kouxing_client import Client, KouxingError, Refused, Session
-from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.system.continuity import Continuity, compare, worst
@@ -29,6 +28,7 @@ from kouxing.evaluation.system.live import ReceivedResults, speak, speak_undistu
 from kouxing.evaluation.system.network import Network, NetworkLink
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.client_connection import connect_client
@@ -249,7 +249,7 @@ def _start_system(fault: Fault, folder: Path, timing: Timing, console: Console) 
 def _measure_fault(
     name: str,
     folder: Path,
-    sentence: NDArray[np.float32],
+    sentence: Floats,
     undisturbed: list[ReceivedResults],
     timing: Timing,
     console: Console,

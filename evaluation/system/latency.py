@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 from kouxing_client import Client, Session
-from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.evaluation.percentiles import percentiles
 from kouxing.evaluation.system.live import CHUNK_S, speak
 from kouxing.evaluation.system.systems import run_all_services
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.command.client_connection import connect_client
@@ -71,9 +71,7 @@ def measure(path: Path, console: Console, language: str | None = None) -> Latenc
     )
 
 
-def stream(
-    session: Session, sound: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def stream(session: Session, sound: Floats) -> tuple[Doubles, Doubles, Doubles]:
     """Stream in real time; return media time and both latencies of every frame, seconds.
 
     The session takes 32-bit floats. Frames after the last sample are omitted. Raises ``UserError``

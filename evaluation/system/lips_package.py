@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.scoring import ErrorCounts, count_errors
@@ -33,12 +32,13 @@ from kouxing.services.recognizer.lips.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import configured_face
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.arrays import Floats
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent
 
-Samples = NDArray[np.float32]
-Faps = NDArray[np.float32]
+Samples = Floats
+Faps = Floats
 
 SERVER, PACKAGE, DIFFERENCE = "server", "package", "difference"
 _SCRIPT = ROOT / "clients/kouxing-lips/demo/frames.mjs"

@@ -24,7 +24,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip
@@ -37,12 +36,11 @@ from kouxing.evaluation.rivals.tables import find_node
 from kouxing.evaluation.source_tree import ROOT
 from kouxing.evaluation.system.chromium import Chromium, serve_folder, write_wav
 from kouxing.services.cli.web_model import web_model
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
-
-Array = NDArray[np.float64]
 
 OURS = "kouxing-lips"
 _NONE = "none"  # a page without lip sync
@@ -154,16 +152,16 @@ def _serve_site(audio: Path, profile: bytes | None) -> Iterator[_Site]:
             yield _Site(folder, origin, folder / "voice.wav")
 
 
-def _recordings(clips: Sequence[LipClip]) -> list[NDArray[np.float32]]:
+def _recordings(clips: Sequence[LipClip]) -> list[Floats]:
     return [clip.samples for clip in clips[:: -(-len(clips) // _NUM_PROFILE_CLIPS)]]
 
 
-def _demo_samples() -> list[NDArray[np.float32]]:
+def _demo_samples() -> list[Floats]:
     files = sorted((ROOT / "shared/demo").glob("*.wav"))
     return [read_audio(file)[0].reshape(-1) for file in files]
 
 
-def _wlipsync_profile(recordings: Iterable[NDArray[np.float32]]) -> bytes:
+def _wlipsync_profile(recordings: Iterable[Floats]) -> bytes:
     """Return a profile for wLipSync from recordings, samples at 16 kHz."""
     with tempfile.TemporaryDirectory() as name:
         for number, samples in enumerate(recordings):
@@ -219,7 +217,7 @@ def _with_accuracy(
 
 
 def _add_accuracy(
-    page: LipsPage, column: int, played_clips: Sequence[tuple[Array, Mouth]]
+    page: LipsPage, column: int, played_clips: Sequence[tuple[Doubles, Mouth]]
 ) -> LipsPage:
     """Add the agreement with real mouths. A take has rows of a time and openings."""
 
@@ -239,7 +237,7 @@ def _add_accuracy(
     )
 
 
-def _shown_mouth(rows: Array, column: int, lag_s: float) -> Mouth:
+def _shown_mouth(rows: Doubles, column: int, lag_s: float) -> Mouth:
     """Return a column of openings as a mouth, earlier by a lag."""
     time_s = np.arange(int(rows[-1, 0] * FRAME_RATE_HZ)) / FRAME_RATE_HZ
     faps = np.zeros((len(time_s), NUM_FAPS))

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from kouxing_client import Client, FapFrame, KouxingError, Phone, Session
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
@@ -31,7 +31,7 @@ class ReceivedResults:
     live_until_s: float = 0.0  # when the last sample was due
 
     @property
-    def faps(self) -> NDArray[np.float32]:
+    def faps(self) -> Floats:
         """FAPs of all frames, shape (frames, 68)."""
         return np.array([np.frombuffer(frame.values, "<f4") for _, frame in self.frames])
 
@@ -55,7 +55,7 @@ class ReceivedResults:
 
 def speak(
     sessions: Sequence[Session],
-    sound: NDArray[np.float32],
+    sound: Floats,
     *,
     paced: bool = True,
     on_step: Callable[[], None] = lambda: None,
@@ -73,7 +73,7 @@ def speak(
     return [speaker.received for speaker in speakers]
 
 
-def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> ReceivedResults:
+def speak_undisturbed(client: Client, sound: Floats) -> ReceivedResults:
     """Return what a session receives for audio without any fault; it is not paced.
 
     Raises ``UserError`` if results are missing every time, as on a machine that is too busy.
@@ -88,7 +88,7 @@ def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> ReceivedRes
 
 
 class _Speaker:
-    def __init__(self, session: Session, sound: NDArray[np.float32], *, paced: bool) -> None:
+    def __init__(self, session: Session, sound: Floats, *, paced: bool) -> None:
         self._session = session
         self._output = session.results(FapFrame, Phone, keep_all=True)
         pcm, size = sound.astype("<f4").tobytes(), 4 * CHUNK

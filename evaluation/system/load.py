@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from kouxing_client import Client, FapFrame, Refused, Session
-from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.corpora.figures import new_figure
@@ -27,6 +26,7 @@ from kouxing.evaluation.system.wait import wait_until
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.service_kinds import KINDS, read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -118,7 +118,7 @@ def measure(
 
 def _step(
     control: str,
-    speech: NDArray[np.float32],
+    speech: Floats,
     num_asked: int,
     step_s: float,
     delay_s: float,
@@ -211,7 +211,7 @@ def draw(load: Load) -> Any:
     return figure
 
 
-def speaker_audio(speech: NDArray[np.float32], number: int) -> NDArray[np.float32]:
+def speaker_audio(speech: Floats, number: int) -> Floats:
     """Return the audio of a speaker: the speech from another position, in another voice."""
     rotated = np.roll(speech, -round(number * _OFFSET * len(speech)) % len(speech))
     voice = VOICES[number % len(VOICES)]
@@ -268,11 +268,7 @@ class LoadGenerator:
     """Sessions of one client with audio in real time, whose chunks are spread evenly."""
 
     def __init__(
-        self,
-        client: Client,
-        speech: NDArray[np.float32],
-        num_speakers: int,
-        language: str | None = None,
+        self, client: Client, speech: Floats, num_speakers: int, language: str | None = None
     ) -> None:
         self.speakers: list[Speaker] = []  # admitted
         self.refusals: dict[str, int] = {}  # number by code

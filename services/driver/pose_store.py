@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.idle_motion import FADE_S, STALL_S, RestingFace
 
 NEWEST = "newest"
 
-Faps = NDArray[np.float32]
+Faps = Floats
 
 
 @dataclass(slots=True)

@@ -10,11 +10,9 @@ import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.heads import HEAD_NAMES
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.monitoring.logs import LOG
 
@@ -53,7 +51,7 @@ class View:
         """Whether a window or a virtual camera shows the face."""
         return self._is_window_open or self._virtual_camera is not None
 
-    def show(self, faps: NDArray[np.float32], caption: str, now_s: float) -> None:
+    def show(self, faps: Floats, caption: str, now_s: float) -> None:
         """Draw a face (68,) and set the window's caption."""
         if self._window is not None and self._is_window_open:
             self._window.set_caption(caption)

@@ -26,10 +26,9 @@ MNS0 / 1024 or MW0 / 1024. The neutral frames are silent frames with closed lips
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Mask
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-
-Array = NDArray[np.float64]
 
 # Points of MediaPipe's canonical face model (Apache-2.0) that its own alignment uses, without jaw
 # and cheeks: cm, right-handed, y up, z out of the face.
@@ -83,7 +82,7 @@ _CLOSED_FRACTION_SPEAKING = 0.08  # the same in recordings without silence
 _MIN_NEUTRAL = 5  # frames
 
 
-def compute_mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array:
+def compute_mouth_faps(landmarks: NDArray[np.floating], level_db: Doubles) -> Doubles:
     """Compute the FAPs of a mouth relative to its own neutral face, FAP units, (n, 28).
 
     ``landmarks`` are ``LANDMARKS`` of each frame, pixels, (n, 43, 3). ``level_db`` are the audio
@@ -112,7 +111,7 @@ def _landmark_index(point: int) -> int:
     return LANDMARKS.index(point)
 
 
-def _align_head(landmarks: Array) -> Array:
+def _align_head(landmarks: Doubles) -> Doubles:
     points = landmarks * (1, -1, -1)  # y up, z out of the face
     steady = points[:, [_landmark_index(point) for point in _STABLE_POINTS]]
     canonical = np.array(list(_STABLE_POINTS.values()))
@@ -126,14 +125,14 @@ def _align_head(landmarks: Array) -> Array:
     strength[:, -1] *= np.sign(np.linalg.det(left @ right))  # no reflection
     left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
     scale = strength.sum(axis=1) / size
-    aligned: Array = scale[:, None, None] * (points - center) @ (left @ right).transpose(0, 2, 1)
+    aligned: Doubles = scale[:, None, None] * (points - center) @ (left @ right).transpose(0, 2, 1)
     aligned += goal
     return aligned
 
 
-def _is_neutral(height: Array, level_db: Array) -> NDArray[np.bool_]:
+def _is_neutral(height: Doubles, level_db: Doubles) -> Mask:
     quiet = level_db < np.percentile(level_db, _LOUD_PERCENTILE) - _QUIET_DB
-    neutral: NDArray[np.bool_] = quiet & (height <= np.quantile(height, _CLOSED_FRACTION))
+    neutral: Mask = quiet & (height <= np.quantile(height, _CLOSED_FRACTION))
     if neutral.sum() < _MIN_NEUTRAL:
         neutral = height <= np.quantile(height, _CLOSED_FRACTION_SPEAKING)
     return neutral

@@ -12,12 +12,12 @@ every size.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.learning import FilmedSpeech
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels, select_lip_faps
 from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.audio_file import MAX_RATE_HZ, MIN_RATE_HZ
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -43,7 +43,7 @@ def parse_landmark_file(content: bytes) -> FilmedSpeech:
     return FilmedSpeech(samples=samples, frame_s=time_s, lip_track=select_lip_faps(faps))
 
 
-def _parse(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
+def _parse(content: bytes) -> tuple[Doubles, Floats, Floats]:
     """Return times, landmarks and the audio at 16 kHz; ValueError if the content is invalid."""
     if len(content) > MAX_BYTES:
         raise ValueError(f"it is larger than {MAX_BYTES >> 20} MiB")

@@ -28,7 +28,6 @@ from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.mouth_profiles.lip_inputs import ENCODER_FRAME_S, record_lip_inputs
 from kouxing.services.mouth_profiles.lip_tracks import (
@@ -44,10 +43,8 @@ from kouxing.services.recognizer.lips.lip_predictor import (
     load_lip_predictor,
 )
 from kouxing.services.recognizer.lips.mouth_profile import MouthProfile
+from kouxing.shared.arrays import Doubles, Floats, Mask
 from kouxing.shared.errors import UserError
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # ridge strengths to try, encoder frames
 FACE_DELAY_S = 0.06  # delay of the face for which the gain is measured
@@ -66,23 +63,23 @@ class FilmedSpeech:
     """A recording of a speaker with tracked lips."""
 
     samples: Floats  # 16 kHz mono
-    frame_s: Array  # (frames,) times of the images in the audio
-    lip_track: Array  # (frames, 15) FAP units, NaN where not tracked
+    frame_s: Doubles  # (frames,) times of the images in the audio
+    lip_track: Doubles  # (frames, 15) FAP units, NaN where not tracked
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observations:
     """Predicted and tracked lips at the encoder frames of speech."""
 
-    known_s: Array  # (n,)
+    known_s: Doubles  # (n,)
     predicted: Floats  # (n, delays, 15)
     hidden: Floats  # (n, 2 units)
-    tracked: Array  # (n, delays, 15), NaN where unknown
+    tracked: Doubles  # (n, delays, 15), NaN where unknown
 
     def __len__(self) -> int:
         return len(self.known_s)
 
-    def __getitem__(self, rows: slice | NDArray[np.bool_]) -> Self:
+    def __getitem__(self, rows: slice | Mask) -> Self:
         return type(self)(**{name: values[rows] for name, values in self._arrays().items()})
 
     def _arrays(self) -> dict[str, Any]:
@@ -101,10 +98,10 @@ class ProfileGain:
 
     speech_s: float
     delay_s: float
-    before: Array  # (3,) correlation for each of ``MEASURES``; NaN without movement
-    after: Array  # (3,)
-    time_s: Array  # (n,)
-    curves: Array  # (3, 3, n): measure; tracked, before, after
+    before: Doubles  # (3,) correlation for each of ``MEASURES``; NaN without movement
+    after: Doubles  # (3,)
+    time_s: Doubles  # (n,)
+    curves: Doubles  # (3, 3, n): measure; tracked, before, after
 
 
 def observe(lip_predictor: GruLipPredictor, filmed: FilmedSpeech) -> Observations:
@@ -130,7 +127,7 @@ def observe(lip_predictor: GruLipPredictor, filmed: FilmedSpeech) -> Observation
     )
 
 
-def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> float:
+def _camera_lag_s(filmed: FilmedSpeech, time_s: Doubles, predicted: Floats) -> float:
     """Estimate how much later than the audio the images arrive; 0 if there is too little speech."""
     if len(time_s) * ENCODER_FRAME_S < MIN_SPEECH_S:
         return 0.0
@@ -198,15 +195,15 @@ def apply_profile(profile: MouthProfile, observations: Observations) -> Floats:
     return scaled + np.tensordot(observations.hidden, profile.residual, axes=1)
 
 
-def _is_tracked(observations: Observations) -> NDArray[np.bool_]:
+def _is_tracked(observations: Observations) -> Mask:
     """Mask of the FAPs that are tracked anywhere, (15,)."""
     return np.logical_not(np.isnan(observations.tracked).all(axis=(0, 1)))
 
 
-def _is_known(observations: Observations) -> NDArray[np.bool_]:
+def _is_known(observations: Observations) -> Mask:
     """Mask of the encoder frames where these FAPs are known for all delays, (n,)."""
     unknown = np.isnan(observations.tracked[..., _is_tracked(observations)])
-    known: NDArray[np.bool_] = ~unknown.any(axis=(1, 2)) & (unknown.shape[2] > 0)
+    known: Mask = ~unknown.any(axis=(1, 2)) & (unknown.shape[2] > 0)
     return known
 
 
@@ -291,6 +288,6 @@ def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     )
 
 
-def _to_json(values: NDArray[np.float64]) -> list[float | None]:
+def _to_json(values: Doubles) -> list[float | None]:
     """Convert numbers to JSON values; NaN becomes None."""
     return [round(float(value), 4) if np.isfinite(value) else None for value in values]

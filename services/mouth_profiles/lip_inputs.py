@@ -12,9 +12,8 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lips.lip_predictor import join_features
 from kouxing.services.recognizer.live.speech_segmenter import SpeechSegmenter
+from kouxing.shared.arrays import Floats
 from kouxing.shared.phones.events import LipPositions
-
-Floats = NDArray[np.float32]
 
 ENCODER_FRAME_S = FRAMES_PER_ENCODER_FRAME * HOP_S
 

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.slices import level_db
 from kouxing.services.recognizer.lips.lip_predictor import LIP_FAPS, OTHER_SIDE
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.faps import MOUTH_FAPS
-
-Array = NDArray[np.float64]
 
 MEASURES = ("opening", "width", "jaw")
 LEVEL_STEP_S = 0.02
@@ -22,19 +21,19 @@ _SIDES = [[MOUTH_FAPS.index(fap), MOUTH_FAPS.index(OTHER_SIDE.get(fap, fap))] fo
 _JAW, _UPPER_LIP, _LOWER_LIP, _CORNER = (LIP_FAPS.index(fap) for fap in (3, 4, 5, 6))
 
 
-def select_lip_faps(faps: Array) -> Array:
+def select_lip_faps(faps: Doubles) -> Doubles:
     """Select lip FAPs from mouth FAPs, (n, 28) to (n, 15). Left and right are averaged."""
     return np.stack([faps[:, pair].mean(axis=1) for pair in _SIDES], axis=1)
 
 
-def lip_measures(lips: NDArray[np.floating]) -> Array:
+def lip_measures(lips: NDArray[np.floating]) -> Doubles:
     """Compute opening, width and jaw, (n, 3), from FAPs, (n, 15 or more)."""
     height = -lips[:, _UPPER_LIP] - lips[:, _LOWER_LIP]
-    measures: Array = np.stack([height, 2 * lips[:, _CORNER], lips[:, _JAW]], axis=1)
+    measures: Doubles = np.stack([height, 2 * lips[:, _CORNER], lips[:, _JAW]], axis=1)
     return measures
 
 
-def interpolate_track(frame_s: Array, values: Array, time_s: Array) -> Array:
+def interpolate_track(frame_s: Doubles, values: Doubles, time_s: Doubles) -> Doubles:
     """Interpolate a track, (n,), at times of any shape; NaN outside it and within long gaps."""
     known = ~np.isnan(values)
     if known.sum() < 2:
@@ -45,11 +44,11 @@ def interpolate_track(frame_s: Array, values: Array, time_s: Array) -> Array:
     after = np.clip(np.searchsorted(frame_s, time_s), 1, len(frame_s) - 1)
     is_gap = frame_s[after] - frame_s[after - 1] > max_gap_s
     outside = (time_s < frame_s[0]) | (time_s > frame_s[-1])
-    interpolated: Array = np.interp(time_s, frame_s, values)
+    interpolated: Doubles = np.interp(time_s, frame_s, values)
     return np.where(is_gap | outside, np.nan, interpolated)
 
 
-def correlate_curves(pairs: Sequence[tuple[Array, Array]]) -> Array:
+def correlate_curves(pairs: Sequence[tuple[Doubles, Doubles]]) -> Doubles:
     """Correlate predicted and tracked curves, (n, curves) each, pooled over the pairs.
 
     Each pair's means are removed first. NaN values are ignored. The result is NaN for a curve that
@@ -69,7 +68,7 @@ def correlate_curves(pairs: Sequence[tuple[Array, Array]]) -> Array:
     return np.array(figures)
 
 
-def measure_levels(samples: NDArray[np.float32]) -> list[tuple[float, float]]:
+def measure_levels(samples: Floats) -> list[tuple[float, float]]:
     """Measure the level as the live system does: pairs of time (s) and level (dB full scale)."""
     step = round(LEVEL_STEP_S * MEDIA_RATE_HZ)
     ends = range(step, len(samples) + 1, step)

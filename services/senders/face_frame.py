@@ -2,9 +2,7 @@
 
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shapes import SHAPE_SETS
 
@@ -32,7 +30,7 @@ class FaceFrame:
     ``time_s`` is media time. At rest it continues from the last frame, or from 0.
     """
 
-    def __init__(self, faps: NDArray[np.float32], time_s: float) -> None:
+    def __init__(self, faps: Floats, time_s: float) -> None:
         self.faps = faps
         self.time_s = time_s
         self._weights: dict[str, dict[str, float]] = {}

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.senders.connection import TargetConnection
 from kouxing.services.senders.face_frame import FaceFrame
 from kouxing.services.senders.protocols import change_delay, make_connection
 from kouxing.services.senders.target import Target
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.face.idle_motion import FADE_S, RESTING_RATE_HZ, STALL_S, RestingFace
@@ -26,7 +26,7 @@ WINDOW_S = 2.0  # period in which the smallest network delay counts
 PAUSE_S = 0.5  # a frame that is this much later than other frames follows a pause
 MAX_COUNTED = 1000  # frames in the window
 
-Faps = NDArray[np.float32]
+Faps = Floats
 TargetKey = tuple[str, str, int]  # ``Target.key``
 Result = TypeVar("Result")
 

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.lip_model import LipModel, MouthFrame
@@ -29,6 +28,7 @@ from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifi
 from kouxing.services.synthesizer.modifiers.nonverbal import ExpressionModifier, NonverbalModifier
 from kouxing.services.synthesizer.modifiers.speech_motion import SpeechMotionModifier
 from kouxing.services.synthesizer.phone_renumberer import PhoneRenumberer
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.clock import MAX_GAP_S
 from kouxing.shared.face.expression_motion import JAW, mix_expression
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -43,8 +43,8 @@ from kouxing.shared.phones.events import (
     time_of,
 )
 
-Faps: TypeAlias = NDArray[np.float64]  # (68,)
-Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds; FAPs (68,)
+Faps: TypeAlias = Doubles  # (68,)
+Frame: TypeAlias = tuple[float, Floats]  # media time in seconds; FAPs (68,)
 
 MAX_DELAY_S = 1.5  # at most 0.3 live; a viseme further ahead has no visible weight
 REST_S = 0.3  # duration of the return to rest after the end of the sound
@@ -173,9 +173,7 @@ class FaceAnimator:
         """
         self._phones.restart()
 
-    def resume(
-        self, time_s: float, num_frames: int, shown: NDArray[np.float32] | None = None
-    ) -> None:
+    def resume(self, time_s: float, num_frames: int, shown: Floats | None = None) -> None:
         """Replace the face of another process, before this face has made any frames.
 
         Events of the last seconds may be repeated. Their last frames are rehearsed, not shown.
@@ -324,7 +322,7 @@ class FaceAnimator:
         self._shown = shown
         return self._time_s, faps
 
-    def _add_difference(self, faps: NDArray[np.float32], difference: Faps) -> None:
+    def _add_difference(self, faps: Floats, difference: Faps) -> None:
         """Add the remaining difference of a transition to a frame, in place."""
         if difference.any():
             lip_weight = max(
@@ -334,7 +332,7 @@ class FaceAnimator:
             mix_expression(faps, difference.astype(np.float32), lip_weight)
             faps[JAW] = max(jaw, 0.0)
 
-    def _make_target(self, mouth: MouthFrame) -> NDArray[np.float32]:
+    def _make_target(self, mouth: MouthFrame) -> Floats:
         """Make the next frame without the transition, FAPs (68,)."""
         levels, self._levels = self._levels, []
         pitches, self._pitches = self._pitches, []
@@ -351,7 +349,7 @@ class FaceAnimator:
         step_s: float,
         levels: Sequence[tuple[float, float]],
         pitches: Sequence[tuple[float, float]],
-    ) -> NDArray[np.float32]:
+    ) -> Floats:
         """Apply all modifiers to a mouth; return FAPs (68,). A step of 0 is a dry run."""
         faps = np.zeros(NUM_FAPS, dtype=np.float32)
         faps[_MOUTH] = mouth.faps

@@ -5,12 +5,11 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 
-import numpy as np
 from kouxing_client.messages import FapFrame
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lateness import LatenessMeter
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.network.reliable import ReliableReceiver
@@ -72,7 +71,7 @@ class SynthesizerSession:
         if self.skip_policy.update(waiting_s, now_s):
             self.face.skip_to(self.newest_event_s)
 
-    def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
+    def resume(self, media_time: int, num_frames: int, faps: Floats | None) -> None:
         """Continue after the newest frame of another synthesizer."""
         self.output_sequence = num_frames
         self.face.resume(to_seconds(media_time), num_frames, faps)

@@ -10,12 +10,11 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, audio_file_kind, find_media_start
 from kouxing.shared.audio.pcm import FULL_SCALE, as_floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-
-Array = NDArray[np.float64]
 
 BLOCK_SAMPLES = 2400  # per channel, checked together; a multiple of all sample sizes
 _MAX_BLOCKS = 60  # non-silent blocks after which the check ends
@@ -163,7 +162,7 @@ class EncodingCheck:
         return _measure(channels[:, channels.std(axis=0).argmax()])
 
 
-def _decode(data: NDArray[np.uint8], codec: str) -> NDArray[np.float32]:
+def _decode(data: NDArray[np.uint8], codec: str) -> Floats:
     """Decode bytes as samples of one channel."""
     decoder: Any = av.CodecContext.create(codec, "r")
     decoder.sample_rate, decoder.layout = MEDIA_RATE_HZ, "mono"  # any rate
@@ -172,7 +171,7 @@ def _decode(data: NDArray[np.uint8], codec: str) -> NDArray[np.float32]:
         return as_floats(frame.to_ndarray().ravel())
 
 
-def _measure(samples: Array) -> Measure:
+def _measure(samples: Doubles) -> Measure:
     samples = samples - samples.mean()
     segments = np.lib.stride_tricks.sliding_window_view(samples, _SEGMENT)[:: _SEGMENT // 2]
     power = (np.abs(np.fft.rfft(segments * np.hanning(_SEGMENT))) ** 2).mean(axis=0)[1:]

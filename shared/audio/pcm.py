@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 
 FULL_SCALE = 32768.0  # divides 16-bit samples, which are then in [-1, 1)
 
 
-def as_floats(samples: NDArray[Any]) -> NDArray[np.float32]:
+def as_floats(samples: NDArray[Any]) -> Floats:
     """Convert samples of any type to floats with full scale at 1."""
     values = samples.astype(np.float32)
     if samples.dtype.kind == "f":
@@ -19,14 +20,14 @@ def as_floats(samples: NDArray[Any]) -> NDArray[np.float32]:
     return values - 1 if samples.dtype.kind == "u" else values
 
 
-def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
+def as_integers(samples: Floats) -> NDArray[np.int16]:
     """Convert samples in [-1, 1] to little-endian 16-bit integers."""
     scaled = np.clip(np.rint(samples * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
     integers: NDArray[np.int16] = scaled.astype("<i2")
     return integers
 
 
-def decode_pcm(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
+def decode_pcm(pcm: bytes, encoding: str, num_channels: int) -> Floats:
     """Convert bytes to samples, shape (n, channels), clipped to [-1, 1].
 
     ``encoding`` is ``s16le`` or ``f32le``.

@@ -1,13 +1,12 @@
 """Mixes any number of audio channels to one or two, without losing a voice."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
+from kouxing.shared.arrays import Doubles, Floats
 
-_LOST_FRACTION = (
-    0.01  # fraction of the loudest channel's energy; a mix with less has lost the channel
-)
+Samples = Floats  # (n, channels), in [-1, 1]
+
+_LOST_FRACTION = 0.01  # of the loudest channel's energy; a mix with less has lost the channel
 _LOST_FRACTION_OF_AVERAGE = 0.1  # the average of nine channels has 1/81 of one voice
 _SILENT_POWER = 1e-6  # -60 dBFS; a channel below it is silent
 
@@ -24,7 +23,7 @@ class PhaseCancellationGuard:
         self._name = name
         self._num_channels = num_channels
         self._warnings = warnings
-        self._energy: NDArray[np.float64] = np.zeros(1)  # energy of every channel so far
+        self._energy: Doubles = np.zeros(1)  # energy of every channel so far
         self._mixed_energy = 0.0
         self._has_warned = False
 

@@ -23,8 +23,8 @@ a       weight of the expression on the lips, 0 to 1          1         (6,)
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import LOWER_LIP_FAPS, NUM_FAPS, UPPER_LIP_FAPS
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
@@ -46,7 +46,7 @@ _ARKIT_EXPRESSIONS = {
     ExpressionName.BROW_DOWN: ("browDownLeft", "browDownRight"),
     ExpressionName.SQUINT: ("eyeSquintLeft", "eyeSquintRight"),
 }
-EXPRESSION_FAPS: dict[str, NDArray[np.float32]] = {  # (68,) at full strength
+EXPRESSION_FAPS: dict[str, Floats] = {  # (68,) at full strength
     **dict(zip(EXPRESSION_NAMES[1:], EXPRESSIONS[1:], strict=True)),
     **{
         name: ARKIT.basis[[ARKIT.names.index(shape) for shape in shapes]].sum(axis=0)
@@ -62,7 +62,7 @@ class ExpressionMotion:
 
     def __init__(self, ease_s: float = _EASE_S) -> None:
         self._ease_s = ease_s
-        self._goal: NDArray[np.float32] = np.zeros(NUM_FAPS, np.float32)
+        self._goal: Floats = np.zeros(NUM_FAPS, np.float32)
         self._shown = TwoPoleFilter(self._goal)
         self._remaining_s = 0.0  # time until the expressions fade
         self.lip_weight = 1.0  # lowest weight on the lips: 1 without speech, 0 in speech
@@ -79,11 +79,11 @@ class ExpressionMotion:
                 goal += np.float32(strength) * EXPRESSION_FAPS[name]
         self.show_faps(goal, hold_s if strengths else 0.0)
 
-    def show_faps(self, goal: NDArray[np.float32], hold_s: float) -> None:
+    def show_faps(self, goal: Floats, hold_s: float) -> None:
         """Replace the current expressions with FAPs, (68,), for a time."""
         self._goal, self._remaining_s = goal, hold_s
 
-    def add(self, faps: NDArray[np.float32], step_s: float, *, is_speaking: bool) -> None:
+    def add(self, faps: Floats, step_s: float, *, is_speaking: bool) -> None:
         """Add the expressions to a frame, FAPs (68,), in place."""
         is_held = self._remaining_s > 0.0
         self._remaining_s -= step_s
@@ -98,9 +98,7 @@ class ExpressionMotion:
             self._is_shown = bool(np.abs(shown).max() > _VISIBLE)
 
 
-def mix_expression(
-    faps: NDArray[np.float32], expression: NDArray[np.float32], lip_weight: float
-) -> None:
+def mix_expression(faps: Floats, expression: Floats, lip_weight: float) -> None:
     """Add an expression (68,) to a face (68,), in place; ``lip_weight`` is the least ``a``."""
     gap = -(faps[UPPER] + faps[LOWER])
     room = np.minimum(np.minimum(gap, -faps[LOWER]), OPEN) - CLOSED

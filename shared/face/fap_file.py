@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats, Integers, Mask
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.files.output_file import open_output, path_as_text
@@ -49,9 +49,9 @@ class FapAnimation:
 
     name: str
     frame_rate_hz: float
-    faps: NDArray[np.float32]  # (num_frames, 68), FAP units; FAP 1 and 2 hold the first selection
-    visemes: NDArray[np.int64] | None = None  # (num_frames, 4), the numbers of FAP 1; None if unset
-    expressions: NDArray[np.int64] | None = None  # (num_frames, 6), the numbers of FAP 2
+    faps: Floats  # (num_frames, 68), FAP units; FAP 1 and 2 hold the first selection
+    visemes: Integers | None = None  # (num_frames, 4), the numbers of FAP 1; None if unset
+    expressions: Integers | None = None  # (num_frames, 6), the numbers of FAP 2
     start_s: float = 0.0  # time of the first frame in the session
 
 
@@ -162,7 +162,7 @@ def _parse_int(word: str, description: str) -> int:
         raise ValueError(f"'{word}' is not {description}") from None
 
 
-def _parse_mask(line: str) -> NDArray[np.bool_]:
+def _parse_mask(line: str) -> Mask:
     digits = "".join(line.split())
     if len(digits) not in (NUM_FAPS, _GRETA_MASK_DIGITS) or set(digits) - {"0", "1"}:
         raise ValueError(
@@ -173,9 +173,7 @@ def _parse_mask(line: str) -> NDArray[np.bool_]:
     return np.array([digit == "1" for digit in digits[:NUM_FAPS]])
 
 
-def _parse_values(
-    words: list[str], mask: NDArray[np.bool_]
-) -> tuple[list[int], list[int], NDArray[np.float32]]:
+def _parse_values(words: list[str], mask: Mask) -> tuple[list[int], list[int], Floats]:
     """Return the numbers of FAP 1 (4) and FAP 2 (6), and the other values in the mask.
 
     The first word is the number of the frame.

@@ -14,17 +14,15 @@ standard's English ones. Deviations:
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.files.tsv_tables import read_table
-
-Float32 = NDArray[np.float32]
 
 FULL = 63  # highest viseme_blend and expression_intensity
 
 
-def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
+def fap_table(name: str) -> tuple[list[dict[str, str]], Floats]:
     """Read a table of this package: its rows, and its columns ``fapN`` as FAPs (rows, 68)."""
     rows = read_table(__package__, name)
     values = np.zeros((len(rows), NUM_FAPS), np.float32)
@@ -35,7 +33,7 @@ def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
     return rows, values
 
 
-def _read(kind: str) -> tuple[tuple[str, ...], Float32]:
+def _read(kind: str) -> tuple[tuple[str, ...], Floats]:
     rows, values = fap_table("high_level.tsv")
     indices = [number for number, row in enumerate(rows) if row["kind"] == kind]
     return tuple(rows[number]["name"] for number in indices), values[indices]
@@ -45,24 +43,24 @@ VISEME_NAMES, VISEMES = _read("viseme")  # (15, 68), row 0 is "none"
 EXPRESSION_NAMES, EXPRESSIONS = _read("expression")  # (7, 68), row 0 is neutral
 
 
-def viseme_faps(select1: int, select2: int, blend: float) -> Float32:
+def viseme_faps(select1: int, select2: int, blend: float) -> Floats:
     """Blend two visemes (0 for none, 1 to 14) into low-level FAPs (68,).
 
     ``blend`` goes from 0 (second viseme only) to 63 (first viseme only).
     """
     fraction = np.float32(blend / FULL)
-    blended: Float32 = VISEMES[select1] * fraction + VISEMES[select2] * (1 - fraction)
+    blended: Floats = VISEMES[select1] * fraction + VISEMES[select2] * (1 - fraction)
     return blended
 
 
 def expression_faps(
     select1: int, intensity1: float, select2: int = 0, intensity2: float = 0.0
-) -> Float32:
+) -> Floats:
     """Add two expressions into low-level FAPs (68,).
 
     Expressions: 1 joy, 2 sadness, 3 anger, 4 fear, 5 disgust, 6 surprise; 0 for none. Intensities
     go from 0 to 63.
     """
     first, second = np.float32(intensity1 / FULL), np.float32(intensity2 / FULL)
-    added: Float32 = EXPRESSIONS[select1] * first + EXPRESSIONS[select2] * second
+    added: Floats = EXPRESSIONS[select1] * first + EXPRESSIONS[select2] * second
     return added

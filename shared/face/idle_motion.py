@@ -18,8 +18,8 @@ from collections.abc import Mapping
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.face.expression_motion import ExpressionMotion
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.smoothing import smooth_step, smoothing_gain
@@ -121,10 +121,7 @@ class IdleMotion:
         self._reaction_s = math.inf  # when the gaze follows a new state
 
     def apply(
-        self,
-        faps: NDArray[np.float32],
-        time_s: float,
-        state: ConversationState = ConversationState.SILENT,
+        self, faps: Floats, time_s: float, state: ConversationState = ConversationState.SILENT
     ) -> None:
         """Add the motion, at a time since the first frame, to FAPs (68,) in place."""
         if state is not self._state:
@@ -171,7 +168,7 @@ class IdleMotion:
             return smooth_step(since_s / _LID_FALL_S)
         return 1.0 - smooth_step((since_s - _LID_FALL_S - _LID_CLOSED_S) / _LID_RISE_S)
 
-    def _gaze(self, time_s: float) -> NDArray[np.float64]:
+    def _gaze(self, time_s: float) -> Doubles:
         """Return yaw (left) and pitch (down) of the gaze in space."""
         if time_s >= min(self._fixation_end_s, self._reaction_s):
             saccade_s = self._reaction_s
@@ -182,18 +179,18 @@ class IdleMotion:
             self._look_at(self._target(), saccade_s)
         return self._gaze_at(time_s)
 
-    def _gaze_at(self, time_s: float) -> NDArray[np.float64]:
+    def _gaze_at(self, time_s: float) -> Doubles:
         done = smooth_step((time_s - self._saccade_s) / self._saccade_length_s)
         return self._gaze_from + done * (self._gaze_to - self._gaze_from)
 
-    def _look_at(self, target: NDArray[np.float64], saccade_s: float) -> None:
+    def _look_at(self, target: Doubles, saccade_s: float) -> None:
         if np.array_equal(target, self._gaze_to):
             return
         self._gaze_from, self._gaze_to = self._gaze_at(saccade_s), target
         size_deg = float(np.linalg.norm(target - self._gaze_from)) / DEGREE
         self._saccade_s, self._saccade_length_s = saccade_s, 0.021 + 0.0022 * size_deg
 
-    def _target(self) -> NDArray[np.float64]:
+    def _target(self) -> Doubles:
         """Return the target of the current fixation in the current state."""
         rng = np.random.default_rng([self._seed, self._fixation])
         probability = 1.0 if self.has_eye_contact else _ON_LISTENER[self._state]
@@ -215,7 +212,7 @@ class RestingFace:
         """Show expressions, strengths 0 to 1 by name, for a time; they replace earlier ones."""
         self._expression.show(strengths, hold_s)
 
-    def faps(self, now_s: float) -> NDArray[np.float32]:
+    def faps(self, now_s: float) -> Floats:
         """Return the FAPs (68,) at a time of any clock; times must not decrease."""
         if self._start_s is None:
             self._start_s = self._last_s = now_s
@@ -226,7 +223,7 @@ class RestingFace:
             self._motion.apply(faps, now_s - self._start_s)
         return faps
 
-    def blend(self, face: NDArray[np.float32], weight: float, now_s: float) -> NDArray[np.float32]:
+    def blend(self, face: Floats, weight: float, now_s: float) -> Floats:
         """Blend another face with the resting face; return FAPs (68,). 1 is the other face."""
         rest = self.faps(now_s)
         return rest + np.float32(weight) * (face - rest)

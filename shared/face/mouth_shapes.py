@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.shapes import OCULUS
 
-Float32 = NDArray[np.float32]
 Cue: TypeAlias = tuple[float, str]  # start in seconds, and the mouth
 
 CLOSED, REST = "A", "X"
@@ -29,7 +28,7 @@ _WEAK = 0.12  # weight below which an Oculus viseme is not shown
 _REST_S = 0.2  # lips that stay closed for longer are at rest
 
 
-def mouth_shape(faps: Float32) -> str:
+def mouth_shape(faps: Floats) -> str:
     """Return the letter, A to H, of a face with FAPs (68,)."""
     upper, lower = -float(faps[3]), -float(faps[4])  # how far each lip is from closed lips
     opening = upper + lower
@@ -47,7 +46,7 @@ def mouth_shape(faps: Float32) -> str:
     return "C" if opening < _MAX_OPEN else "D"
 
 
-def oculus_viseme(faps: Float32) -> str:
+def oculus_viseme(faps: Floats) -> str:
     """Return the strongest of the 15 Oculus visemes of a face with FAPs (68,).
 
     ``sil`` is 1 minus the other weights, so it counts only if all others are weak. ``PP`` needs
@@ -60,7 +59,7 @@ def oculus_viseme(faps: Float32) -> str:
     return OCULUS.names[int(weights.argmax())]
 
 
-def mouth_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
+def mouth_cues(frames: Iterable[tuple[float, Floats]]) -> Iterator[Cue]:
     """Yield a cue for each change of the drawn mouth, as soon as the change is certain.
 
     ``frames`` are times in seconds and FAPs (68,). The first cue starts at the first frame. Closed
@@ -68,7 +67,7 @@ def mouth_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
     """
     closed_since_s = -np.inf
 
-    def mouth_of(time_s: float, faps: Float32) -> str:
+    def mouth_of(time_s: float, faps: Floats) -> str:
         nonlocal closed_since_s
         shape = mouth_shape(faps)
         if shape != CLOSED:
@@ -80,14 +79,14 @@ def mouth_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
     return _cues(frames, mouth_of, frozenset({CLOSED, "G"}))
 
 
-def oculus_cues(frames: Iterable[tuple[float, Float32]]) -> Iterator[Cue]:
+def oculus_cues(frames: Iterable[tuple[float, Floats]]) -> Iterator[Cue]:
     """Yield a cue for each change of the strongest Oculus viseme, like :func:`mouth_cues`."""
     return _cues(frames, lambda _, faps: oculus_viseme(faps), frozenset({"PP", "FF"}))
 
 
 def _cues(
-    frames: Iterable[tuple[float, Float32]],
-    mouth_of: Callable[[float, Float32], str],
+    frames: Iterable[tuple[float, Floats]],
+    mouth_of: Callable[[float, Floats], str],
     at_once: frozenset[str],
 ) -> Iterator[Cue]:
     """Yield the mouths that last two frames. Mouths in ``at_once`` may last one frame."""

@@ -37,14 +37,11 @@ bound or an optimality condition, and repeat.
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level_faps import VISEMES, fap_table
 from kouxing.shared.face.shape_names import ShapeSetName
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # lengths of an average face, mm; an eye's angle counts as the distance that the pupil travels
 _FAPU_MM = {"MNS": 17.0, "MW": 48.0, "ENS": 45.0, "ES": 58.0, "IRISD": 9.0}
@@ -58,7 +55,7 @@ _LIDS = slice(18, 22)  # FAPs 19 to 22
 _TONGUE = slice(43, 47)  # FAPs 44 to 47
 
 
-def _effect_mm() -> Float64:
+def _effect_mm() -> Doubles:
     """Return D of equation (2)."""
     lengths = [_FAPU_MM.get(fap.fapu, 0.0) / FAP_UNITS_PER_FAPU for fap in FAPS]
     travel = np.diag([mm or _EYE_RADIUS_MM * RADIANS_PER_ANGLE_UNIT for mm in lengths])
@@ -79,10 +76,10 @@ class ShapeSet:
     def __init__(
         self,
         names: tuple[str, ...],
-        basis: Float32,
-        solved: Float32 | None = None,
-        effect_mm: Float64 = _EFFECT_MM,
-        finish: Callable[[Float32], None] = lambda _weights: None,
+        basis: Floats,
+        solved: Floats | None = None,
+        effect_mm: Doubles = _EFFECT_MM,
+        finish: Callable[[Floats], None] = lambda _weights: None,
     ) -> None:
         self.names = names
         self.basis = basis
@@ -93,16 +90,16 @@ class ShapeSet:
         self._unbounded = np.linalg.solve(self._gram, self._right)
 
     @property
-    def equation(self) -> tuple[Float64, Float64]:
+    def equation(self) -> tuple[Doubles, Doubles]:
         """Matrices of equation (2): (N, N), and (N, 68), which times the FAPs is its right side."""
         return self._gram, self._right
 
-    def faps(self, weights: Float32) -> Float32:
+    def faps(self, weights: Floats) -> Floats:
         """Return the FAPs (68,) of weights (N,), equation (1)."""
-        faps: Float32 = np.asarray(weights, dtype=np.float32) @ self.basis
+        faps: Floats = np.asarray(weights, dtype=np.float32) @ self.basis
         return faps
 
-    def weights(self, faps: Float32) -> Float32:
+    def weights(self, faps: Floats) -> Floats:
         """Return the weights (N,), 0 to 1, whose face is closest to FAPs (68,); equation (2)."""
         if faps.shape != (NUM_FAPS,):
             raise ValueError(f"expected FAPs of shape ({NUM_FAPS},), got {faps.shape}")
@@ -110,7 +107,7 @@ class ShapeSet:
         self._finish(weights)
         return weights
 
-    def _solve(self, faps: Float64) -> Float64:
+    def _solve(self, faps: Doubles) -> Doubles:
         right = self._right @ faps
         guess = self._unbounded @ faps
         at_one = guess >= 1.0
@@ -151,7 +148,7 @@ def _build_arkit() -> ShapeSet:
 
 
 def _build_oculus() -> ShapeSet:
-    def fill_silence(weights: Float32) -> None:
+    def fill_silence(weights: Floats) -> None:
         weights[0] = max(0.0, 1.0 - float(weights.sum()))
 
     names = "sil PP FF TH DD kk CH SS nn RR aa E ih oh ou".split()
@@ -183,7 +180,7 @@ def _build_vrm() -> ShapeSet:
     solved = basis.copy()
     solved[both] = 0.0
 
-    def join_blinks(weights: Float32) -> None:
+    def join_blinks(weights: Floats) -> None:
         weights[both] = weights[both + 1 : both + 3].min()
         weights[both + 1 : both + 3] -= weights[both]
 

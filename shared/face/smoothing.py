@@ -3,10 +3,9 @@
 import math
 from typing import Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from kouxing.shared.arrays import Floats
 
-Value = TypeVar("Value", float, NDArray[np.float32])
+Value = TypeVar("Value", float, Floats)
 
 
 def smoothing_gain(elapsed_s: float, time_constant_s: float) -> float:

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.inventory import SILENCE
@@ -71,7 +69,7 @@ class LipPositions(Record, frozen=True, kw_only=True):
 
     time_s: float  # seconds from the session's first sample
     delay_s: float  # audio was known up to time_s + delay_s; negative: a forecast
-    faps: NDArray[np.float32]  # (28,) FAP units, in the order of MOUTH_FAPS; 0 where not tracked
+    faps: Floats  # (28,) FAP units, in the order of MOUTH_FAPS; 0 where not tracked
     closure: float  # probability that the lips touch, 0 to 1
     lip_to_teeth: float  # probability that the lower lip touches the teeth, 0 to 1
 
@@ -112,7 +110,7 @@ class Waveform(Record, frozen=True, kw_only=True):
     """A chunk of the session's audio, as the recognizer processes it."""
 
     time_s: float  # time of the first sample
-    samples: NDArray[np.float32]  # (n,) 16 kHz mono
+    samples: Floats  # (n,) 16 kHz mono
 
 
 SoundEvent = Phone | LipPositions | SpeechChange | Progress | AudioSkipped | EndOfSound

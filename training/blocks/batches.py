@@ -20,6 +20,7 @@ from scipy.ndimage import uniform_filter1d
 
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
+from kouxing.shared.arrays import Doubles, Floats, Integers
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.networks.augmentation import (
     Samples,
@@ -57,16 +58,13 @@ _CODED_PEAK, _MIN_COMPRESSION, _MAX_COMPRESSION = 0.5, 0.3, 0.98
 _CODECS = (("MP3", "MPEG_LAYER_III"), ("OGG", "OPUS"))
 _TINY = 1e-9
 
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int16]
-
 
 @dataclass(frozen=True, slots=True)
 class BatchSource:
     """Recordings and background sounds from which batches are drawn."""
 
     recordings: Sequence[LabeledRecording]
-    backgrounds: Sequence[Integers] = ()  # music and noise
+    backgrounds: Sequence[NDArray[np.int16]] = ()  # music and noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +108,7 @@ def draw_block_batch(batch_source: BatchSource, number: int) -> BlockBatch:
 
 
 def _draw_excerpt(
-    batch_source: BatchSource, probs: NDArray[np.float64], num_frames: int, rng: np.random.Generator
+    batch_source: BatchSource, probs: Doubles, num_frames: int, rng: np.random.Generator
 ) -> tuple[Floats, FrameTargets]:
     """Draw an excerpt: frames, clean and disturbed, (num_frames, 160), and their targets."""
     tempo, shortening = 1.0, 0.0
@@ -139,7 +137,7 @@ def _draw_excerpt(
 
 def _draw_speech(
     recordings: Sequence[LabeledRecording],
-    probs: NDArray[np.float64],
+    probs: Doubles,
     num_frames: int,
     rng: np.random.Generator,
 ) -> tuple[Samples, FrameTargets]:
@@ -165,7 +163,7 @@ def _draw_speech(
     return as_floats(np.concatenate(sounds)), targets
 
 
-def _shorten(frames: Floats, tempo: float, shortening: float, num_frames: int) -> NDArray[np.int64]:
+def _shorten(frames: Floats, tempo: float, shortening: float, num_frames: int) -> Integers:
     """Choose the frames of faster speech, (num_frames,).
 
     Steady sounds, which resemble their neighbors, are shortened more, like fast speakers do.
@@ -188,7 +186,9 @@ def _add_background(sound: Samples, batch_source: BatchSource, rng: np.random.Ge
         numbers = rng.integers(
             len(batch_source.recordings), size=int(rng.integers(1, _MAX_VOICES + 1))
         )
-        others: list[Integers] = [batch_source.recordings[number].samples for number in numbers]
+        others: list[NDArray[np.int16]] = [
+            batch_source.recordings[number].samples for number in numbers
+        ]
     elif draw < _BABBLE_PROB + _MUSIC_PROB and batch_source.backgrounds:
         others = [batch_source.backgrounds[int(rng.integers(len(batch_source.backgrounds)))]]
     else:

@@ -36,16 +36,10 @@ from onnx import TensorProto, helper
 
 from kouxing.services.recognizer.acoustic.blocks import cache_names
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.shared.arrays import Floats
 from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
 from kouxing.training.networks.network import MAX_DEVIATIONS
-from kouxing.training.networks.onnx_graph import (
-    DOMAIN,
-    Floats,
-    Graph,
-    floats,
-    halves,
-    module_arrays,
-)
+from kouxing.training.networks.onnx_graph import DOMAIN, Graph, floats, halves, module_arrays
 from kouxing.training.networks.teacher import KEPT_LAYERS
 
 _LAST_OF_BLOCK = "last_of_block"

@@ -32,6 +32,7 @@ from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, count_frames
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.pcm import as_floats, as_integers
 from kouxing.shared.command.terminal import print_message
 from kouxing.training.blocks.batches import BATCH_S, BATCHES_PER_STEP, BatchSource
@@ -137,7 +138,7 @@ def train_blocks(
 
 
 def _label_arrays(
-    recordings: Sequence[LabeledRecording], topology: Topology, log_prior: NDArray[np.float32]
+    recordings: Sequence[LabeledRecording], topology: Topology, log_prior: Floats
 ) -> dict[str, ArrayLike]:
     """Return labeled recordings and the statistics of their alignment as arrays of a file."""
     targets = [recording.targets for recording in recordings]

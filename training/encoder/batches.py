@@ -16,6 +16,7 @@ from kouxing.services.mouth_profiles.lip_inputs import ENCODER_FRAME_S
 from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.encoder.network import NUM_INPUTS
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, Samples, TargetColumns
@@ -29,7 +30,6 @@ from kouxing.training.networks.augmentation import (
 )
 from kouxing.training.seed import SEED
 
-Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
 Batch = tuple[Halves, Halves]  # inputs, (batch, positions, 160); targets
 
@@ -60,7 +60,7 @@ class BatchSource:
     background_only_prob: float = 0.08  # of an excerpt without speech
     babble_only_prob: float = 0.0  # of voices in the background of such an excerpt
 
-    def draw(self, rng: np.random.Generator, probs: NDArray[np.float64]) -> Piece:
+    def draw(self, rng: np.random.Generator, probs: Doubles) -> Piece:
         """Draw a piece; ``probs`` are the cumulative probabilities."""
         return self.pieces[int(np.searchsorted(probs, rng.random() * probs[-1]))]
 
@@ -104,9 +104,7 @@ def network_inputs(samples: Floats) -> Floats:
     return frames[: len(frames) // 2 * 2].reshape(-1, NUM_INPUTS)
 
 
-def _draw_excerpt(
-    batch_source: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
-) -> Excerpt:
+def _draw_excerpt(batch_source: BatchSource, probs: Doubles, rng: np.random.Generator) -> Excerpt:
     samples, targets = _speech(batch_source, probs, rng)
     clean, speed = change_speed(samples, rng)
     sound = clean
@@ -147,7 +145,7 @@ def rows_at(targets: Floats, positions: NDArray[np.floating]) -> Floats:
 
 
 def _speech(
-    batch_source: BatchSource, probs: NDArray[np.float64], rng: np.random.Generator
+    batch_source: BatchSource, probs: Doubles, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Join recordings and pauses that are long enough for an excerpt at any speed."""
     sounds: list[Floats] = []

@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.encoder import FORMAT, VoiceKind
 from kouxing.services.recognizer.acoustic.model_file import load_component
+from kouxing.shared.arrays import Floats
 from kouxing.training.encoder.network import MEAN_PITCH, NUM_FEATURES, NUM_INPUTS, AudioEncoder
 from kouxing.training.model_files import write_archive
 from kouxing.training.networks.onnx_graph import (
-    Floats,
     Graph,
     floats,
     module_arrays,

@@ -31,7 +31,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.special import expit
 
 from kouxing.corpora.lip_clips import LipClip
@@ -39,6 +38,7 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.services.mouth_profiles.lip_inputs import ENCODER_FRAME_S
 from kouxing.services.recognizer.front_end.features import WINDOW_SAMPLES
 from kouxing.services.recognizer.lips.lip_predictor import NUM_LIP_FAPS
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.files.output_file import open_output
 from kouxing.shared.phones.events import Phone
@@ -47,8 +47,6 @@ from kouxing.training.lips.recipe import measure_scale, repeats_by_source, stand
 from kouxing.training.lips.recurrent import LipNetwork, SpeechExample, train_network
 from kouxing.training.lips.targets import closed_below, targets_at
 from kouxing.training.seed import SEED
-
-Floats = NDArray[np.float32]
 
 NUM_EPOCHS = 12
 _NUM_COMPONENTS = 128

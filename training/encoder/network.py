@@ -28,15 +28,14 @@ layers as targets).
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, log_softmax
 
 from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.lips.lip_predictor import NUM_OUTPUTS
+from kouxing.shared.arrays import Floats
 from kouxing.training.encoder.targets import (
     EFFORT,
     LEVEL,
@@ -101,7 +100,7 @@ class AudioEncoder(nn.Module):
         return OutputParts(*ranges, *scalars)
 
     @torch.no_grad()
-    def rescale_lips(self, mean: NDArray[np.float32], deviation: NDArray[np.float32]) -> None:
+    def rescale_lips(self, mean: Floats, deviation: Floats) -> None:
         """Express the lips in the units of the lip teacher, whose mean and deviation are given."""
         scale, offset = (
             torch.from_numpy(values).repeat(len(LIP_DELAYS_S)) for values in (deviation, mean)

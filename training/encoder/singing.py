@@ -12,13 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyworld
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
-
-Floats = NDArray[np.float32]
-Array = NDArray[np.float64]
+from kouxing.shared.arrays import Doubles, Floats, Integers, Mask
 
 _FRAME_S = 0.005
 _PITCH_FRAMES_PER_ENCODER_FRAME = 4
@@ -39,8 +36,8 @@ class SungVoice:
     """A sung or held copy of speech."""
 
     samples: Floats  # 16 kHz
-    source: NDArray[np.int64]  # (positions,) the position of the speech
-    is_sung: NDArray[np.bool_]  # (positions,) False in the spoken parts before and after a hold
+    source: Integers  # (positions,) the position of the speech
+    is_sung: Mask  # (positions,) False in the spoken parts before and after a hold
     pitch: Floats  # (positions,) log2 of Hz, NaN without voice
 
 
@@ -77,8 +74,8 @@ def sing(samples: Floats, num_positions: int, rng: np.random.Generator) -> SungV
 
 
 def _stretch(
-    voiced: NDArray[np.bool_], envelope: Array, rng: np.random.Generator, *, is_melody: bool
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    voiced: Mask, envelope: Doubles, rng: np.random.Generator, *, is_melody: bool
+) -> tuple[Integers, Mask]:
     """Repeat voiced frames for a melody. Hold a loud frame; in a melody, only sometimes.
 
     Return the source frame of each new frame, and whether it is sung or held.
@@ -95,7 +92,7 @@ def _stretch(
     return source, np.full(len(source), True) if is_melody else source == held
 
 
-def _melody(pitch_hz: Array, rng: np.random.Generator) -> Array:
+def _melody(pitch_hz: Doubles, rng: np.random.Generator) -> Doubles:
     """Draw a pitch for every frame, Hz."""
     spoken_hz = np.median(pitch_hz[pitch_hz > 0])
     notes: list[float] = []
@@ -108,5 +105,5 @@ def _melody(pitch_hz: Array, rng: np.random.Generator) -> Array:
     semitones += rng.uniform(0.0, _MAX_VIBRATO) * np.sin(phase) + rng.uniform(
         _MIN_TONIC, _MAX_TONIC
     )
-    melody: Array = spoken_hz * 2 ** (semitones / 12)
+    melody: Doubles = spoken_hz * 2 ** (semitones / 12)
     return np.clip(melody, _MIN_PITCH_HZ, _MAX_PITCH_HZ)

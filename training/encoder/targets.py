@@ -33,6 +33,7 @@ from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.encoder import VoiceKind
+from kouxing.shared.arrays import Floats, Mask
 from kouxing.shared.audio.pcm import as_floats, as_integers
 from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError
@@ -41,7 +42,6 @@ from kouxing.training.encoder.singing import sing
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES, TeacherOutputs, Teachers
 from kouxing.training.seed import SEED
 
-Floats = NDArray[np.float32]
 Samples = NDArray[np.int16]  # 16 kHz
 
 PITCH, LEVEL, EFFORT, VOICE = range(4)  # columns
@@ -230,7 +230,7 @@ class TargetStore:
             pieces.append(Piece(trimmed, targets, recording.weight))
         return pieces
 
-    def _is_audible(self, outputs: TeacherOutputs, voice: VoiceKind) -> NDArray[np.bool_]:
+    def _is_audible(self, outputs: TeacherOutputs, voice: VoiceKind) -> Mask:
         if voice == VoiceKind.SPEECH:
             return np.asarray(outputs.phones[:, self._teachers.silence] < _SILENT)
         return np.asarray(outputs.level > _LAUGHING_LEVEL)

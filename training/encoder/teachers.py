@@ -33,13 +33,12 @@ from torch.nn.functional import pad
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.blocks.exported import rebuild_encoder, rebuild_readout
 from kouxing.training.blocks.network import block_layout
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.whisper import init_encoder
-
-Floats = NDArray[np.float32]
 
 ENCODER_FRAME_SAMPLES = 320
 _WHISPER_LAYERS = (1, 3, 5)  # layers of Whisper's encoder, counted from 0

@@ -19,7 +19,6 @@ from itertools import combinations, islice, pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from kouxing.corpora.feature_cache import read_audio
@@ -34,13 +33,12 @@ from kouxing.services.synthesizer.lips.ferguson.contour import load_lip_points
 from kouxing.services.synthesizer.lips.ferguson.key_frames import build_anchors
 from kouxing.services.synthesizer.lips.ferguson.phone_table import COLUMNS, MAX_OPENING, PhoneTable
 from kouxing.services.synthesizer.lips.ferguson.timing import OnsetCrossings
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.command.terminal import print_message, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
-
-Array = NDArray[np.float64]
 
 NUM_LEVELS = 4
 _KIND_RIDGE = 5.0  # weight of the mean of all phones of a kind, phones
@@ -139,7 +137,7 @@ _CLOSED = (REST, "b")  # visemes whose lips touch
 _DEFAULT_OPENING = 2.0  # opening of a viseme without data
 
 
-def relative_openings(clips: Sequence[LipClip]) -> list[Array]:
+def relative_openings(clips: Sequence[LipClip]) -> list[Doubles]:
     """Compute R of the frames of each clip, (num_frames,); NaN if not measured.
 
     R is 0 for a closed mouth and 5 for the speaker's widest.
@@ -172,7 +170,7 @@ def fit_openings(
     return dict(zip(inventory.phones, (fitted * is_open).tolist(), strict=True))
 
 
-def measure_travel(clips: Sequence[LipClip]) -> Array:
+def measure_travel(clips: Sequence[LipClip]) -> Doubles:
     """Measure the travel of each mouth FAP from a closed to the widest mouth, FAP units.
 
     These are the coefficients of motion of Zhang et al. 2021, section 3, by least squares through
@@ -189,7 +187,9 @@ def measure_travel(clips: Sequence[LipClip]) -> Array:
     return travel
 
 
-def _opening_weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneInventory) -> Array:
+def _opening_weights(
+    times_s: Doubles, phones: Sequence[Phone], inventory: PhoneInventory
+) -> Doubles:
     """Compute the weight of each phone's opening in R at some times, (num_times, num_phones)."""
     anchors = build_anchors(phones)
     weights = np.zeros((len(times_s), len(inventory)))
@@ -201,7 +201,7 @@ def _opening_weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneIn
     return weights
 
 
-def _viseme_fractions(inventory: PhoneInventory) -> Array:
+def _viseme_fractions(inventory: PhoneInventory) -> Doubles:
     """Return the fraction of each viseme in each phone, (num_phones, num_visemes)."""
     names = sorted({name for fractions in inventory.visemes.values() for name, _ in fractions})
     fractions = np.zeros((len(inventory), len(names)))
@@ -211,7 +211,7 @@ def _viseme_fractions(inventory: PhoneInventory) -> Array:
     return fractions
 
 
-def _least_squares(weights: Array, height: Array, start: Array) -> Array:
+def _least_squares(weights: Doubles, height: Doubles, start: Doubles) -> Doubles:
     ridge = np.sqrt(_OPENING_RIDGE)
     result = lsq_linear(
         np.vstack([weights, ridge * np.eye(len(start))]),

@@ -44,6 +44,7 @@ from kouxing.services.recognizer.search.forced_path import (
     viterbi_path,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.arrays import Doubles, Floats, Integers
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.durations import PhoneDurations
 from kouxing.training.training_set import Example
@@ -64,9 +65,9 @@ class RecordingCopy:
 class HmmParameters:
     """The parameters to estimate."""
 
-    first_state: NDArray[np.int64]  # (num_phones + 1,)
-    log_stay: NDArray[np.float32]  # (states,)
-    log_leave: NDArray[np.float32]  # (states,)
+    first_state: Integers  # (num_phones + 1,)
+    log_stay: Floats  # (states,)
+    log_leave: Floats  # (states,)
     mixtures: GaussianMixtures
 
     @property
@@ -75,7 +76,7 @@ class HmmParameters:
         return int(self.first_state[-1])
 
 
-def flat_path(graph: UtteranceGraph, log_energy: NDArray[np.float32]) -> NDArray[np.int64]:
+def flat_path(graph: UtteranceGraph, log_energy: Floats) -> Integers:
     """Make a flat start from the log energy of each frame: phones of equal length, no pauses.
 
     The energy decides about silence at both ends. Returns the node of each frame, (frames,).
@@ -98,13 +99,11 @@ def flat_path(graph: UtteranceGraph, log_energy: NDArray[np.float32]) -> NDArray
     return np.concatenate(pieces)
 
 
-def _spread(nodes: NDArray[np.int64], num_frames: int) -> NDArray[np.int64]:
+def _spread(nodes: Integers, num_frames: int) -> Integers:
     return nodes[(np.arange(num_frames) * len(nodes)) // max(1, num_frames)]
 
 
-def normalized_features(
-    copy: RecordingCopy, prior_mean: NDArray[np.float32], half_width: int
-) -> NDArray[np.float32]:
+def normalized_features(copy: RecordingCopy, prior_mean: Floats, half_width: int) -> Floats:
     """Compute the normalized features of a copy as a new session does, (frames, 39)."""
     features = append_deltas(compute_cepstra_batch(copy.log_mel.astype(np.float32)), half_width)
     return RunningMean(prior_mean).normalize(features)
@@ -114,20 +113,20 @@ def normalized_features(
 class FrameSet:
     """Frames of all copies, each with its state."""
 
-    features: NDArray[np.float32]  # (frames, 39)
-    weights: NDArray[np.float32]  # (frames,)
-    bounds: NDArray[np.int64]  # (copies + 1,) first frame of each copy
+    features: Floats  # (frames, 39)
+    weights: Floats  # (frames,)
+    bounds: Integers  # (copies + 1,) first frame of each copy
     graphs: list[UtteranceGraph]
-    states: NDArray[np.int64]  # (frames,) -1 if the copy could not be aligned
-    paths: list[NDArray[np.int64]]
+    states: Integers  # (frames,) -1 if the copy could not be aligned
+    paths: list[Integers]
 
     @classmethod
     def build(
         cls,
         copies: Sequence[RecordingCopy],
         inventory: PhoneInventory,
-        first_state: NDArray[np.int64],
-        prior_mean: NDArray[np.float32],
+        first_state: Integers,
+        prior_mean: Floats,
         half_width: int,
     ) -> FrameSet:
         """Compute the features and the flat start."""
@@ -172,7 +171,7 @@ class FrameSet:
             frames += float(self.weights[start]) * (end - start)
         return total / max(frames, 1.0)
 
-    def by_state(self, num_states: int) -> list[NDArray[np.int64]]:
+    def by_state(self, num_states: int) -> list[Integers]:
         """Frame numbers of every state."""
         order = np.argsort(self.states, kind="stable")
         cuts = np.searchsorted(self.states[order], np.arange(num_states + 1))
@@ -186,7 +185,7 @@ _NUM_ROTATION_STEPS = 15
 _MIN_STAY, _MAX_STAY = 0.05, 0.99
 
 
-def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> HmmParameters:
+def first_estimate(frames: FrameSet, first_state: Integers) -> HmmParameters:
     """Estimate one Gaussian per state from the flat start."""
     num_states = int(first_state[-1])
     half = np.full(num_states, np.log(0.5), np.float32)
@@ -203,7 +202,7 @@ def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> HmmParam
     return estimate(frames, hmm)
 
 
-def variance_floor(frames: FrameSet) -> NDArray[np.float32]:
+def variance_floor(frames: FrameSet) -> Floats:
     """Lowest variance of a component, shape (39,)."""
     return np.asarray(_VARIANCE_FLOOR * frames.features.var(axis=0))
 
@@ -242,9 +241,7 @@ def estimate(frames: FrameSet, hmm: HmmParameters, num_iterations: int = 1) -> H
     )
 
 
-def _component_sums(
-    design: NDArray[np.float32], matrix: NDArray[np.float32], weights: NDArray[np.float32]
-) -> NDArray[np.float64]:
+def _component_sums(design: Floats, matrix: Floats, weights: Floats) -> Doubles:
     """Sum [x^2, x, 1] over a state's frames, weighted by gamma, shape (mixtures, 79)."""
     sums = np.zeros((matrix.shape[1], design.shape[1]))
     for start in range(0, len(design), _BLOCK_FRAMES):  # short sums keep enough precision
@@ -257,9 +254,7 @@ def _component_sums(
     return sums
 
 
-def _transitions(
-    frames: FrameSet, hmm: HmmParameters
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _transitions(frames: FrameSet, hmm: HmmParameters) -> tuple[Floats, Floats]:
     occupied = np.full(hmm.num_states, 2.0)
     left = np.full(hmm.num_states, 1.0)
     for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
@@ -304,7 +299,7 @@ def split(hmm: HmmParameters, frames: FrameSet, num_mixtures: int) -> HmmParamet
     return replace(hmm, mixtures=GaussianMixtures(weights=weights, means=means, covars=covars))
 
 
-def _drop_light(weights: NDArray[np.float32], count: float) -> None:
+def _drop_light(weights: Floats, count: float) -> None:
     """Set the weights of components with too few frames to 0, in place."""
     light = weights * count < _MIN_FRAMES
     light[weights.argmax()] = False
@@ -330,7 +325,7 @@ def topology_of(hmm: HmmParameters, phone_lm: PhoneLanguageModel, frames: FrameS
     )
 
 
-def decorrelate(frames: FrameSet, hmm: HmmParameters) -> tuple[HmmParameters, NDArray[np.float32]]:
+def decorrelate(frames: FrameSet, hmm: HmmParameters) -> tuple[HmmParameters, Floats]:
     """Rotate the features, in place, so that diagonal covariances fit best (Gales 1999, eq. 20-24).
 
     Returns the rotated model and the rotation, (39, 39), for ``x @ rotation``.
@@ -362,9 +357,7 @@ def decorrelate(frames: FrameSet, hmm: HmmParameters) -> tuple[HmmParameters, ND
     return replace(hmm, mixtures=mixtures), rotation
 
 
-def _component_covariances(
-    frames: FrameSet, hmm: HmmParameters
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _component_covariances(frames: FrameSet, hmm: HmmParameters) -> tuple[Doubles, Doubles]:
     """Compute the covariance, (components, 39, 39), and weight, (components,), of components."""
     mixtures = hmm.mixtures
     num_states, num_mixtures, num = mixtures.means.shape

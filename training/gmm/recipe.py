@@ -13,6 +13,7 @@ from kouxing.services.recognizer.front_end.features import (
     LogMel,
     compute_cepstra_batch,
 )
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -103,7 +104,7 @@ def train_gmm(
 
 def _train_mixtures(
     frames: FrameSet, hmm: HmmParameters, num_mixtures: int
-) -> tuple[HmmParameters, NDArray[np.float32]]:
+) -> tuple[HmmParameters, Floats]:
     """Double the mixtures step by step; return the model and the rotation of the features."""
     rotation = np.eye(NUM_FEATURES, dtype=np.float32)
     print_message(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
@@ -149,7 +150,7 @@ def _augmented_log_mel(samples: NDArray[np.int16], rng: np.random.Generator) -> 
     return LogMel().accept_waveform(scale_level(sound, rng)).astype(np.float16)
 
 
-def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
+def _mean_cepstra(examples: Sequence[Example]) -> Floats:
     """Compute the mean cepstra of the recordings, shape (13,)."""
     step = max(1, len(examples) // _MEAN_RECORDINGS)
     means = [

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.scoring import ErrorCounts, count_errors
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology, score_segment
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
 from kouxing.services.recognizer.search.decoder import Decoder
+from kouxing.shared.arrays import Floats
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.training.training_set import Example, load_examples
@@ -70,7 +70,7 @@ def choose_search_weights(
 
 
 def _offline_error_rate(
-    topology: Topology, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
+    topology: Topology, scores: Sequence[Floats], examples: Sequence[Example]
 ) -> float:
     """Compute the phone error rate of offline decoding from scores, (frames, states) each."""
     decoder = Decoder(topology)

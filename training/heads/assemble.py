@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 from scipy import interpolate, ndimage, spatial
 
+from kouxing.shared.arrays import Doubles, Integers
 from kouxing.shared.face.faps import FAPS
 from kouxing.training.heads import fitted_mesh, paint, parts, subdivision, textures
 from kouxing.training.heads.hair import hair_piece, strand_texture
@@ -37,9 +37,6 @@ from kouxing.training.heads.parts import HeadPiece, eye_pieces, teeth_pieces, to
 from kouxing.training.heads.people import PEOPLE, REFERENCE, MorphTargets, Person
 from kouxing.training.heads.textures import encode
 from kouxing.training.heads.zones import FaceFields, Fields, Skin, close_lips, subdivide
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 LOWEST = 3.1  # lower end of the bust, dm
 # the neckband, as rings around the garment's edge: outward and up, dm
@@ -96,7 +93,7 @@ class HeadBuilder:
         )
         self._unit_fields = FaceFields(self.reference, self._cavity, blink, squint).fields
 
-    def _shaped(self, targets: MorphTargets, face_units: MorphTargets) -> Float:
+    def _shaped(self, targets: MorphTargets, face_units: MorphTargets) -> Doubles:
         """Shape the mesh (19158, 3), and move its pivot to the common place."""
         vertices = self._mesh.vertices.copy()
         for name, amount in targets:
@@ -106,7 +103,7 @@ class HeadBuilder:
         joint = np.unique(self._mesh.quads[self._mesh.group("joint-head")])
         return np.asarray(vertices - vertices[joint].mean(axis=0) + PIVOT)
 
-    def _skin(self, vertices: Float) -> Skin:
+    def _skin(self, vertices: Doubles) -> Skin:
         skin = subdivide(vertices, self._face)
         x, y, z = self._layout.T
         top = np.clip((y - 6.48) / 0.15, 0, 1)
@@ -152,7 +149,7 @@ class HeadBuilder:
         layout = self.reference.vertices
         covered = layout[:, 1] < neckline_height(layout[:, 2]) - 0.15
 
-        def visible(quads: Index) -> Index:
+        def visible(quads: Integers) -> Integers:
             triangles = subdivision.triangles_of(quads)
             return triangles[~covered[triangles].all(axis=1)]
 
@@ -170,7 +167,7 @@ class HeadBuilder:
             coarse_triangles=visible(skin.coarse_quads),
         )
 
-    def _garment(self, vertices: Float) -> HeadPiece:
+    def _garment(self, vertices: Doubles) -> HeadPiece:
         """Make a round-necked top: the torso, slightly enlarged, cut off around the neck."""
         torso, plain = (subdivide(shape, self._torso) for shape in (vertices, self._plain))
         smooth, layout = (skin.vertices[: len(skin.base)] for skin in (torso, plain))
@@ -220,7 +217,7 @@ class HeadBuilder:
             )
         return pieces
 
-    def _brows(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
+    def _brows(self, vertices: Doubles, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the brows, and raise their inner ends; they follow the skin below them."""
         brows = fitted_mesh.read(self._folder, f"eyebrows/{person.brows}/{person.brows}")
         points = brows.fit(vertices)
@@ -246,7 +243,7 @@ class HeadBuilder:
         geometry = parts.Geometry(points, brows.triangles, uv, color, brows.welds)
         return HeadPiece("brows", geometry, "brows", 0.9, np.ones(len(points)), shifts)
 
-    def _lashes(self, vertices: Float, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
+    def _lashes(self, vertices: Doubles, skin: Skin, fields: Fields, person: Person) -> HeadPiece:
         """Fit the upper lashes; they follow the face units of the eyelids, and the skin."""
         lashes = fitted_mesh.read(self._folder, f"eyelashes/{person.lashes}/{person.lashes}")
         middle = self._plain[lashes.base[lashes.triangles]].mean(axis=(1, 2))
@@ -265,7 +262,7 @@ class HeadBuilder:
         geometry = parts.Geometry(points, lashes.triangles, lashes.uv, color, lashes.welds)
         return HeadPiece("lashes", geometry, "lashes", 0.9, np.ones(len(points)), shifts)
 
-    def _tear_lines(self, vertices: Float, skin: Skin, fields: Fields) -> HeadPiece:
+    def _tear_lines(self, vertices: Doubles, skin: Skin, fields: Fields) -> HeadPiece:
         """Make the wet lines: strips from the edges of the lower lids to the eyeballs.
 
         They follow the lids.
@@ -273,7 +270,7 @@ class HeadBuilder:
         layout = self.reference.vertices
         left = self.reference.number[np.array(LEFT_LOWER_LID)]
         right = spatial.cKDTree(layout).query(layout[left] * [-1, 1, 1])[1]
-        rows: list[Index] = []
+        rows: list[Integers] = []
         points, triangles = [], []
         for center, lid in zip(eye_centers(vertices, self._mesh), (left, right[::-1]), strict=True):
             edge = skin.vertices[lid]
@@ -296,7 +293,7 @@ class HeadBuilder:
         shifts = {fap: shift[at] for fap, shift in fields.items() if np.abs(shift[at]).max() > 1e-6}
         return HeadPiece("tears", geometry, "eye", 0.05, np.ones(len(at)), shifts)
 
-    def _outer_vertices(self) -> Index:
+    def _outer_vertices(self) -> Integers:
         """Find the vertices of the left half that face outward."""
         skin = self.reference
         normals = subdivision.vertex_normals(skin.vertices, subdivision.triangles_of(skin.quads))
@@ -305,7 +302,7 @@ class HeadBuilder:
         outer = ((normals * outward).sum(axis=1) > 0) & (skin.vertices[:, 0] > -1e-6)
         return np.flatnonzero(outer & ~self._cavity)
 
-    def _skin_source(self) -> Float:
+    def _skin_source(self) -> Doubles:
         """Return the coordinates (V, 2) of the outer vertices in MakeHuman's skin, v downward."""
         mesh, skin = self._mesh, self.reference
         is_left = self._plain[mesh.quads].mean(axis=1)[:, 0] > 0
@@ -326,7 +323,7 @@ class HeadBuilder:
         lid = np.stack([upper[:, 0], upper[:, 1], low], axis=1)
         lips = lip_outline(self.reference)
 
-        def load(name: str, size: int = 0) -> Float:
+        def load(name: str, size: int = 0) -> Doubles:
             return textures.load(self._folder, name, size)
 
         complexion = paint.resample(self._map, load(f"skins/textures/{person.skin}.png"), 3)
@@ -347,7 +344,7 @@ class HeadBuilder:
             ),
         }
 
-    def _roots(self, skin: Skin, hair: HeadPiece) -> Float:
+    def _roots(self, skin: Skin, hair: HeadPiece) -> Doubles:
         """Return the amount of hair on the scalp (H, W): where hair grows, and under the hair."""
         strands = hair.geometry.vertices
         points = np.concatenate([strands, strands[hair.geometry.triangles].mean(axis=1)])

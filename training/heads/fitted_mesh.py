@@ -9,15 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.makehuman import read_obj
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 REPOSITORY = "https://github.com/makehumancommunity/makehuman-assets"
 
@@ -26,32 +23,32 @@ REPOSITORY = "https://github.com/makehumancommunity/makehuman-assets"
 class FittedMesh:
     """A mesh that is fitted to the base mesh. Vertices are split at the seams of the texture."""
 
-    triangles: Index  # (F, 3)
-    uv: Float  # (V, 2), v downward
-    welds: Index  # (V,), first vertex at the same position
-    base: Index  # (V, 3), vertices of the base mesh
-    weights: Float  # (V, 3)
-    offsets: Float  # (V, 3), relative to the scale
-    scale: Float  # (3, 3): for each axis two vertices of the base mesh, and their distance, dm
+    triangles: Integers  # (F, 3)
+    uv: Doubles  # (V, 2), v downward
+    welds: Integers  # (V,), first vertex at the same position
+    base: Integers  # (V, 3), vertices of the base mesh
+    weights: Doubles  # (V, 3)
+    offsets: Doubles  # (V, 3), relative to the scale
+    scale: Doubles  # (3, 3): for each axis two vertices of the base mesh, and their distance, dm
 
     @property
-    def quads(self) -> Index:
+    def quads(self) -> Integers:
         """Quads (F / 2, 4), for a mesh of quads only, such as hair."""
         first, second = np.split(self.triangles, 2)
         return np.column_stack([first, second[:, 2]])
 
-    def fit(self, vertices: Float) -> Float:
+    def fit(self, vertices: Doubles) -> Doubles:
         """Return the vertices (V, 3) on a shape (19158, 3) of the base mesh, dm."""
         first, second = self.scale[:, 0].astype(int), self.scale[:, 1].astype(int)
         axes = np.arange(3)
         size = np.abs(vertices[first, axes] - vertices[second, axes]) / self.scale[:, 2]
         return np.asarray(self.transfer(vertices) + self.offsets * size)
 
-    def transfer(self, field: Float) -> Float:
+    def transfer(self, field: Doubles) -> Doubles:
         """Transfer displacements (19158, 3) of the base mesh to the vertices (V, 3)."""
         return np.asarray(np.einsum("vk,vkd->vd", self.weights, field[self.base]))
 
-    def keep_triangles(self, mask: NDArray[np.bool_]) -> "FittedMesh":
+    def keep_triangles(self, mask: Mask) -> "FittedMesh":
         """Return the triangles (F,) that are kept, without unused vertices."""
         used, triangles, welds = subdivision.used_vertices(self.triangles[mask], self.welds)
         return FittedMesh(
@@ -91,7 +88,7 @@ def find(folder: Path, name: str) -> Path:
     return path
 
 
-def _fitting(text: str) -> tuple[Index, Float, Float, Float]:
+def _fitting(text: str) -> tuple[Integers, Doubles, Doubles, Doubles]:
     """Return vertices of the base mesh, weights, offsets, and scale, see ``FittedMesh``."""
     scale = np.zeros((3, 3))
     rows = []
@@ -111,7 +108,7 @@ def _fitting(text: str) -> tuple[Index, Float, Float, Float]:
     return numbers[:, :3].astype(int), numbers[:, 3:6], numbers[:, 6:9], scale
 
 
-def _split_at_seams(text: str) -> tuple[Index, Float, Index]:
+def _split_at_seams(text: str) -> tuple[Integers, Doubles, Integers]:
     """Return quads (F, 4), texture coordinates (V, 2), and the vertex in the file of each (V,)."""
     _, uv, faces, _ = read_obj(text)
     pairs, quads = np.unique(faces.reshape(-1, 2), axis=0, return_inverse=True)

@@ -3,15 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from kouxing.shared.arrays import Doubles
 from kouxing.training.heads import fitted_mesh, paint, parts, subdivision, textures
 from kouxing.training.heads.makehuman import PIVOT
 from kouxing.training.heads.parts import HeadPiece
 from kouxing.training.heads.people import Person
-
-Float = NDArray[np.float64]
 
 _HAIR_TEXTURES = {"afro01": "afro"}
 # styles with a fringe over the right eye: its distance from the head's axis at the side, dm, and
@@ -25,7 +23,7 @@ _SWEEP = 0.62  # fraction of the angle to the right ear by which it is turned
 _WIDEST_HAIR = 5.9  # height, dm
 
 
-def strand_texture(folder: Path, person: Person) -> Float:
+def strand_texture(folder: Path, person: Person) -> Doubles:
     """Return the texture of the hair (H, W, 2); the strands of gray hair differ less."""
     style = person.hair
     file = f"hair/{style}/{_HAIR_TEXTURES.get(style, style)}_diffuse.png"
@@ -34,7 +32,7 @@ def strand_texture(folder: Path, person: Person) -> Float:
 
 
 def hair_piece(
-    folder: Path, person: Person, vertices: Float, right_eye: Float, alpha: Float
+    folder: Path, person: Person, vertices: Doubles, right_eye: Doubles, alpha: Doubles
 ) -> HeadPiece:
     """Return hair that is fitted to the vertices of a head, with its triangles in drawing order.
 
@@ -70,7 +68,7 @@ def hair_piece(
     return HeadPiece("hair", geometry, "hair", 0.6, np.ones(len(used)))
 
 
-def _swept_aside(points: Float, right_eye: Float, width: float, lifted: float) -> Float:
+def _swept_aside(points: Doubles, right_eye: Doubles, width: float, lifted: float) -> Doubles:
     """Turn a fringe that covers the right eye to the side, and lift it off the forehead."""
     x, y, z = points.T
     depth = z - paint.AXIS_Z
@@ -80,7 +78,7 @@ def _swept_aside(points: Float, right_eye: Float, width: float, lifted: float) -
     swept_part = np.clip(turn + np.pi / 2, 0, None) * np.clip((0.6 - turn) / 0.6, 0, 1) * low
     turned = turn - _SWEEP * swept_part
 
-    def reach(angle: Float) -> Float:
+    def reach(angle: Doubles) -> Doubles:
         return 1 / np.hypot(np.sin(angle) / width, np.cos(angle) / 1.0)
 
     radius = np.hypot(x, depth) * reach(turned) / reach(turn)

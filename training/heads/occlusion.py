@@ -6,16 +6,14 @@ course 16, 2002.
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from kouxing.services.driver.render.renderer import create_offscreen_context
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.measures import neckline_height
 from kouxing.training.heads.parts import Geometry, HeadPiece
-
-Float = NDArray[np.float64]
 
 _SKULL = np.array([0.0, 5.93, 0.42])  # its middle, dm
 _HIDDEN = 0.002  # fraction of the sphere that is visible from a hidden vertex, at most
@@ -35,7 +33,7 @@ void main() { depth = gl_FragCoord.z; }
 """
 
 
-def openness(vertices: Float, normals: Float, triangles: NDArray[np.int64]) -> Float:
+def openness(vertices: Doubles, normals: Doubles, triangles: Integers) -> Doubles:
     """Estimate the cosine-weighted fraction of the sphere that is visible from points, (V,).
 
     ``vertices`` and ``normals`` (V, 3) are the points, in dm. Only ``triangles`` (F, 3) occlude.
@@ -92,7 +90,7 @@ _OPEN_MOUTH = {
 }  # fmt: skip
 
 
-def _open_mouth_vertices(piece: HeadPiece) -> Float:
+def _open_mouth_vertices(piece: HeadPiece) -> Doubles:
     vertices = piece.geometry.vertices.copy()
     for fap, value in _OPEN_MOUTH.items():
         if fap in piece.fields:
@@ -100,7 +98,7 @@ def _open_mouth_vertices(piece: HeadPiece) -> Float:
     return vertices
 
 
-def bake_occlusion(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bool_]) -> None:
+def bake_occlusion(pieces: list[HeadPiece], layout: Doubles, cavity: Mask) -> None:
     """Bake the ambient occlusion into the vertex colors of a head's pieces; skin is the first.
 
     Hidden triangles of the teeth are removed, and teeth that are mostly hidden.
@@ -113,7 +111,7 @@ def bake_occlusion(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bo
     vertices = np.concatenate([_open_mouth_vertices(p) for p in solid])
     normals = np.concatenate([_outward(p) for p in solid])
 
-    def visibility(with_hair: bool) -> Float:
+    def visibility(with_hair: bool) -> Doubles:
         triangles = [
             p.geometry.triangles + first
             for p, first in zip(solid, offsets, strict=False)
@@ -154,9 +152,7 @@ def bake_occlusion(pieces: list[HeadPiece], layout: Float, cavity: NDArray[np.bo
             piece.keep(_visible_triangles(geometry.triangles, visible))
 
 
-def _visible_triangles(
-    triangles: NDArray[np.int64], visible: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _visible_triangles(triangles: Integers, visible: Mask) -> Mask:
     """Return which triangles (F,) of the teeth are visible, without fragments of hidden teeth."""
     edges = np.concatenate([triangles[:, :2], triangles[:, 1:]]).T
     graph = coo_array((np.ones(edges.shape[1]), edges), shape=(len(visible), len(visible)))
@@ -166,7 +162,7 @@ def _visible_triangles(
     return np.asarray(shown & (shown_fraction[tooth] > _TOOTH_SHOWN))
 
 
-def _outward(piece: HeadPiece) -> Float:
+def _outward(piece: HeadPiece) -> Doubles:
     """Return normals (V, 3). Normals of hair point away from the skull."""
     points = _open_mouth_vertices(piece)
     if piece.name != "hair":
@@ -175,7 +171,7 @@ def _outward(piece: HeadPiece) -> Float:
     return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
 
 
-def _along_teeth(geometry: Geometry) -> Float:
+def _along_teeth(geometry: Geometry) -> Doubles:
     """Return the fraction (V, 1) of the light on a row of teeth: less at the back and inside."""
     front = geometry.vertices[:, 2].max()
     back = (front - geometry.vertices[:, 2:]) / 0.45
@@ -186,7 +182,7 @@ def _along_teeth(geometry: Geometry) -> Float:
     return np.asarray(np.clip(1.15 - 2.2 * back, 0.05, 1.0) * (1 - 0.75 * inside))
 
 
-def _into_mouth(z: Float) -> Float:
+def _into_mouth(z: Doubles) -> Doubles:
     """Return the fraction (V, 1) of the light at a depth behind the lips."""
     inside = np.clip((z[:, None] - 0.75) / 0.5, 0, 1)
     return 0.02 + 0.98 * inside**2

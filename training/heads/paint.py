@@ -7,12 +7,10 @@ the head (0 in front, pi behind), its rows the height. Colors are sRGB, 0 to 1.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import interpolate, ndimage, spatial
 
+from kouxing.shared.arrays import Doubles, Integers
 from kouxing.training.heads.textures import Color, mix, noise
-
-Float = NDArray[np.float64]
 
 AXIS_Z = 0.35  # dm, of the vertical axis
 TOP_Y, BOTTOM_Y = 6.85, 4.15  # dm
@@ -22,7 +20,7 @@ _ANGLES = np.radians([0.0, 70.0, 110.0, 180.0])
 _COLUMNS = np.array([0.0, 0.80, 0.92, 1.0])
 
 
-def skin_uv(vertices: Float) -> Float:
+def skin_uv(vertices: Doubles) -> Doubles:
     """Return the texture coordinates (V, 2) of points (V, 3)."""
     angle = np.abs(np.arctan2(np.abs(vertices[:, 0]), vertices[:, 2] - AXIS_Z))
     u = np.interp(angle, _ANGLES, _COLUMNS)
@@ -34,15 +32,15 @@ def skin_uv(vertices: Float) -> Float:
 class FaceMap:
     """Positions of the skin's texels on the neutral face."""
 
-    x: Float  # (H, W) dm, distance from the middle plane
-    y: Float
-    z: Float
-    angle: Float
-    source: Float  # (2, H, W) row and column in MakeHuman's skin, 0 to 1
-    vertex: NDArray[np.int64]  # (H, W) the nearest vertex
+    x: Doubles  # (H, W) dm, distance from the middle plane
+    y: Doubles
+    z: Doubles
+    angle: Doubles
+    source: Doubles  # (2, H, W) row and column in MakeHuman's skin, 0 to 1
+    vertex: Integers  # (H, W) the nearest vertex
 
 
-def face_map(vertices: Float, uv: Float, source: Float) -> FaceMap:
+def face_map(vertices: Doubles, uv: Doubles, source: Doubles) -> FaceMap:
     """Interpolate from the outer skin's vertices (V, 3) of the left half to the texels.
 
     ``source`` (V, 2) are their coordinates in MakeHuman's skin, with v downward.
@@ -68,14 +66,14 @@ def face_map(vertices: Float, uv: Float, source: Float) -> FaceMap:
     )
 
 
-def resample(face: FaceMap, texture: Float, order: int) -> Float:
+def resample(face: FaceMap, texture: Doubles, order: int) -> Doubles:
     """Move one of MakeHuman's skins (H, W, 3) to this texture's coordinates."""
     pixels = face.source * (np.array(texture.shape[:2]) - 1)[:, None, None]
     bands = [ndimage.map_coordinates(texture[..., k], pixels, order=order) for k in range(3)]
     return np.asarray(np.clip(np.stack(bands, axis=2), 0, 1))
 
 
-def scalp(face: FaceMap, texture: Float) -> Float:
+def scalp(face: FaceMap, texture: Doubles) -> Doubles:
     """Return where hair grows (H, W), 0 to 1, from a skin with painted black hair."""
     light = resample(face, texture, 1).mean(axis=2)
     dark = np.clip((0.50 - light) / 0.25, 0, 1)
@@ -87,7 +85,7 @@ def scalp(face: FaceMap, texture: Float) -> Float:
     return np.asarray(dark + (parting - dark) * high)
 
 
-def _soft_spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
+def _soft_spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Doubles:
     """Make a soft spot (H, W) on the front of the face."""
     spot = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
     return spot * np.clip((1.5 - face.angle) / 0.25, 0, 1)
@@ -114,7 +112,7 @@ class Look:
     cel: bool = False  # cel shading: plain colors, light and shade
 
 
-def _inpaint(image: Float, hidden: Float) -> Float:
+def _inpaint(image: Doubles, hidden: Doubles) -> Doubles:
     """Replace the hidden part (H, W), 0 to 1, of an image (H, W, 3) by its surroundings."""
     weight = (1 - hidden)[..., None]
     sigma = (24, 24, 0)
@@ -124,8 +122,8 @@ def _inpaint(image: Float, hidden: Float) -> Float:
 
 
 def skin(
-    face: FaceMap, lid: Float, lips: Float, look: Look, complexion: Float, roots: Float
-) -> Float:
+    face: FaceMap, lid: Doubles, lips: Doubles, look: Look, complexion: Doubles, roots: Doubles
+) -> Doubles:
     """Paint the skin, sRGB (H, W, 3).
 
     ``lid`` and ``lips`` are outlines (N, 3): x, upper and lower height; both run outward, in dm.
@@ -173,7 +171,9 @@ def skin(
     return np.clip(image + (strands - image) * (0.85 * roots)[..., None], 0, 1)
 
 
-def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lips: Float) -> Float:
+def _paint_stubble(
+    image: Doubles, face: FaceMap, amount: float, color: Color, lips: Doubles
+) -> Doubles:
     """Tint the shaven parts of the face: upper lip, chin, jaw and sideburns."""
     top = np.interp(
         face.angle, [0.0, 0.30, 0.55, 0.95, 1.25, 1.45], [5.10, 5.12, 5.16, 5.28, 5.55, 5.70]
@@ -207,7 +207,7 @@ _WRINKLES = (
 )
 
 
-def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
+def _paint_age(image: Doubles, face: FaceMap, amount: float) -> Doubles:
     texels = np.stack([face.x, face.y], axis=-1)
     waver = 0.004 * noise(face.x.shape, 9, 22)
     for points, depth in _WRINKLES:
@@ -232,7 +232,7 @@ def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
     return image * (1 + 0.012 * amount * noise(face.x.shape, 12, 24)[..., None])
 
 
-def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
+def _paint_lips(image: Doubles, face: FaceMap, lips: Doubles, look: Look) -> Doubles:
     upper, lower = (np.interp(face.x, lips[:, 0], lips[:, column]) for column in (1, 2))
     upper = upper - 0.012 * np.exp(-((face.x / 0.024) ** 2))  # Cupid's bow
     edge = 0.0065
@@ -248,7 +248,9 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
     return np.asarray(image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33]))
 
 
-def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, width: float) -> Float:
+def _paint_eye_lines(
+    image: Doubles, face: FaceMap, lid: Doubles, lower: Doubles, width: float
+) -> Doubles:
     edge = np.interp(face.x, lid[:, 0], lid[:, 1])
     inside = 1 / (1 + np.exp(-(face.x - lid[0, 0] - 0.01) / 0.008))
     inside *= 1 / (1 + np.exp((face.x - lid[-1, 0] - 0.02) / 0.012))

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import FORMAT
 from kouxing.services.driver.head.import_head import MAX_VERTICES
+from kouxing.shared.arrays import Doubles, Floats, Integers, Mask
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import open_output
 from kouxing.training.heads import subdivision
@@ -22,22 +22,19 @@ from kouxing.training.heads.makehuman import FEATURE_POINTS, METERS_PER_UNIT, PI
 from kouxing.training.heads.measures import eye_centers, eye_radius
 from kouxing.training.heads.zones import Fields, Skin, jaw_fields, tongue_fields
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 
 @dataclass(slots=True)
 class Geometry:
     """Vertices and triangles of a ``HeadPiece``."""
 
-    vertices: Float  # (V, 3)
-    triangles: Index  # (F, 3)
-    uv: Float  # (V, 2), v downward as in glTF
-    colors: Float  # (V, 3) linear factors on the texture
-    welds: Index | None = None  # (V,) the first vertex at each position, if a position has several
+    vertices: Doubles  # (V, 3)
+    triangles: Integers  # (F, 3)
+    uv: Doubles  # (V, 2), v downward as in glTF
+    colors: Doubles  # (V, 3) linear factors on the texture
+    welds: Integers | None = None  # (V,) first vertex at each position; None: all positions differ
 
 
-def grid_triangles(rows: int, columns: int) -> Index:
+def grid_triangles(rows: int, columns: int) -> Integers:
     """Triangulate a grid of ``rows * columns`` vertices, row by row."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     halves = [
@@ -54,11 +51,11 @@ EYE_RINGS = np.radians([0.0, 5.0, 9.5, 13.0, 17.0, 21.0, 25.0, 30.0, 38.0, 48.0,
 _EYE_SEGMENTS = 32
 
 
-def eyeball(center: Float, radius: float) -> Geometry:
+def eyeball(center: Doubles, radius: float) -> Geometry:
     """Make a sphere, open at the back; its texture is a view from the front."""
     turn = np.linspace(0.0, 2 * np.pi, _EYE_SEGMENTS + 1)
     angle, turn = np.meshgrid(EYE_RINGS, turn, indexing="ij")
-    bulge = 1.0 + 0.035 * np.clip(1 - angle / np.radians(32.0), 0, 1) ** 1.0  # the cornea
+    bulge = 1.0 + 0.035 * np.clip(1 - angle / np.radians(32.0), 0, 1)  # the cornea
     direction = np.stack(
         [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=2
     )
@@ -69,7 +66,7 @@ def eyeball(center: Float, radius: float) -> Geometry:
     return Geometry(vertices, triangles, uv, np.ones((len(vertices), 3)))
 
 
-def pupil_growth(geometry: Geometry, center: Float) -> Float:
+def pupil_growth(geometry: Geometry, center: Doubles) -> Doubles:
     """Return radial directions (V, 3), of unit length at the pupil's edge, for FAPs 29 and 30."""
     angle = np.repeat(EYE_RINGS, _EYE_SEGMENTS + 1)
     weight = np.interp(angle, [0.0, PUPIL_ANGLE, IRIS_ANGLE], [0.0, 1.0, 0.0])
@@ -91,12 +88,12 @@ class HeadPiece:
     geometry: Geometry
     texture: str
     roughness: float
-    head_weight: Float  # (V,)
+    head_weight: Doubles  # (V,)
     fields: Fields = field(default_factory=dict)  # FAP -> (V, 3), dm at 1 FAPU or 1 rad
     coarse_vertices: int = 0  # 0: there is only one level of detail
-    coarse_triangles: Index | None = None
+    coarse_triangles: Integers | None = None
 
-    def keep(self, mask: NDArray[np.bool_]) -> None:
+    def keep(self, mask: Mask) -> None:
         """Remove the other triangles (F,) of a piece without coarse ones, and unused vertices."""
         old = self.geometry
         used, triangles, welds = subdivision.used_vertices(old.triangles[mask], _welds(old))
@@ -107,7 +104,7 @@ class HeadPiece:
         self.fields = {fap: shift[used] for fap, shift in self.fields.items()}
 
 
-def _welds(geometry: Geometry) -> Index:
+def _welds(geometry: Geometry) -> Integers:
     return np.arange(len(geometry.vertices)) if geometry.welds is None else geometry.welds
 
 
@@ -126,7 +123,7 @@ def write(
     Raises ``UserError`` if it has too many vertices.
     """
 
-    def meters(points: Float) -> NDArray[np.float32]:
+    def meters(points: Doubles) -> Floats:
         return np.asarray((points - PIVOT) * METERS_PER_UNIT, dtype=np.float32)
 
     first = np.cumsum([0] + [len(p.geometry.vertices) for p in pieces])
@@ -214,7 +211,7 @@ def write(
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[HeadPiece]:
+def eye_pieces(vertices: Doubles, mesh: BaseMesh, fapu: dict[str, float]) -> list[HeadPiece]:
     """Make the eyeballs; they can move forward, and their pupils can grow."""
     pieces = []
     for row, name in enumerate(("eye_left", "eye_right")):
@@ -229,7 +226,7 @@ def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[
     return pieces
 
 
-def teeth_pieces(teeth: FittedMesh, vertices: Float, fapu: dict[str, float]) -> list[HeadPiece]:
+def teeth_pieces(teeth: FittedMesh, vertices: Doubles, fapu: dict[str, float]) -> list[HeadPiece]:
     """Make the upper and the lower teeth; the lower teeth move with the jaw.
 
     ``vertices`` (19158, 3) is the base mesh's shape for which the mouth is laid out.

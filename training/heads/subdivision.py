@@ -8,10 +8,11 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from kouxing.services.driver.head.surface import Float, Index, find_edges
+from kouxing.services.driver.head.surface import find_edges
+from kouxing.shared.arrays import Doubles, Integers
 
 
-def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, Index]:
+def catmull_clark(quads: Integers, num_vertices: int) -> tuple[sparse.csr_array, Integers]:
     """Subdivide once.
 
     Returns the matrix (V + E + F, V) from the old to the new vertices (moved old vertices, edge
@@ -67,8 +68,8 @@ def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, In
 
 
 def smooth_strands(
-    points: Float, quads: Index, uv: Float, welds: Index
-) -> tuple[Float, Index, Float, Index]:
+    points: Doubles, quads: Integers, uv: Doubles, welds: Integers
+) -> tuple[Doubles, Integers, Doubles, Integers]:
     """Subdivide a textured mesh (V, 3) once, across the seams of its texture.
 
     Returns points (W, 3), quads (4 F, 4), texture coordinates (W, 2), and ``welds`` (W,): the first
@@ -88,16 +89,16 @@ def smooth_strands(
     return (matrix @ points[used])[position], vertices.reshape(-1, 4), rows[:, 1:], first[same]
 
 
-def _incidence(rows: Index, columns: Index, shape: tuple[int, int]) -> sparse.csr_array:
+def _incidence(rows: Integers, columns: Integers, shape: tuple[int, int]) -> sparse.csr_array:
     return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape)
 
 
-def triangles_of(quads: Index) -> Index:
+def triangles_of(quads: Integers) -> Integers:
     """Split quads (F, 4) into triangles (2 F, 3)."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def used_vertices(triangles: Index, welds: Index) -> tuple[Index, Index, Index]:
+def used_vertices(triangles: Integers, welds: Integers) -> tuple[Integers, Integers, Integers]:
     """Return the vertices (W,) that triangles (F, 3) use, and triangles and welds (W,) of these.
 
     ``welds`` (V,) has the first vertex at the same position.
@@ -107,7 +108,7 @@ def used_vertices(triangles: Index, welds: Index) -> tuple[Index, Index, Index]:
     return used, corners.reshape(-1, 3), first[same]
 
 
-def patch_sizes(quads: Index) -> Index:
+def patch_sizes(quads: Integers) -> Integers:
     """Return for each quad (F, 4) the size of its connected patch, in quads."""
     corner, quad = quads.ravel(), np.repeat(np.arange(len(quads)), 4)
     incidence = _incidence(corner, quad, (quads.max() + 1, len(quads)))
@@ -115,7 +116,7 @@ def patch_sizes(quads: Index) -> Index:
     return np.asarray(np.bincount(patch)[patch])
 
 
-def vertex_normals(vertices: Float, triangles: Index) -> Float:
+def vertex_normals(vertices: Doubles, triangles: Integers) -> Doubles:
     """Return the unit normals (V, 3): area-weighted means over the adjacent triangles."""
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     area = np.cross(b - a, c - a)
@@ -126,7 +127,9 @@ def vertex_normals(vertices: Float, triangles: Index) -> Float:
     return normals
 
 
-def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, Index]:
+def clip(
+    height: Doubles, triangles: Integers, values: Doubles
+) -> tuple[Doubles, Integers, Integers]:
     """Remove everything above ``height`` (V,) 0; ``values`` (V, D) are interpolated at the cut.
 
     Returns values (W, D) of old and new vertices, triangles (G, 3), and the edges (E, 2) of the cut

@@ -7,14 +7,13 @@ import io
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from kouxing.shared.arrays import Doubles, Integers
 from kouxing.training.heads.fitted_mesh import find
 from kouxing.training.heads.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
 
-Float = NDArray[np.float64]
 Color = tuple[float, float, float]
 
 GRAY = 0.75  # mean of the gray textures
@@ -26,20 +25,20 @@ _SHADOW_WIDTH = 0.006  # of hairs, relative to the texture's height
 _RELIEF = 8.0  # slope at a relative change of the brightness from one texel to the next
 
 
-def noise(shape: tuple[int, int], sigma: float | tuple[float, float], seed: int) -> Float:
+def noise(shape: tuple[int, int], sigma: float | tuple[float, float], seed: int) -> Doubles:
     """Make smooth noise of unit variance."""
     white = np.random.default_rng(seed).standard_normal(shape)
-    smooth: Float = ndimage.gaussian_filter(white, sigma, mode="wrap")
+    smooth: Doubles = ndimage.gaussian_filter(white, sigma, mode="wrap")
     smooth /= smooth.std()
     return smooth
 
 
-def mix(image: Float, color: Color, amount: Float) -> Float:
+def mix(image: Doubles, color: Color, amount: Doubles) -> Doubles:
     """Blend a color into an image (H, W, 3) by an amount (H, W)."""
     return image + (np.array(color) - image) * np.clip(amount, 0, 1)[..., None]
 
 
-def load(folder: Path, name: str, size: int = 0) -> Float:
+def load(folder: Path, name: str, size: int = 0) -> Doubles:
     """Read one of MakeHuman's textures (H, W, 3 or 4), with ``size`` reduced to a square."""
     with Image.open(find(folder, name)) as file:
         image = file.convert("RGBA" if "A" in file.getbands() else "RGB")
@@ -48,7 +47,7 @@ def load(folder: Path, name: str, size: int = 0) -> Float:
     return np.asarray(image, dtype=np.float64) / 255
 
 
-def encode(image: Float) -> bytes:
+def encode(image: Doubles) -> bytes:
     """Encode (H, W, 3) as JPEG, (H, W, 2) of gray and alpha as PNG."""
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     file = io.BytesIO()
@@ -59,7 +58,7 @@ def encode(image: Float) -> bytes:
     return file.getvalue()
 
 
-def strands(texture: Float, contrast: float) -> Float:
+def strands(texture: Doubles, contrast: float) -> Doubles:
     """Make a hair texture (H, W, 4) gray with the mean ``GRAY``; return (H, W, 2) with alpha.
 
     MakeHuman painted light and shade into its hair. Only a part of it is kept, because the heads
@@ -87,7 +86,7 @@ def strands(texture: Float, contrast: float) -> Float:
     return np.stack([np.round(gray * 40) / 40, np.round(alpha * 16) / 16], axis=2)
 
 
-def sample_alpha(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> Float:
+def sample_alpha(triangles: Integers, uv: Doubles, alpha: Doubles) -> Doubles:
     """Return alpha at N points of each triangle (F, N); ``uv`` (V, 2) has v downward."""
     steps = np.linspace(0.02, 0.96, 9)
     barycentric = np.array([(a, b, 1 - a - b) for a in steps for b in steps if a + b < 1])
@@ -96,7 +95,7 @@ def sample_alpha(triangles: NDArray[np.int64], uv: Float, alpha: Float) -> Float
     return np.asarray(alpha[row, column])
 
 
-def hairs(texture: Float, strength: float) -> Float:
+def hairs(texture: Doubles, strength: float) -> Doubles:
     """Return the alpha of brows or lashes (H, W, 4), scaled, as even gray with alpha (H, W, 2)."""
     drawn = texture[..., 3]
     # hairs that are thinner than a pixel would fade; their soft shadow fills the gaps
@@ -105,7 +104,7 @@ def hairs(texture: Float, strength: float) -> Float:
     return np.stack([np.full_like(alpha, GRAY), alpha], axis=2)
 
 
-def relief(image: Float) -> Float:
+def relief(image: Doubles) -> Doubles:
     """Return a normal map (H / 2, W / 2, 3) whose fine dark details are deep."""
     gray = image.mean(axis=2)
     gray = gray.reshape(gray.shape[0] // 2, 2, gray.shape[1] // 2, 2).mean(axis=(1, 3))
@@ -117,7 +116,7 @@ def relief(image: Float) -> Float:
     return np.asarray(0.5 + 0.5 * normal)
 
 
-def tint(color: Color) -> Float:
+def tint(color: Color) -> Doubles:
     """Return the linear factor (3,) that gives a gray texture a color."""
     return np.asarray(np.minimum((np.array(color) / GRAY) ** 2, 1.0))
 
@@ -126,7 +125,7 @@ _EYE_CENTER = (302, 727)  # center of an eye in MakeHuman's texture, row and col
 _EYE_IRIS, _EYE_WHITE = 118.0, 250.0  # radii in that texture
 
 
-def eye(texture: Float, color: Color, iris_size: float = 1.0, size: int = 512) -> Float:
+def eye(texture: Doubles, color: Color, iris_size: float = 1.0, size: int = 512) -> Doubles:
     """Turn MakeHuman's eye into a view from the front, with the angle from the pupil as radius.
 
     ``color`` is the color of the iris, ``iris_size`` scales iris and pupil.
@@ -162,7 +161,7 @@ def eye(texture: Float, color: Color, iris_size: float = 1.0, size: int = 512) -
     return np.clip(mix(image, (0.015, 0.012, 0.012), pupil), 0, 1)
 
 
-def teeth(texture: Float) -> Float:
+def teeth(texture: Doubles) -> Doubles:
     """Whiten the enamel of MakeHuman's teeth, and make the gums paler (H, W, 3)."""
     colors = texture[..., :3]
     light = colors.mean(axis=2, keepdims=True)
@@ -173,7 +172,7 @@ def teeth(texture: Float) -> Float:
     return np.asarray(np.clip(enamel + (gum - enamel) * is_gum, 0, 1))
 
 
-def tongue(size: int = 128) -> Float:
+def tongue(size: int = 128) -> Doubles:
     """Paint the tongue from above, with its tip at the bottom: papillae and a groove."""
     rough = 0.06 * noise((size, size), 0.8, 9) + 0.02 * noise((size, size), 4.0, 10)
     across = (np.arange(size) + 0.5) / size - 0.5
@@ -183,6 +182,6 @@ def tongue(size: int = 128) -> Float:
     return np.clip(mix(image, (0.93, 0.68, 0.66), paler), 0, 1)
 
 
-def cloth(color: Color, size: int = 16) -> Float:
+def cloth(color: Color, size: int = 16) -> Doubles:
     """Paint a plain knitted fabric."""
     return np.broadcast_to(np.array(color), (size, size, 3)).copy()

@@ -17,7 +17,6 @@ lips, eyelids move around the eyeball, puffed cheeks come forward.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from kouxing.services.driver.head import surface
@@ -27,13 +26,12 @@ from kouxing.services.driver.head.skin_fields import (
     INNER_LIPS,
     OUTER_LIPS,
 )
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.shared.face.faps import FAPS
 from kouxing.training.heads import subdivision
 from kouxing.training.heads.makehuman import FEATURE_POINTS
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Fields = dict[int, Float]  # FAP number -> (V, 3)
+Fields = dict[int, Doubles]  # FAP number -> (V, 3)
 
 # the ring of vertices along which the lips meet, from 2.2 over 2.4 and 2.3 to 2.5
 LIP_RING = (
@@ -48,14 +46,14 @@ _HINGE_Z = 0.35  # position of the jaw's axis, dm
 class Skin:
     """A subdivided surface; a coarse vertex keeps its number in the fine one."""
 
-    number: Index  # number of a base mesh vertex on the surface, or -1
-    coarse_quads: Index
-    quads: Index
+    number: Integers  # number of a base mesh vertex on the surface, or -1
+    coarse_quads: Integers
+    quads: Integers
     matrix: sparse.csr_array  # coarse vertices -> fine vertices
-    vertices: Float  # fine, dm
-    base: Index  # base mesh vertex of each coarse vertex
+    vertices: Doubles  # fine, dm
+    base: Integers  # base mesh vertex of each coarse vertex
 
-    def transfer(self, target: Float) -> Float:
+    def transfer(self, target: Doubles) -> Doubles:
         """Transfer displacements (19158, 3) of the base mesh to the fine vertices."""
         return np.asarray(self.matrix @ target[self.base])
 
@@ -63,12 +61,12 @@ class Skin:
         """Find the vertex of a feature point."""
         return int(self.number[FEATURE_POINTS[name]])
 
-    def points(self, *names: str) -> Index:
+    def points(self, *names: str) -> Integers:
         """Find the vertices of feature points."""
         return self.number[[FEATURE_POINTS[name] for name in names]]
 
 
-def subdivide(vertices: Float, quads: Index) -> Skin:
+def subdivide(vertices: Doubles, quads: Integers) -> Skin:
     """Subdivide some quads of the base mesh once."""
     base, compact = np.unique(quads, return_inverse=True)
     coarse = compact.reshape(quads.shape)
@@ -110,14 +108,14 @@ def axis_of(fap: int) -> tuple[int, float]:
     return DIRECTION_AXES[FAPS[fap - 1].direction]
 
 
-def smoothest_fields(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
+def smoothest_fields(skin: Skin, points: Integers | list[Integers], fixed: Integers) -> Doubles:
     """Interpolate between points of the skin, see ``surface.smoothest_fields``."""
     return surface.smoothest_fields(
         skin.vertices, subdivision.triangles_of(skin.quads), points, fixed
     )
 
 
-def _axis_field(fap: int, weight: Float) -> Float:
+def _axis_field(fap: int, weight: Doubles) -> Doubles:
     """Make a field (V, 3) along the axis of a FAP."""
     axis, sign = axis_of(fap)
     field = np.zeros((len(weight), 3))
@@ -133,7 +131,7 @@ class FaceFields:
     """
 
     def __init__(
-        self, skin: Skin, cavity: NDArray[np.bool_], blink: list[Float], squint: list[Float]
+        self, skin: Skin, cavity: Mask, blink: list[Doubles], squint: list[Doubles]
     ) -> None:
         self.skin = skin
         self.cavity = cavity
@@ -145,10 +143,10 @@ class FaceFields:
         self._brows()
         self._zones()
 
-    def _add(self, fap: int, weight: Float) -> None:
+    def _add(self, fap: int, weight: Doubles) -> None:
         self.fields[fap] = _axis_field(fap, weight)
 
-    def _far(self, names: tuple[str, ...], reach: float) -> NDArray[np.bool_]:
+    def _far(self, names: tuple[str, ...], reach: float) -> Mask:
         return self._geodesics.distance(self.skin.points(*names)) > reach
 
     def _lips(self) -> None:
@@ -211,7 +209,7 @@ class FaceFields:
                     left = left - 0.5 * left[skin.point(name)] * self.lip_y[name]
             self._add(fap, left)
 
-    def _eyes(self, blink: list[Float], squint: list[Float]) -> None:
+    def _eyes(self, blink: list[Doubles], squint: list[Doubles]) -> None:
         for units, pairs in (
             (blink, ((19, "3.1"), (20, "3.2"))),
             (squint, ((21, "3.3"), (22, "3.4"))),
@@ -225,7 +223,7 @@ class FaceFields:
         x, y, z = self.skin.vertices.T
         fixed = np.flatnonzero((y < 5.87) | (y > 6.42) | (z < 0.75) | self.cavity)
 
-        def bars(*names: str) -> list[Index]:
+        def bars(*names: str) -> list[Integers]:
             """Group each point with the hairs above and below, so that a brow keeps its breadth."""
             groups = []
             for point in self.skin.points(*names):
@@ -265,7 +263,7 @@ class FaceFields:
             names = ("3.1", "3.3", "3.7", "3.11") if side == "l" else ("3.2", "3.4", "3.8", "3.12")
             self._zone(fap, names, 0.05, 0.22, nose)
 
-    def _bump(self, name: str, reach: float) -> Float:
+    def _bump(self, name: str, reach: float) -> Doubles:
         _, y, _ = self.skin.vertices.T
         lids = ("3.3", "3.4", "3.7", "3.8", "3.11", "3.12")
         fixed = self._far((name,), reach) | self.cavity | (y > 5.80)
@@ -279,7 +277,7 @@ class FaceFields:
         return smoothest_fields(self.skin, [top], np.flatnonzero(fixed))[:, 0]
 
     def _zone(
-        self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Index
+        self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Integers
     ) -> None:
         """Move vertices within ``core`` of the points, fix those beyond ``reach``."""
         points = self.skin.points(*([names] if isinstance(names, str) else names))
@@ -312,7 +310,7 @@ def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
 
 
 def jaw_fields(
-    vertices: Float, weight: Float, fapu: dict[str, float], chin_z: float = 1.104
+    vertices: Doubles, weight: Doubles, fapu: dict[str, float], chin_z: float = 1.104
 ) -> Fields:
     """Compute the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
     lever = weight * np.maximum(vertices[:, 2] - _HINGE_Z, 0) / (chin_z - _HINGE_Z)

@@ -24,10 +24,8 @@ from numpy.typing import NDArray
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from kouxing.services.recognizer.lips.lip_predictor import CLOSURE, NUM_LIP_FAPS
+from kouxing.shared.arrays import Doubles, Floats, Mask
 from kouxing.training.lips.positions import SpeechStretch, features_of
-
-Floats = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 _RIDGE, _CLOSURE_RIDGE = 0.1, 0.01
 _MIN_DEVIATION = 1e-2
@@ -37,7 +35,7 @@ _MAX_ITERATIONS = 40
 
 def fit_linear(
     speech: Sequence[SpeechStretch], targets: Sequence[Floats], counts: Sequence[float]
-) -> tuple[Array, Array]:
+) -> tuple[Doubles, Doubles]:
     """Fit the linear part to stretches of speech, each of which counts ``counts`` times.
 
     ``targets`` are FAPs and probabilities, NaN if unknown, (positions, delays, 17). Returns weights
@@ -53,7 +51,7 @@ def fit_linear(
     weights = np.zeros((len(mean), *known_targets.shape[1:]))
     bias = np.zeros(known_targets.shape[1:])
     unknown = np.isnan(known_targets[..., :NUM_LIP_FAPS])
-    known: NDArray[np.bool_] = np.logical_not(unknown.any(axis=1))  # (positions, 15)
+    known: Mask = np.logical_not(unknown.any(axis=1))  # (positions, 15)
     for columns in _equal_columns(known):
         rows = known[:, columns[0]]
         weights[..., columns] = _fit_faps(
@@ -66,7 +64,7 @@ def fit_linear(
     return weights, bias - np.tensordot(mean, weights, axes=1)
 
 
-def _equal_columns(known: NDArray[np.bool_]) -> list[list[int]]:
+def _equal_columns(known: Mask) -> list[list[int]]:
     """Group the FAPs that are known at the same positions."""
     groups: dict[bytes, list[int]] = {}
     for column in range(known.shape[1]):
@@ -75,7 +73,7 @@ def _equal_columns(known: NDArray[np.bool_]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _fit_faps(features: Floats, faps: Floats, count: Floats, speaker: NDArray[np.str_]) -> Array:
+def _fit_faps(features: Floats, faps: Floats, count: Floats, speaker: NDArray[np.str_]) -> Doubles:
     """Return the weights of a ridge regression, (features, delays, FAPs)."""
     size = features.shape[1]
     squares, products, total = np.zeros((size, size)), np.zeros((size, faps[0].size)), 0.0
@@ -95,7 +93,7 @@ def _fit_faps(features: Floats, faps: Floats, count: Floats, speaker: NDArray[np
     return np.asarray(weights, dtype=np.float64)
 
 
-def _fit_closures(features: Floats, closure: Floats, count: Floats) -> tuple[Array, Array]:
+def _fit_closures(features: Floats, closure: Floats, count: Floats) -> tuple[Doubles, Doubles]:
     """Return weights and bias of a logistic regression, (features, delays), (delays,)."""
     torch.set_num_threads(1)
     known = ~np.isnan(closure)

@@ -20,10 +20,8 @@ from kouxing.corpora.feature_cache import cache_folder, load_or_compute
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.mouth_profiles.lip_inputs import record_lip_inputs
 from kouxing.services.recognizer.acoustic.encoder import ENCODER_PATH
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.training.networks.augmentation import augment_samples, scale_level
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 _FORMAT = "4"  # raise when the positions change
 
@@ -34,7 +32,7 @@ class SpeechStretch:
 
     clip: LipClip
     features: NDArray[np.float16]  # (positions, features), inputs of the lip model
-    known_s: Array  # (positions,) media time up to which the audio is known
+    known_s: Doubles  # (positions,) media time up to which the audio is known
     speed: float  # speed of the copy; above 1 is faster than the clip
 
 

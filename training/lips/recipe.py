@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import (
     LipClip,
@@ -34,6 +33,7 @@ from kouxing.services.recognizer.lips.lip_predictor import (
     NUM_OUTPUTS,
     GruLipPredictor,
 )
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.errors import UserError
 from kouxing.training.lips.linear import fit_linear
 from kouxing.training.lips.positions import SpeechStretch, components_of, features_of, speech_of
@@ -42,9 +42,6 @@ from kouxing.training.lips.targets import closed_below, targets_at
 from kouxing.training.model_card import write_card
 from kouxing.training.model_files import save_lip_predictor
 from kouxing.training.seed import SEED
-
-Floats = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 # For faces with delays of 0, 20, 50, 60, 100 or 160 ms: the audio of a position ends 5 ms before
 # a frame of the face is due.
@@ -206,7 +203,7 @@ def standardize(target: Floats, units: FapScale) -> Floats:
 
 
 def combine_parts(
-    basis: Basis, network: LipNetwork, linear_weights: Array, linear_bias: Array
+    basis: Basis, network: LipNetwork, linear_weights: Doubles, linear_bias: Doubles
 ) -> GruLipPredictor:
     """Combine the network with the linear part (see ``fit_linear``) and the encoder's lips.
 

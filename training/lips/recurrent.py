@@ -16,8 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from kouxing.services.recognizer.lips.lip_predictor import NUM_LIP_FAPS, NUM_OUTPUTS
-
-Floats = NDArray[np.float32]
+from kouxing.shared.arrays import Floats
 
 HIDDEN_WIDTH = 96
 _DROPOUT = 0.3

@@ -17,13 +17,11 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import CLOSED_FRACTION, LipClip, opening_of
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, select_lip_faps
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.phones.events import Phone
-
-Array = NDArray[np.float64]
 
 _RANGE_PERCENTILES = (1.0, 99.0)
 _LIP_TO_TEETH = "f"
@@ -31,7 +29,7 @@ _LIP_TO_TEETH = "f"
 
 def closed_below(clips: Sequence[LipClip]) -> dict[str, float]:
     """Measure the opening, FAP units, below which the lips of each speaker touch."""
-    by_speaker: dict[str, list[Array]] = defaultdict(list)
+    by_speaker: dict[str, list[Doubles]] = defaultdict(list)
     for clip in clips:
         by_speaker[clip.speaker].append(opening_of(clip.faps))
     limits = {}
@@ -47,9 +45,9 @@ def targets_at(
     clip: LipClip,
     phones: Sequence[Phone] | None,
     closed_at: float,
-    known_s: Array,
+    known_s: Doubles,
     delays_s: Sequence[float],
-) -> NDArray[np.float32]:
+) -> Floats:
     """Compute the targets of positions whose audio is known up to ``known_s``, (n,), in the clip.
 
     ``phones`` are None if the recognizer does not support the clip's language. Below the opening

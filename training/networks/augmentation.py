@@ -32,9 +32,10 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import butter, fftconvolve, resample_poly, sosfilt
 
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
+from kouxing.shared.arrays import Doubles, Floats, Integers
 from kouxing.shared.audio.pcm import as_floats
 
-Samples = NDArray[np.float32]
+Samples = Floats
 Sound = NDArray[np.floating[Any]]  # samples during processing
 
 _HALF_RATE_HZ = SAMPLE_RATE_HZ / 2
@@ -109,18 +110,18 @@ def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:
     return samples * np.float32(gain)
 
 
-def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.int64]:
+def source_frames(num_frames: int, speed: float, num_source: int) -> Integers:
     """Return the source frame of each frame after a change of speed, (num_frames,)."""
     source = speed * np.arange(num_frames) + (speed - 1) * _HALF_WINDOW  # t_source
     return np.asarray(np.clip(np.rint(source), 0, num_source - 1).astype(np.int64))
 
 
-def _room_response(rng: np.random.Generator) -> NDArray[np.float64]:
+def _room_response(rng: np.random.Generator) -> Doubles:
     """Draw a room's response; the first echo arrives after 1 to 8 ms."""
     t60_s = rng.uniform(_MIN_T60_S, _MAX_T60_S)
     num_samples = int(SAMPLE_RATE_HZ * min(t60_s, _MAX_ROOM_S))
     time_s = np.arange(num_samples) / SAMPLE_RATE_HZ
-    response: NDArray[np.float64] = rng.standard_normal(num_samples)
+    response: Doubles = rng.standard_normal(num_samples)
     response *= np.exp(-6.9 * time_s / t60_s)
     response[: int(SAMPLE_RATE_HZ * rng.uniform(0.001, 0.008))] = 0.0
     response *= rng.uniform(0.1, 0.8) / np.sqrt((response**2).sum() + _TINY)
@@ -128,7 +129,7 @@ def _room_response(rng: np.random.Generator) -> NDArray[np.float64]:
     return response
 
 
-def _colored_noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
+def _colored_noise(samples: Sound, rng: np.random.Generator) -> Doubles:
     """Draw a noise 3 to 30 dB below a recording."""
     num_samples = len(samples)
     size = next_fast_len(num_samples, real=True)
@@ -168,7 +169,7 @@ def _transmit(samples: Sound, rng: np.random.Generator) -> Sound:
     return np.asarray(sosfilt(filters, samples))
 
 
-def _filter_response(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
+def _filter_response(samples: Sound, rng: np.random.Generator) -> Doubles:
     size = next_fast_len(len(samples), real=True)
     color = _random_curve(np.fft.rfftfreq(size, 1 / SAMPLE_RATE_HZ), 7, (0.1, 0.5), rng)
     return np.asarray(irfft(rfft(samples, size) * color, size)[: len(samples)])
@@ -179,7 +180,7 @@ def _random_curve(
     num_knots: int,
     spread: tuple[float, float],
     rng: np.random.Generator,
-) -> NDArray[np.float64]:
+) -> Doubles:
     """Draw amplitudes over frequency; the spread of their logarithm is also drawn."""
     knots = rng.normal(0.0, rng.uniform(*spread), num_knots)
     frequency_hz = np.linspace(0.0, _HALF_RATE_HZ, num_knots)

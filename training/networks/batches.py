@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from kouxing.shared.arrays import Doubles, Integers
+
 
 @dataclass(frozen=True, slots=True)
 class FrameTargets:
@@ -28,7 +30,7 @@ class FrameTargets:
         """Make targets of one state a frame, shape (frames,)."""
         return cls(states[:, None].astype(np.uint16), np.ones((len(states), 1), np.float16))
 
-    def select(self, frames: NDArray[np.int64] | slice) -> FrameTargets:
+    def select(self, frames: Integers | slice) -> FrameTargets:
         """Select the targets of some frames."""
         return FrameTargets(self.states[frames], self.probs[frames])
 
@@ -58,7 +60,7 @@ Sample = tuple[NDArray[np.floating[Any]], FrameTargets]  # inputs of the network
 Batch = tuple[Tensor, Tensor, Tensor]  # inputs; states and probabilities, (batch, frames, k)
 
 
-def sampling_probs(recordings: Sequence[LabeledRecording]) -> NDArray[np.float64]:
+def sampling_probs(recordings: Sequence[LabeledRecording]) -> Doubles:
     """Probabilities of sampling each recording, (recordings,)."""
     weights = np.array([recording.weight for recording in recordings])
     weights /= weights.sum()

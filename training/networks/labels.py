@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
 from kouxing.corpora.parallel import process_in_order
@@ -29,6 +28,7 @@ from kouxing.services.recognizer.search.forced_path import (
     viterbi_path,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.arrays import Floats, Integers
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations
@@ -49,7 +49,7 @@ _FULL_FOLDER_MINUTES = 45  # longer folders get the weight of this much speech
 class Alignment:
     """The state of each frame of a recording."""
 
-    states: NDArray[np.int64]  # (frames,) STATES_PER_PHONE for each phone
+    states: Integers  # (frames,) STATES_PER_PHONE for each phone
     phones: list[PathSegment]
     weight: float  # of the phones in statistics of durations
 
@@ -170,7 +170,7 @@ def _align_examples(
 
 def alignment_statistics(
     alignments: Sequence[Alignment], weights: Sequence[float], phone_lm: PhoneLanguageModel
-) -> tuple[Topology, NDArray[np.float32]]:
+) -> tuple[Topology, Floats]:
     """Count transitions and durations, and the states' log priors, (states,).
 
     ``weights`` are the relative sampling weights of the recordings in training.

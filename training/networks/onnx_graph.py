@@ -20,6 +20,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.shared.arrays import Floats
 
 DOMAIN = "com.microsoft"  # domain of onnxruntime's own operators
 _OPERATORS = 20  # version of the ONNX operator set
@@ -28,8 +29,6 @@ _MAX_INTEGER = 127
 _ZERO_POINT = 128  # the integer for an input of 0
 _MIN_SCALE = 1e-12
 _EPSILON = 1e-5  # epsilon of the norms, as in PyTorch
-
-Floats = NDArray[np.float32]
 
 
 class Graph:

@@ -38,6 +38,7 @@ from torch import Tensor
 
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, count_frames
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.batches import (
@@ -104,7 +105,7 @@ class WholeEncoder(Encoder):
             pieces.append(hidden.clamp(-_MAX_HALF, _MAX_HALF).half().cpu().numpy())
         return np.concatenate(pieces)
 
-    def encode(self, samples: NDArray[np.float32]) -> Tensor:
+    def encode(self, samples: Floats) -> Tensor:
         """Encode padded samples, (batch, n), to (batch, positions, 3 width)."""
         with mixed_precision():
             hidden: Tensor = self(centered_mel(torch.from_numpy(samples).to(self.positions.device)))

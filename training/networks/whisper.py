@@ -35,6 +35,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import open_file
 from kouxing.training.device import DEVICE
@@ -105,7 +106,7 @@ def _weight_names(num_layers: int) -> dict[str, str]:
     return names
 
 
-def _float_array(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
+def _float_array(arrays: dict[str, NDArray[np.generic]], name: str) -> Floats:
     """Return an array as 32-bit floats; ValueError if it cannot be used."""
     if name not in arrays:
         raise ValueError(f"it lacks {name}")

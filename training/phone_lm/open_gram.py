@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import track
 
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import open_file, read_file
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -38,12 +38,10 @@ _MAX_TRIES = 8  # to draw a word that is not counted after its context
 class _Level:
     """N-grams of one length, ascending; a code's digits to the base ``_BASE`` are the words."""
 
-    code: NDArray[np.int64]  # (n-grams,)
-    cumulative: NDArray[np.float64]  # (n-grams + 1,) sum of the probabilities before each n-gram
+    code: Integers  # (n-grams,)
+    cumulative: Doubles  # (n-grams + 1,) sum of the probabilities before each n-gram
 
-    def draw(
-        self, context: NDArray[np.int64], rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def draw(self, context: Integers, rng: np.random.Generator) -> tuple[Integers, Mask]:
         """Draw a word after each context; return the words and which of them are counted there."""
         first, end = (np.searchsorted(self.code, (context + n) * _BASE) for n in (0, 1))
         start = self.cumulative[first]
@@ -52,7 +50,7 @@ class _Level:
         counted = (height < self.cumulative[end] - start) & (first < end)
         return self.code[np.minimum(index, len(self.code) - 1)] % _BASE, counted
 
-    def has(self, code: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def has(self, code: Integers) -> Mask:
         """Return which n-grams are counted."""
         index = np.minimum(np.searchsorted(self.code, code), len(self.code) - 1)
         return np.asarray(self.code[index] == code)
@@ -85,7 +83,7 @@ def draw_phones(
 
 
 def _phones_of_words(
-    drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory
+    drawn: Integers, words: Sequence[str], inventory: PhoneInventory
 ) -> PhoneStream:
     silence = inventory.index[inventory.silence]
     phones = [
@@ -102,9 +100,7 @@ def _phones_of_words(
     return np.asarray(stream[np.concatenate([[True], ~repeated])])
 
 
-def _next_words(
-    levels: Sequence[_Level], context: NDArray[np.int64], rng: np.random.Generator
-) -> NDArray[np.int64]:
+def _next_words(levels: Sequence[_Level], context: Integers, rng: np.random.Generator) -> Integers:
     """Draw a word after each row of words, shape (rows, words before)."""
     num_before = context.shape[1]
     code = context @ _BASE ** np.arange(num_before - 1, -1, -1)

@@ -34,6 +34,7 @@ from kouxing.services.recognizer.acoustic.model_file import (
     read_archive,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.arrays import Doubles, Floats, Integers
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import read_text
@@ -48,8 +49,8 @@ _UNSEEN_COUNT = 0.5  # added to the count of each single phone
 _MIN_REMAINDER = 1e-4
 _MAX_CODE = np.iinfo(np.int64).max
 
-_NgramCodes = dict[int, NDArray[np.int64]]  # by n, ascending
-_Probs = dict[int, NDArray[np.float64]]  # by n
+_NgramCodes = dict[int, Integers]  # by n, ascending
+_Probs = dict[int, Doubles]  # by n
 
 
 def join_sentences(sentences: Sequence[Sequence[int]], inventory: PhoneInventory) -> PhoneStream:
@@ -81,7 +82,7 @@ def estimate_phone_lm(
     unigram_counts[grams[1]] += counts[1]
     probs: _Probs = {1: unigram_counts / unigram_counts.sum()}
     grams[1] = np.arange(num_phones)
-    gains: dict[int, NDArray[np.float64]] = {}
+    gains: dict[int, Doubles] = {}
     for n in range(2, order + 1):
         _, context = np.unique(grams[n] // num_phones, return_inverse=True)
         total = np.bincount(context, weights=counts[n])  # N
@@ -96,7 +97,7 @@ def estimate_phone_lm(
 
 def _count_ngrams(
     stream: PhoneStream, order: int, silence: int, num_phones: int
-) -> tuple[_NgramCodes, dict[int, NDArray[np.int64]]]:
+) -> tuple[_NgramCodes, dict[int, Integers]]:
     """Count n-grams of 1 to ``order`` phones; a pause may only be the first or the last phone."""
     phones = stream.astype(np.int64)
     last = np.arange(1, len(phones))  # where n-grams end; the first pause is only context
@@ -114,11 +115,7 @@ def _count_ngrams(
 
 
 def _prune(
-    grams: _NgramCodes,
-    probs: _Probs,
-    gains: dict[int, NDArray[np.float64]],
-    max_ngrams: int,
-    num_phones: int,
+    grams: _NgramCodes, probs: _Probs, gains: dict[int, Doubles], max_ngrams: int, num_phones: int
 ) -> None:
     """Keep the n-grams with the highest gains, and their prefixes, in place."""
     all_gains = np.concatenate(list(gains.values()))
@@ -169,9 +166,7 @@ class _NgramTree:
             log_backoff=_log_probs(backoffs),
         )
 
-    def _smoothed_prob(
-        self, wanted: NDArray[np.int64], n: int, backoffs: _Probs
-    ) -> NDArray[np.float64]:
+    def _smoothed_prob(self, wanted: Integers, n: int, backoffs: _Probs) -> Doubles:
         num_phones = len(self.inventory)
         index = np.minimum(np.searchsorted(self.grams[n], wanted), len(self.grams[n]) - 1)
         probs = self.probs[n][index]
@@ -186,12 +181,12 @@ class _NgramTree:
         return probs
 
 
-def _remainder(total: NDArray[Any]) -> NDArray[np.float64]:
+def _remainder(total: NDArray[Any]) -> Doubles:
     """Return what a sum of probabilities leaves of 1, at least a little."""
     return np.asarray(np.maximum(1 - total, _MIN_REMAINDER))
 
 
-def _log_probs(values: _Probs) -> NDArray[np.float32]:
+def _log_probs(values: _Probs) -> Floats:
     """Return the logarithms of all levels in order, the root's (0) first."""
     logs = np.log(np.concatenate([[1.0], *(values[n] for n in range(1, len(values) + 1))]))
     return np.asarray(logs.astype(np.float32))

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
@@ -28,6 +27,7 @@ from kouxing.services.recognizer.search.forced_path import (
     build_utterance_graph,
     viterbi_path,
 )
+from kouxing.shared.arrays import Doubles, Floats, Integers
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.universal.segments import features
@@ -57,7 +57,7 @@ class Aligner:
         """Number of universal phones, silence included."""
         return len(self.inventory)
 
-    def align(self, stored: Sequence[Features]) -> dict[str, NDArray[np.int64]]:
+    def align(self, stored: Sequence[Features]) -> dict[str, Integers]:
         """Return the states of the frames of recordings, (2 positions,) each, by name.
 
         A recording with too few positions for its phones is left out.
@@ -103,7 +103,7 @@ class Aligner:
             silence=self.inventory.index[self.inventory.silence],
         )
 
-    def _hand_labels(self, stored: Features) -> NDArray[np.int64]:
+    def _hand_labels(self, stored: Features) -> Integers:
         """Return the phones of a recording's positions; empty without hand-made labels."""
         table = self.recordings[stored.name].labels
         if table is None:
@@ -113,7 +113,7 @@ class Aligner:
         phones = np.array([self.inventory.index[symbol] for symbol in symbols])
         return np.asarray(phones[np.minimum(np.searchsorted(ends_s, time_s), len(phones) - 1)])
 
-    def _similarity_weights(self, labels: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
+    def _similarity_weights(self, labels: Sequence[Integers]) -> Doubles:
         """Return w, (phones, phones)."""
         counts = np.bincount(np.concatenate(labels), minlength=self.num_phones)
         is_known = counts >= _MIN_LABELED
@@ -144,8 +144,8 @@ def _components(stored: Sequence[Features]) -> list[Tensor]:
 
 
 def _classifier(
-    features: Sequence[Tensor], labels: Sequence[NDArray[np.int64]], num_phones: int
-) -> tuple[nn.Module, NDArray[np.float32]]:
+    features: Sequence[Tensor], labels: Sequence[Integers], num_phones: int
+) -> tuple[nn.Module, Floats]:
     """Train a classifier of positions; return it with the phones' log priors."""
     inputs, targets = torch.cat(list(features)), torch.from_numpy(np.concatenate(labels))
     classifier = nn.Sequential(
@@ -167,7 +167,7 @@ def _classifier(
     return classifier.eval(), np.log(counts / counts.sum()).astype(np.float32)
 
 
-def _states_on_path(scores: NDArray[np.float32], graph: UtteranceGraph) -> NDArray[np.int64]:
+def _states_on_path(scores: Floats, graph: UtteranceGraph) -> Integers:
     """Return the state of each row of scores, or nothing if there are too few rows."""
     num_states = scores.shape[1]
     stay, leave = (np.full(num_states, np.log(prob), np.float32) for prob in (_STAY, _LEAVE))
@@ -175,7 +175,7 @@ def _states_on_path(scores: NDArray[np.float32], graph: UtteranceGraph) -> NDArr
     return np.asarray(graph.states[path])
 
 
-def _split_into_states(phones: NDArray[np.int64]) -> NDArray[np.int64]:
+def _split_into_states(phones: Integers) -> Integers:
     """Divide each phone's frames equally among its states."""
     starts = np.flatnonzero(np.diff(phones, prepend=-1))
     lengths = np.diff(np.append(starts, len(phones)))

@@ -17,6 +17,7 @@ from kouxing.services.recognizer.acoustic.network import (
     position_table,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
+from kouxing.shared.arrays import Floats
 from kouxing.training.blocks.export import BlockGraph
 from kouxing.training.blocks.exported import rebuild_encoder
 from kouxing.training.blocks.network import BlockEncoder
@@ -38,7 +39,7 @@ class FeatureEncoder:
         unused = np.zeros((LENGTH, self._shape.width), np.float32)
         self._positions = np.concatenate([position_table(self._shape.width), unused])
 
-    def encode(self, recordings: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float16]]:
+    def encode(self, recordings: Sequence[Floats]) -> list[NDArray[np.float16]]:
         """Encode log-mel frames, (n, 80) each, to (blocks, B + R, layers * width) each.
 
         The rows of positions that a block lacks are undefined.
@@ -74,7 +75,7 @@ class FeatureEncoder:
         ]
 
 
-def _padded(frames: NDArray[np.float32], num_blocks: int) -> NDArray[np.float32]:
+def _padded(frames: Floats, num_blocks: int) -> Floats:
     """Floor the bands as the recognizer does, and repeat the last frame."""
     num_frames = (
         PADDING_FRAMES + FRAMES_PER_ENCODER_FRAME * (num_blocks * BLOCK_LENGTH + LENGTH) + 3

@@ -25,6 +25,7 @@ from rich.progress import track
 from kouxing.corpora.feature_cache import load_or_compute, read_audio
 from kouxing.corpora.speech_corpus import Utterance
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.arrays import Floats
 from kouxing.shared.command.terminal import write_text
 from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.seed import SEED
@@ -46,7 +47,7 @@ class Features:
     num_frames: int
     rows: NDArray[np.int8]  # (blocks, B + R, 1024)
 
-    def position_features(self) -> NDArray[np.float32]:
+    def position_features(self) -> Floats:
         """Return the features of the positions, (positions, 1024)."""
         rows = self.rows[:, :BLOCK_LENGTH].reshape(-1, WIDTH)[: -(-self.num_frames // 2)]
         return rows.astype(np.float32) * np.float32(STEP)
@@ -63,7 +64,7 @@ class FeatureStore:
     def standardize(self, recordings: Sequence[Utterance]) -> None:
         """Compute mean and deviation from some recordings, or read them."""
 
-        def compute() -> dict[str, NDArray[np.float32]]:
+        def compute() -> dict[str, Floats]:
             size = min(_NUM_STANDARDIZED, len(recordings))
             features = []
             for number in np.random.default_rng(SEED).choice(len(recordings), size, replace=False):
@@ -121,6 +122,6 @@ def _read_shard(index: Path) -> Iterator[Features]:
         yield Features(name=name, num_frames=num_frames, rows=rows[first : first + num_blocks])
 
 
-def _frames_of(recording: Utterance) -> NDArray[np.float32]:
+def _frames_of(recording: Utterance) -> Floats:
     """Return log-mel frames, (n, 80)."""
     return WhisperMel().accept_waveform(read_audio(recording.path))[:MAX_FRAMES]

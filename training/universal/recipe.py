@@ -18,6 +18,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import EXTENSION_PREFIX, BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.decoder import PathSegment
+from kouxing.shared.arrays import Floats, Integers
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
@@ -125,10 +126,10 @@ def _aligned_states(aligner: Aligner, stored: Sequence[Features]) -> dict[str, N
 
 def _statistics(
     recordings: Mapping[str, Utterance],
-    states: Mapping[str, NDArray[np.int64]],
+    states: Mapping[str, Integers],
     weight_of: Mapping[str, float],
     inventory: PhoneInventory,
-) -> tuple[Topology, NDArray[np.float32]]:
+) -> tuple[Topology, Floats]:
     """Count transitions, durations and n-grams of phones; return the states' log priors too."""
     aligned = [
         Alignment(states=path, phones=_phones_of(path), weight=weight_of[name])
@@ -140,7 +141,7 @@ def _statistics(
     return alignment_statistics(aligned, list(np.array(weights) / sum(weights)), phone_lm)
 
 
-def _phones_of(states: NDArray[np.int64]) -> list[PathSegment]:
+def _phones_of(states: Integers) -> list[PathSegment]:
     """Return the phones of aligned frames. Equal neighbors differ in their states' order."""
     starts = np.flatnonzero(
         np.diff(states // STATES_PER_PHONE, prepend=-1) | (np.diff(states, prepend=0) < 0)

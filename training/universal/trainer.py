@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import nll_loss
 
+from kouxing.shared.arrays import Integers
 from kouxing.training.blocks.network import BlockLayout, BlockReadout, block_layout
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.networks.optimizer import optimize
@@ -41,7 +42,7 @@ _NO_STATE = -1
 def train_readout(
     readout: BlockReadout,
     recordings: Sequence[Features],
-    states: Mapping[str, NDArray[np.int64]],
+    states: Mapping[str, Integers],
     weights: Sequence[float],
     *,
     num_steps: int,
@@ -85,8 +86,8 @@ def train_readout(
 
 
 def _crop(
-    recording: Features, states: NDArray[np.int64], layout: BlockLayout, rng: np.random.Generator
-) -> tuple[NDArray[np.int8], NDArray[np.int64]]:
+    recording: Features, states: Integers, layout: BlockLayout, rng: np.random.Generator
+) -> tuple[NDArray[np.int8], Integers]:
     """Draw blocks of a recording; return features, (n, 1024), and states, (n, 2)."""
     num_more = len(recording.rows) - _CROP_BLOCKS
     first = int(rng.integers(num_more + 1)) if num_more > 0 and rng.random() < 0.5 else 0
@@ -100,7 +101,7 @@ def _crop(
     return rows.reshape(-1, WIDTH)[_in_cache(layout)], by_place
 
 
-def _in_cache(layout: BlockLayout) -> NDArray[np.int64]:
+def _in_cache(layout: BlockLayout) -> Integers:
     """Return the row of each place in the stored blocks, (n,)."""
     own = np.arange(layout.num_positions)
     rows = own // BLOCK_LENGTH * LENGTH + own % BLOCK_LENGTH

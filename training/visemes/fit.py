@@ -54,12 +54,11 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEMES,
 )
 from kouxing.shared import fast_record
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import LIP_HEIGHT_FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-
-Array = NDArray[np.float64]
 
 _NEAR = 8  # visemes of a frame that can have weight
 _FAR_S = 60.0  # a viseme this far away has no weight
@@ -70,11 +69,11 @@ class FrameTable:
     """Frames of all clips, with the nearest visemes and silences of each."""
 
     viseme: NDArray[np.intp]  # (num_frames, near)
-    before_s: Array  # (num_frames, near) start of the apex minus time
-    after_s: Array  # (num_frames, near) its end minus time
-    silence_start_s: Array  # (num_frames, 2) minus time
-    silence_end_s: Array  # (num_frames, 2) minus time
-    faps: Array  # (num_frames, num_mouth_faps)
+    before_s: Doubles  # (num_frames, near) start of the apex minus time
+    after_s: Doubles  # (num_frames, near) its end minus time
+    silence_start_s: Doubles  # (num_frames, 2) minus time
+    silence_end_s: Doubles  # (num_frames, 2) minus time
+    faps: Doubles  # (num_frames, num_mouth_faps)
 
 
 def collect_frames(
@@ -88,7 +87,9 @@ def collect_frames(
             continue
         time = clip.time_s[:, None]
 
-        def nearest(starts: Array, ends: Array, count: int, time: Array = time) -> NDArray[np.intp]:
+        def nearest(
+            starts: Doubles, ends: Doubles, count: int, time: Doubles = time
+        ) -> NDArray[np.intp]:
             distance = np.maximum(np.maximum(starts - time, time - ends), 0.0)
             return np.argsort(distance, axis=1, kind="stable")[:, :count]
 
@@ -179,7 +180,7 @@ class _FapFit:
         self._start[4, ~self.fixed] *= gain
         self.visemes[4, ~self.fixed] *= gain
 
-    def curve(self) -> tuple[Array, Array]:
+    def curve(self) -> tuple[Doubles, Doubles]:
         """Return modeled and measured values of all frames."""
         silent = self._log_silences(self.silences)
         return self._blend(self.visemes, silent)[0], self._measured
@@ -188,14 +189,14 @@ class _FapFit:
         """Minimize the loss over the unknowns of some visemes and of the silences; return it."""
         num = 5 * len(rows)
 
-        def unpack(z: Array) -> tuple[Array, Array]:
+        def unpack(z: Doubles) -> tuple[Doubles, Doubles]:
             visemes, silences = self.visemes.copy(), self.silences.copy()
             visemes[:, rows] = self._start[:, rows] + self._spread * z[:num].reshape(5, -1)
             if with_silences:
                 silences = self._silence_start + self._silence_spread * z[num:]
             return visemes, silences
 
-        def loss(z: Array) -> tuple[float, Array]:
+        def loss(z: Doubles) -> tuple[float, Doubles]:
             visemes, silences = unpack(z)
             silent = self._log_silences(silences)
             curve, slopes = self._blend(visemes, silent)
@@ -235,7 +236,7 @@ class _FapFit:
         self.visemes, self.silences = unpack(result.x)
         return float(result.fun)
 
-    def _log_silences(self, silences: Array) -> Array:
+    def _log_silences(self, silences: Doubles) -> Doubles:
         """Compute the log weights of the silences, (num_frames, 2)."""
         theta_left, theta_right = np.exp(silences[:2])
         start, end = self._silence
@@ -245,7 +246,7 @@ class _FapFit:
             end - start,
         )
 
-    def _blend(self, visemes: Array, silent: Array) -> tuple[Array, list[Array]]:
+    def _blend(self, visemes: Doubles, silent: Doubles) -> tuple[Doubles, list[Doubles]]:
         """Compute the curve, (num_frames,), and its five slopes, (num_frames, near)."""
         viseme, c = self._viseme, self.c
         log_alpha, log_minus, log_plus, offset, target = visemes[:, viseme]

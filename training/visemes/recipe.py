@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip, label_clip, no_clip_error, read_clips
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
@@ -26,11 +25,12 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     VISEMES,
 )
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.command.terminal import write_text
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-from kouxing.training.visemes.fit import Array, collect_frames, fit_parameters
+from kouxing.training.visemes.fit import collect_frames, fit_parameters
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
 _SPOKEN_DB = 25.0  # audio this far below the loudest is not speech
@@ -45,7 +45,7 @@ _SOURCE = "start and tongue: targets of Crystal.TTVS (Tsinghua University), Apac
 
 def measure_viseme_levels(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
-) -> Array:
+) -> Doubles:
     """Measure the level of each viseme relative to its speaker's mean, dB, (num_visemes,)."""
     start = initial_parameters().level_db
     total, count = _LEVEL_RIDGE * start, np.full(len(VISEMES), _LEVEL_RIDGE)
@@ -142,7 +142,7 @@ def format_parameters(
     that a fair evaluation must exclude.
     """
 
-    def line(name: str, values: NDArray[np.float64]) -> str:
+    def line(name: str, values: Doubles) -> str:
         # seven digits are precise enough and equal on all machines
         return f"{json.dumps(name)}: [{', '.join(f'{value:.7g}' for value in values)}]"
 

@@ -7,8 +7,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.cli.options import CaptionKind
@@ -28,6 +26,7 @@ from kouxing.services.recognizer.offline.offline_recognition import recognize_re
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
@@ -49,7 +48,7 @@ class FaceMotion:
     frames: list[film.TimedFaps]
     frame_rate_hz: float
     image_rate_hz: float  # default for a video
-    samples: NDArray[np.float32] | None  # 16 kHz mono, shape (n,)
+    samples: Floats | None  # 16 kHz mono, shape (n,)
     phones: list[Phone] | None = None  # spoken phones in order; None if the source has no sound
     syllables: Sequence[TimedSyllable] = ()  # as written, in order
     source: Path | None = None

@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import TypeAlias
 from xml.sax.saxutils import escape
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.services.cli.options import CurveFormat
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.mouth_shapes import CLOSED, REST, SILENCE, Cue, mouth_cues, oculus_cues
 from kouxing.shared.files.output_file import path_as_text
 
-Frames: TypeAlias = Iterable[tuple[float, NDArray[np.float32]]]  # times in seconds, FAPs (68,)
+Frames: TypeAlias = Iterable[tuple[float, Floats]]  # times in seconds, FAPs (68,)
 _NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 _Span: TypeAlias = tuple[str, str, str]  # start, end, and the mouth between them
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import Progress
 
 from kouxing.services.cli.options import CurveFormat, ExportOptions
@@ -24,6 +23,7 @@ from kouxing.services.cli.recordings.cue_files import CUE_FORMATS, CUE_KINDS, fo
 from kouxing.services.cli.recordings.curve_reader import median_rate_hz
 from kouxing.services.senders import live_link
 from kouxing.services.senders.face_frame import FaceFrame
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import print_message, write_text
 from kouxing.shared.errors import UserError
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from kouxing.services.cli.recordings.animation import FaceMotion
 
 T = TypeVar("T", Phone, TimedSyllable)
-Values = NDArray[np.float32]
+Values = Floats
 FrameRow = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
 _SHAPE_FORMATS = (CurveFormat.ARKIT, CurveFormat.OCULUS, CurveFormat.VRM)
 _LIVE_LINK_RATE_HZ = 60  # rate of the time code; the app's default

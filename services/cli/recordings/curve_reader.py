@@ -18,9 +18,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.senders.live_link import ANGLES
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import MAX_FRAMES, FapAnimation
@@ -40,8 +40,6 @@ _ROUNDING_S = 0.0015  # steps between times in whole milliseconds differ by up t
 _OTHER_COLUMNS = {"", "time_s", "sequence", "phone", "timecode", "blendshapecount"}
 _OTHER_COLUMNS |= {angle.lower() for angle in ANGLES}
 _HEAD_FAPS = dict(zip(ANGLES, ("head_yaw", "head_pitch", "head_roll"), strict=False))
-
-Float64 = NDArray[np.float64]
 
 
 def read_table(path: Path) -> FapAnimation:
@@ -70,7 +68,7 @@ def read_table(path: Path) -> FapAnimation:
         print_message(f"{path}: ignored unknown columns: {', '.join(map(_hint, ignored))}")
     count = names.index("blendshapecount") if "blendshapecount" in names else None
     times: list[str] = []
-    values: list[Float64] = []
+    values: list[Doubles] = []
     for number, row in enumerate(rows, start=1):
         if count is not None and row[count : count + 1] == ["0"]:
             continue
@@ -151,7 +149,7 @@ def _json_rows(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
             ) from None
 
 
-def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
+def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Doubles]:
     """Return the columns of FAPs or of one set of shapes, and their FAPs at a value of 1.
 
     Shapes may have any name that other programs give them. Several columns that form one shape
@@ -180,7 +178,7 @@ def _known_columns(path: Path, names: list[str]) -> tuple[list[int], Float64]:
     return [folded.index(name.lower()) for name in known], np.array([*known.values()])
 
 
-def _parse_times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float64:
+def _parse_times_s(path: Path, times: list[str], *, is_time_code: bool) -> Doubles:
     try:
         codes = [_TIME_CODE.fullmatch(str(time).strip()) for time in times]
         values = [code.groups() if code else () for code in codes] if is_time_code else times
@@ -195,12 +193,12 @@ def _parse_times_s(path: Path, times: list[str], *, is_time_code: bool) -> Float
     hours, minutes, seconds, frames = fields.T
     lowest_hz = frames.max() if len(np.unique(seconds)) > 1 else max(59, frames.max())
     rate_hz = next((rate for rate in _TIME_CODE_RATES_HZ if lowest_hz < rate), 60)
-    times_s: Float64 = 3600 * hours + 60 * minutes + seconds + frames / rate_hz
+    times_s: Doubles = 3600 * hours + 60 * minutes + seconds + frames / rate_hz
     midnights = np.cumsum(np.diff(times_s, prepend=times_s[0]) < -_DAY_S / 2)
     return times_s + midnights * _DAY_S
 
 
-def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
+def _resample(path: Path, times_s: Doubles, faps: Doubles) -> FapAnimation:
     steps_s = np.diff(times_s)
     if (steps_s < 0).any():
         number = int(np.argmax(steps_s < 0)) + 2
@@ -224,7 +222,7 @@ def _resample(path: Path, times_s: Float64, faps: Float64) -> FapAnimation:
     return FapAnimation(path.stem, rate_hz, resampled)
 
 
-def median_rate_hz(times_s: Float64) -> float:
+def median_rate_hz(times_s: Doubles) -> float:
     """Return the median frame rate. Averaging equal steps cancels the rounding of their times."""
     steps_s = np.diff(times_s)
     steps_s = steps_s[steps_s > 0]

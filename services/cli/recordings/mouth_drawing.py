@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.cli.options import TimingMethod, WidthSource
 from kouxing.services.cli.recordings.captions import spell_syllables
@@ -48,6 +47,7 @@ from kouxing.services.synthesizer.lips.ferguson.timing import (
     time_text,
 )
 from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import open_progress, plural, print_message, write_text
 from kouxing.shared.errors import UserError
@@ -57,8 +57,6 @@ from kouxing.shared.fonts import NO_CHINESE_FONT, can_draw
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-
-Array = NDArray[np.float64]
 
 NUM_POINTS = 21  # on each line of the contour, in a table
 FRAME_RATE_HZ = 25.0
@@ -74,19 +72,19 @@ _BLOCK_FRAMES = 250  # number of contours to compute at once
 class _MouthMotion:
     """The motion of a mouth, and its labels in the drawing."""
 
-    samples: NDArray[np.float32]  # 16 kHz mono, shape (n,)
+    samples: Floats  # 16 kHz mono, shape (n,)
     phones: Sequence[Phone]
     syllables: Sequence[TimedSyllable]
     key_frames: KeyFrames
-    widths: tuple[Array, Array]  # times, and the width at each, relative to the mouth at rest
+    widths: tuple[Doubles, Doubles]  # times, and the width at each, relative to the mouth at rest
     inventory: PhoneInventory
     shows_text: bool  # whether labels show characters next to their spelling
 
-    def widths_at(self, times_s: Sequence[float] | Array) -> Array:
+    def widths_at(self, times_s: Sequence[float] | Doubles) -> Doubles:
         """Return the width at times (n,), relative to the mouth at rest."""
         return np.interp(times_s, *self.widths)
 
-    def sample(self) -> tuple[Array, Array, Array]:
+    def sample(self) -> tuple[Doubles, Doubles, Doubles]:
         """Return the times of the video's frames, and the opening and the width at each of them."""
         num_frames = int(len(self.samples) / MEDIA_RATE_HZ * FRAME_RATE_HZ) + 1
         times_s = np.arange(num_frames) / FRAME_RATE_HZ
@@ -162,7 +160,7 @@ def draw_mouth(
 
 def _time_phones(
     source: Path,
-    samples: NDArray[np.float32],
+    samples: Floats,
     transcript: Transcript | None,
     timing: TimingMethod | None,
     inventory: PhoneInventory,
@@ -190,11 +188,11 @@ def _time_phones(
 
 def _find_widths(
     lips: WidthSource,
-    samples: NDArray[np.float32],
+    samples: Floats,
     timed: Sequence[Phone],
     inventory: PhoneInventory,
     with_progress: WithProgress,
-) -> tuple[Array, Array]:
+) -> tuple[Doubles, Doubles]:
     """Return times, and the distance of the corners at each, relative to the mouth at rest."""
     if lips is WidthSource.FERGUSON:
         return np.zeros(1), np.ones(1)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import read_file
 
@@ -24,7 +24,7 @@ MAX_BYTES = 4 * 1024 * 1024
 _GROUP_SIZES = {2: 14, 3: 14, 4: 6, 5: 4, 6: 4, 7: 1, 8: 10, 9: 15, 10: 10, 11: 6}
 _FAPU_LENGTHS = ("MNS", "MW", "ENS", "ES", "IRISD")
 
-Position = NDArray[np.float64]
+Position = Doubles
 
 
 @dataclass(frozen=True, slots=True)

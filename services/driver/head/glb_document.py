@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.files.output_file import open_output
 
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
@@ -74,9 +75,7 @@ class GlbDocument:
             )
         return self.add("accessors", item)
 
-    def add_sparse_vectors(
-        self, rows: NDArray[np.intp], values: NDArray[np.float32], count: int
-    ) -> int:
+    def add_sparse_vectors(self, rows: NDArray[np.intp], values: Floats, count: int) -> int:
         """Store displacements (count, 3), zero outside ``rows``; return their accessor's index."""
         number = np.uint16 if count <= MAX_SHORT_VERTICES else np.uint32
         padded = np.concatenate([values, np.zeros((int(len(rows) < count), 3), np.float32)])

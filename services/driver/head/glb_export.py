@@ -48,12 +48,13 @@ from kouxing.services.driver.head.morph_targets import (
 from kouxing.services.driver.render import shaders
 from kouxing.services.driver.render.renderer import BACKGROUND
 from kouxing.services.driver.render.scene import place_camera
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
 from kouxing.shared.face.shapes import ARKIT
 
-TimedFaps: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
+TimedFaps: TypeAlias = tuple[float, Floats]  # media time in seconds, FAPs (68,)
 
 _ROTATION_OF = {
     23: ("eye_left", (0, 1, 0)),
@@ -191,13 +192,13 @@ def _add_animation(
     document.add("animations", {"name": "speech", "samplers": samplers, "channels": channels})
 
 
-def _rotation(node: str, faps: NDArray[np.float32]) -> NDArray[np.float64]:
+def _rotation(node: str, faps: Floats) -> Doubles:
     """Return the quaternions (num_frames, 4) of a node that FAPs rotate: yaw, pitch, roll."""
     angles = np.zeros((len(faps), 3))
     for fap, (turned, axis) in _ROTATION_OF.items():
         if turned == node:
             angles[:, axis.index(1)] = faps[:, fap - 1] * RADIANS_PER_ANGLE_UNIT
-    quaternions: NDArray[np.float64] = Rotation.from_euler("YXZ", angles[:, [1, 0, 2]]).as_quat()
+    quaternions: Doubles = Rotation.from_euler("YXZ", angles[:, [1, 0, 2]]).as_quat()
     return quaternions
 
 
@@ -358,7 +359,7 @@ def _description(head: Head) -> dict[str, Any]:
     } | ({"license": "CC0-1.0"} if _is_built_in(head) else {})
 
 
-def _shapes(names: tuple[str, ...], values: NDArray[np.float32]) -> list[dict[str, Any]]:
+def _shapes(names: tuple[str, ...], values: Floats) -> list[dict[str, Any]]:
     """Return shapes as low-level FAPs."""
     return [
         {"name": name, "faps": {FAPS[i].name: round(float(row[i]), 1) for i in np.flatnonzero(row)}}

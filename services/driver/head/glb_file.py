@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.head.draco_decoder import decode_mesh, read_mesh_size
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content, parse_json, read_file
 
@@ -34,8 +35,6 @@ _SUPPORTED = {
 }  # fmt: skip
 # extensions whose data is plain glTF
 _LOOK_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "VRM")
-
-Float64 = NDArray[np.float64]
 
 
 @contextlib.contextmanager
@@ -158,7 +157,7 @@ class GlbFile:
             raise ValueError("a buffer view is outside the file")
         return buffer[start : start + size]
 
-    def attributes(self, primitive: dict[str, Any], names: Iterable[str]) -> dict[str, Float64]:
+    def attributes(self, primitive: dict[str, Any], names: Iterable[str]) -> dict[str, Doubles]:
         """Return the named attributes (V, components) of a primitive, and its "indices" (N, 1)."""
         accessors = {k: v for k, v in primitive["attributes"].items() if k in names}
         if "indices" in primitive:
@@ -193,7 +192,7 @@ class GlbFile:
             name: self.accessor(index) for name, index in accessors.items() if name not in decoded
         } | decoded
 
-    def accessor(self, index: object) -> Float64:
+    def accessor(self, index: object) -> Doubles:
         """Return an accessor's values (N, components); normalized values are in [-1, 1]."""
         item = self.item("accessors", index)
         width, count = _NUM_COMPONENTS[item["type"]], int(item["count"])
@@ -240,7 +239,7 @@ class GlbFile:
             return self.view(image["bufferView"])
         return self._uri(str(image["uri"])) if "uri" in image else b""
 
-    def nodes(self) -> list[tuple[int, Float64]]:
+    def nodes(self) -> list[tuple[int, Doubles]]:
         """Return the nodes of the scene with their world matrices (4, 4), parents first.
 
         A file without scenes has one scene, with all nodes.
@@ -250,7 +249,7 @@ class GlbFile:
         scene = scenes[self.json.get("scene", 0)] if scenes else {}
         roots = scene.get("nodes", [node for node in range(len(nodes)) if node not in children])
         queue = [(int(root), np.eye(4)) for root in roots]
-        worlds: dict[int, Float64] = {}
+        worlds: dict[int, Doubles] = {}
         while queue:
             number, parent = queue.pop(0)
             node = self.item("nodes", number)
@@ -275,7 +274,7 @@ class GlbFile:
         return np.ndarray(shape, kind, data, start, (stride, kind.itemsize))
 
 
-def _to_float(values: NDArray[Any], accessor: dict[str, Any]) -> Float64:
+def _to_float(values: NDArray[Any], accessor: dict[str, Any]) -> Doubles:
     """Return numbers of an accessor; normalized numbers are in [-1, 1]."""
     out = values.astype(np.float64)
     if accessor.get("normalized") and values.dtype.kind in "iu":
@@ -285,7 +284,7 @@ def _to_float(values: NDArray[Any], accessor: dict[str, Any]) -> Float64:
     return out
 
 
-def _local_matrix(node: dict[str, Any]) -> Float64:
+def _local_matrix(node: dict[str, Any]) -> Doubles:
     """Return the matrix (4, 4) of a node relative to its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T

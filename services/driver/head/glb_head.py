@@ -26,11 +26,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kouxing.services.driver.head.glb_file import Float64, GlbFile, check_glb
+from kouxing.services.driver.head.glb_file import GlbFile, check_glb
 from kouxing.services.driver.head.glb_pieces import find_bones, read_pieces
 from kouxing.services.driver.head.head import Head, assemble_head
 from kouxing.services.driver.head.mesh_pieces import FapFields, MeshPiece, pack_head, part_names
 from kouxing.services.driver.head.morph_targets import units_per_weight
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import (
     FAP_NUMBER,
@@ -63,7 +64,7 @@ _OPEN_JAW = float(ARKIT.basis[ARKIT.names.index("jawOpen"), _JAW])
 _FAP_BY_NAME = {fap.name: fap for fap in FAPS[2:]}
 _NOT_MOUTH = re.compile("eye|brow|cheek|nose|blink|look")
 _SETS = {"arkit": ARKIT, "oculus": OCULUS, "vrm": VRM}
-ShapeFaps = dict[str, Float64]  # shape: FAPs (68,) at weight 1
+ShapeFaps = dict[str, Doubles]  # shape: FAPs (68,) at weight 1
 
 
 def read_glb(path: Path) -> Head:
@@ -123,7 +124,7 @@ def _rename_known_shapes(piece: MeshPiece, shape_of: Mapping[str, str]) -> None:
             piece.vertices = piece.vertices + piece.rest[name] * shift
 
 
-def _turn_jaw(piece: MeshPiece, arm: Float64, known: ShapeFaps) -> None:
+def _turn_jaw(piece: MeshPiece, arm: Doubles, known: ShapeFaps) -> None:
     """Let a jaw bone move the teeth and the tongue, if they have no shapes that open the mouth."""
     opening = {name: row[_JAW] / _OPEN_JAW for name, row in known.items() if row[_JAW] > 0}
     if not opening.keys() & piece.shapes.keys():
@@ -182,17 +183,17 @@ def standard_fapu() -> dict[str, float]:
     return lengths | {"AU": RADIANS_PER_ANGLE_UNIT}
 
 
-def head_weight_at(height: Float64) -> Float64:
+def head_weight_at(height: Doubles) -> Doubles:
     """Return the fraction (V,) of the head rotation by height above the eyes, in eye distances."""
     x = np.clip((height - _NECK_HEIGHTS[1]) / (_NECK_HEIGHTS[0] - _NECK_HEIGHTS[1]), 0, 1)
-    faded: Float64 = x**2 * (3 - 2 * x)
+    faded: Doubles = x**2 * (3 - 2 * x)
     return faded
 
 
 def _check_single_face(pieces: list[MeshPiece], known: ShapeFaps) -> None:
     """Raise ``UserError`` if two meshes far from each other have a mouth."""
     opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in known)
-    centers: list[Float64] = []
+    centers: list[Doubles] = []
     size = 0.0
     for piece in pieces:
         moved = np.linalg.norm(piece.shapes.get(opener, np.zeros((1, 3))), axis=1)
@@ -204,7 +205,7 @@ def _check_single_face(pieces: list[MeshPiece], known: ShapeFaps) -> None:
         raise UserError("it has several faces; export only one avatar")
 
 
-def _upright_rotation(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool) -> Float64:
+def _upright_rotation(eyes: Doubles, mouth: Doubles | None, *, is_mirrored: bool) -> Doubles:
     """Return the rotation (3, 3) after which y is up and the face looks along z.
 
     It turns by right angles, and then by the remaining angle of the eyes if that is large. For a
@@ -229,7 +230,7 @@ def _upright_rotation(eyes: Float64, mouth: Float64 | None, *, is_mirrored: bool
     return turn
 
 
-def _find_eye_centers(glb: GlbFile, pieces: list[MeshPiece], names: list[str]) -> Float64:
+def _find_eye_centers(glb: GlbFile, pieces: list[MeshPiece], names: list[str]) -> Doubles:
     """Find the centers of the left and right eye (2, 3) by bones, eyeballs, lids or the mouth."""
     bones = {bone: number for number, bone in find_bones(glb).items()}
     matrices = dict(glb.nodes())
@@ -264,7 +265,7 @@ def _find_eye_centers(glb: GlbFile, pieces: list[MeshPiece], names: list[str]) -
     return np.stack([middle + half, middle - half])
 
 
-def _moved_center(pieces: list[MeshPiece], names: list[str]) -> Float64 | None:
+def _moved_center(pieces: list[MeshPiece], names: list[str]) -> Doubles | None:
     """Return the mean position of the vertices that some shapes move."""
     total, center = 0.0, np.zeros(3)
     for piece in pieces:
@@ -275,7 +276,7 @@ def _moved_center(pieces: list[MeshPiece], names: list[str]) -> Float64 | None:
     return center / total if total > 0 else None
 
 
-def _find_pivot(glb: GlbFile, turn: Float64, middle: Float64, unit: float) -> Float64:
+def _find_pivot(glb: GlbFile, turn: Doubles, middle: Doubles, unit: float) -> Doubles:
     """Return the position of the joint that the head rotates about."""
     bones = find_bones(glb)
     for number, matrix in glb.nodes():
@@ -286,7 +287,7 @@ def _find_pivot(glb: GlbFile, turn: Float64, middle: Float64, unit: float) -> Fl
     return middle + PIVOT_OFFSET * unit
 
 
-def _weights_by_fap(known: ShapeFaps, *, gaze: bool) -> dict[str, Float64]:
+def _weights_by_fap(known: ShapeFaps, *, gaze: bool) -> dict[str, Doubles]:
     """Return each shape's weight per unit of every FAP (68,), by the module's equation."""
     names = sorted(known, key=str.lower)
     shapes = np.array([known[name] for name in names])
@@ -301,7 +302,7 @@ def _weights_by_fap(known: ShapeFaps, *, gaze: bool) -> dict[str, Float64]:
     return dict(zip(names, weights, strict=True))
 
 
-def _displacement_fields(piece: MeshPiece, weights: dict[str, Float64]) -> FapFields:
+def _displacement_fields(piece: MeshPiece, weights: dict[str, Doubles]) -> FapFields:
     """Return the displacements (V, 3) of a piece by one unit of each FAP, m."""
     names = [name for name in piece.shapes if name in weights]
     if not names:
@@ -314,7 +315,7 @@ def _displacement_fields(piece: MeshPiece, weights: dict[str, Float64]) -> FapFi
     }
 
 
-def _travel_m(gaze: bool) -> Float64:
+def _travel_m(gaze: bool) -> Doubles:
     """Return the travel of a FAP's feature point per unit, m; 0 for FAPs to ignore."""
     fapu = standard_fapu()
     travel = np.zeros(NUM_FAPS)

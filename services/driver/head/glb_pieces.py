@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import Float64, GlbFile
+from kouxing.services.driver.head.glb_file import GlbFile
 from kouxing.services.driver.head.mesh_pieces import MeshPiece
+from kouxing.shared.arrays import Doubles, Integers
 from kouxing.shared.errors import UserError
 
 MAX_VERTICES = 300_000
@@ -83,7 +83,7 @@ def _check_textures(pieces: list[MeshPiece]) -> None:
         piece.texture = known[piece.texture]
 
 
-def _turn_fractions(glb: GlbFile, nodes: dict[int, Float64]) -> dict[int, float]:
+def _turn_fractions(glb: GlbFile, nodes: dict[int, Doubles]) -> dict[int, float]:
     """Return each node's fraction of the head rotation: 1 below a node "head", less on the neck."""
     fraction: dict[int, float] = {}
     bones = find_bones(glb)
@@ -148,8 +148,8 @@ def _piece(
     node: dict[str, Any],
     mesh: dict[str, Any],
     primitive: dict[str, Any],
-    matrices: dict[int, Float64],
-    matrix: Float64,
+    matrices: dict[int, Doubles],
+    matrix: Doubles,
     turn_fractions: dict[int, float],
     binds: Binds,
 ) -> MeshPiece:
@@ -211,14 +211,14 @@ def _texture(material: dict[str, Any]) -> tuple[dict[str, Any], str]:
     return base, f"TEXCOORD_{moved.get('texCoord', base.get('texCoord', 0))}"
 
 
-def _moved_uv(uv: Float64, base: dict[str, Any]) -> Float64:
+def _moved_uv(uv: Doubles, base: dict[str, Any]) -> Doubles:
     """Apply KHR_texture_transform."""
     moved = base.get("extensions", {}).get("KHR_texture_transform")
     if moved is None:
         return uv
     cos, sin = np.cos(moved.get("rotation", 0)), np.sin(moved.get("rotation", 0))
     turn = np.array([[cos, -sin], [sin, cos]])
-    placed: Float64 = (uv * moved.get("scale", (1, 1))) @ turn + moved.get("offset", (0, 0))
+    placed: Doubles = (uv * moved.get("scale", (1, 1))) @ turn + moved.get("offset", (0, 0))
     return placed
 
 
@@ -227,9 +227,9 @@ def _shapes(
     node: dict[str, Any],
     mesh: dict[str, Any],
     primitive: dict[str, Any],
-    placed: Float64,
+    placed: Doubles,
     binds: Binds,
-) -> tuple[dict[str, Float64], dict[str, float]]:
+) -> tuple[dict[str, Doubles], dict[str, float]]:
     """Return the displacements (V, 3) of the expressions and morph targets, and weights at rest."""
     shifts = {}
     for number, target in enumerate(primitive.get("targets", [])):
@@ -238,7 +238,7 @@ def _shapes(
             if shift.shape != placed.shape[:2]:
                 raise ValueError(f"morph target {number} does not match its mesh")
             shifts[number] = np.einsum("vij,vj->vi", placed, shift)
-    shapes: dict[str, Float64] = {}
+    shapes: dict[str, Doubles] = {}
     for name, number, weight in binds:
         if number in shifts:
             shapes[name] = shapes.get(name, 0.0) + weight * shifts[number]
@@ -252,7 +252,7 @@ def _shapes(
     return shapes, rest
 
 
-def _corners(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+def _corners(index: Integers, mode: int) -> Integers:
     """Return the corners (F, 3) of triangles, of a strip (5) or of a fan (6)."""
     if mode == 4:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
@@ -281,7 +281,7 @@ class _Skin:
     """The joints that move the vertices of a mesh, and their weights."""
 
     def __init__(
-        self, glb: GlbFile, skin: object, attributes: dict[str, Float64], nodes: dict[int, Float64]
+        self, glb: GlbFile, skin: object, attributes: dict[str, Doubles], nodes: dict[int, Doubles]
     ) -> None:
         entry = glb.item("skins", skin)
         self._glb = glb
@@ -297,18 +297,18 @@ class _Skin:
         self._index = index
         self._weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
 
-    def matrices(self) -> Float64:
+    def matrices(self) -> Doubles:
         """Return each vertex's rest matrix (V, 4, 4)."""
-        matrices: Float64 = np.einsum("vk,vkij->vij", self._weights, self._bones[self._index])
+        matrices: Doubles = np.einsum("vk,vkij->vij", self._weights, self._bones[self._index])
         return matrices
 
-    def mean(self, values: Mapping[int, float]) -> Float64:
+    def mean(self, values: Mapping[int, float]) -> Doubles:
         """Return each vertex's weighted mean (V,) of joint values. Missing values count as 0."""
         joint_values = np.array([values.get(joint, 0.0) for joint in self._joints])
-        mean: Float64 = (self._weights * joint_values[self._index]).sum(axis=1)
+        mean: Doubles = (self._weights * joint_values[self._index]).sum(axis=1)
         return mean
 
-    def jaw_arm(self, vertices: Float64) -> Float64 | None:
+    def jaw_arm(self, vertices: Doubles) -> Doubles | None:
         """Return the weighted positions (V, 3) relative to a jaw bone, if it moves vertices.
 
         A VRM's jaw bone is ignored, because programs often choose a wrong one.
@@ -324,10 +324,10 @@ class _Skin:
         weight = self.mean(dict.fromkeys(below, 1.0))[:, None]
         if not weight.any():
             return None
-        arm: Float64 = weight * (vertices - self._nodes[jaw][:3, 3])
+        arm: Doubles = weight * (vertices - self._nodes[jaw][:3, 3])
         return arm
 
-    def eye_look_shapes(self, vertices: Float64) -> dict[str, Float64]:
+    def eye_look_shapes(self, vertices: Doubles) -> dict[str, Doubles]:
         """Return ARKit's eye shapes: the displacements (V, 3) by rotations of the eye bones."""
         bones = find_bones(self._glb)
         is_old = "VRM" in self._glb.json["extensions"]  # version 0 looks along -z

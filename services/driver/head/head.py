@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.head.normal_updater import NormalUpdater
 from kouxing.services.heads import DEFAULT_HEAD, HEAD_NAMES
+from kouxing.shared.arrays import Floats, Integers
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.files.array_file import read_arrays
@@ -44,7 +45,6 @@ ASSETS = Path(__file__).parent / "assets"
 MAX_BYTES = 512 * 1024 * 1024  # unpacked size of a file
 
 Detail = Literal["fine", "coarse"]
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,22 +66,22 @@ class Head:
 
     name: str
     parts: tuple[HeadPart, ...]  # skin, garment, eyes, teeth, tongue, hair, lashes
-    vertices: Float32  # (V, 3), neutral face, m
+    vertices: Floats  # (V, 3), neutral face, m
     triangles: NDArray[np.uint32]  # (F, 3), counter-clockwise from outside
     coarse_triangles: tuple[NDArray[np.uint32], ...]  # per part of the coarse head, (C, 3)
-    uv: Float32  # (V, 2), v downwards
-    colors: Float32  # (V, 3), linear factors on the texture: ambient occlusion and tint
-    head_weight: Float32  # (V,), fraction of the head rotation, 0 on the shoulders
+    uv: Floats  # (V, 2), v downwards
+    colors: Floats  # (V, 3), linear factors on the texture: ambient occlusion and tint
+    head_weight: Floats  # (V,), fraction of the head rotation, 0 on the shoulders
     basis: sparse.csr_array  # (3 V, 68), displacement by one FAP unit, m
     fapu: dict[str, float]  # MNS MW ENS ES IRISD in m, AU in rad
     feature_points: dict[str, int]  # vertex by point name, such as "2.1"
-    eye_centers: Float32  # (2, 3), left and right, m
+    eye_centers: Floats  # (2, 3), left and right, m
     textures: dict[str, bytes]  # encoded JPEG or PNG by name
     normal_updater: NormalUpdater
     cel: bool = False  # cartoon shading with one light and one dark tone
 
     @property
-    def normals(self) -> Float32:
+    def normals(self) -> Floats:
         """Unit normals of the neutral face (V, 3)."""
         return self.normal_updater.rest
 
@@ -109,23 +109,23 @@ class Head:
         """Return a part by name."""
         return next(part for part in self.parts if part.name == name)
 
-    def deform(self, faps: Float32) -> Float32:
+    def deform(self, faps: Floats) -> Floats:
         """Return the vertices (V, 3), m, moved by FAPs (68,); FAPs 1 and 2 are ignored."""
         return self._rotate(self._displace(faps), faps, points=True)
 
-    def pose(self, faps: Float32) -> tuple[Float32, Float32]:
+    def pose(self, faps: Floats) -> tuple[Floats, Floats]:
         """Return the vertices moved by FAPs (68,), and their normals, both (V, 3)."""
         vertices = self._displace(faps)
         normals = self.normal_updater.normals(vertices)
         return self._rotate(vertices, faps, points=True), self._rotate(normals, faps, points=False)
 
-    def _displace(self, faps: Float32) -> Float32:
+    def _displace(self, faps: Floats) -> Floats:
         if faps.shape != (NUM_FAPS,):
             raise ValueError(f"expected FAPs of shape ({NUM_FAPS},), got {faps.shape}")
-        moved: Float32 = self.basis @ np.asarray(faps, dtype=np.float32)
+        moved: Floats = self.basis @ np.asarray(faps, dtype=np.float32)
         return self.vertices + moved.reshape(-1, 3)
 
-    def _rotate(self, rows: Float32, faps: Float32, *, points: bool) -> Float32:
+    def _rotate(self, rows: Floats, faps: Floats, *, points: bool) -> Floats:
         """Rotate eyeballs and head; ``rows`` are points or normals."""
         angle = np.asarray(faps, dtype=np.float64) * RADIANS_PER_ANGLE_UNIT
         for side, (name, yaw, pitch) in enumerate((("eye_left", 23, 25), ("eye_right", 24, 26))):
@@ -143,7 +143,7 @@ class Head:
         return rows
 
 
-def _rotation(yaw: float, pitch: float, roll: float) -> Float32:
+def _rotation(yaw: float, pitch: float, roll: float) -> Floats:
     """Return the matrix (3, 3) of yaw (left), pitch (down) and roll (right)."""
     rotation = Rotation.from_euler("YXZ", [yaw, pitch, roll])
     return np.asarray(rotation.as_matrix(), dtype=np.float32)
@@ -257,7 +257,7 @@ def _check_arrays(arrays: dict[str, NDArray[np.generic]]) -> None:
 
 
 def _basis(
-    arrays: dict[str, NDArray[np.generic]], new_index: NDArray[np.int64], num_vertices: int
+    arrays: dict[str, NDArray[np.generic]], new_index: Integers, num_vertices: int
 ) -> sparse.csr_array:
     """Return the displacement fields as a sparse matrix (3 V, 68)."""
     bounds = arrays["field_bounds"].astype(np.int64)

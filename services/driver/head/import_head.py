@@ -16,7 +16,6 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from kouxing.services.driver.head.feature_points_file import FeaturePoints, read_points
-from kouxing.services.driver.head.glb_file import Float64
 from kouxing.services.driver.head.glb_head import EYE_DISTANCE_M, PIVOT_OFFSET, head_weight_at
 from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
 from kouxing.services.driver.head.mesh_pieces import FapFields, MeshPiece, pack_head, weld
@@ -28,6 +27,7 @@ from kouxing.services.driver.head.skin_fields import (
     SkinFields,
 )
 from kouxing.services.driver.head.surface import Geodesics
+from kouxing.shared.arrays import Doubles, Integers
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.files.output_file import open_output
@@ -37,8 +37,6 @@ REQUIRED_POINTS = ("2.1", *sorted(INNER_LIPS), "2.10", *sorted(OUTER_LIPS))
 _MOVED_POINTS = {name for fap in FAPS for name in fap.feature_points}
 _MAX_SNAP = 0.15  # maximum distance of a point from the mesh, eye distances
 _OFF_SURFACE = ("3.5", "3.6", "7.1", "3.13", "3.14")  # points that are not on the surface
-
-Index = NDArray[np.int64]
 
 
 def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
@@ -65,7 +63,7 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
 
 def _positions(
     mesh: Path, path: Path, pieces: list[MeshPiece], points: FeaturePoints
-) -> dict[str, Float64]:
+) -> dict[str, Doubles]:
     """Return the coordinates of every point in the mesh's own axes."""
     vertices, named = numbered_vertices(mesh, pieces)
     positions = {}
@@ -92,7 +90,7 @@ class _HeadImport:
         mesh: Path,
         path: Path,
         pieces: list[MeshPiece],
-        positions: dict[str, Float64],
+        positions: dict[str, Doubles],
         feature_points: FeaturePoints,
     ) -> None:
         self._mesh, self._path, self._pieces = mesh, path, pieces
@@ -133,7 +131,7 @@ class _HeadImport:
 
     # --- the mesh in the axes of a head ---------------------------------------------------------
 
-    def _align_axes(self, positions: dict[str, Float64]) -> None:
+    def _align_axes(self, positions: dict[str, Doubles]) -> None:
         eyes = {}
         for name, lids in (("3.5", ("3.1", "3.3")), ("3.6", ("3.2", "3.4"))):
             if name in positions:
@@ -164,8 +162,8 @@ class _HeadImport:
             piece.vertices = self._to_head(piece.vertices)
         self._vertices = np.concatenate([piece.vertices for piece in self._pieces])
 
-    def _to_head(self, rows: Float64) -> Float64:
-        turned: Float64 = (rows - self._pivot) * self._turn * self._scale
+    def _to_head(self, rows: Doubles) -> Doubles:
+        turned: Doubles = (rows - self._pivot) * self._turn * self._scale
         return turned
 
     def _weld_vertices(self) -> None:
@@ -183,14 +181,14 @@ class _HeadImport:
         )
         triangles = self._weld_of[triangles]
         a, b, c = triangles.T
-        self._triangles: Index = triangles[(a != b) & (b != c) & (c != a)]
+        self._triangles: Integers = triangles[(a != b) & (b != c) & (c != a)]
         if not len(self._triangles):
             raise UserError(f"all faces of {self._mesh} have zero area; export the mesh again")
         edges = np.concatenate([self._triangles[:, [0, 1]], self._triangles[:, [1, 2]]])
         graph = sparse.coo_array((np.ones(len(edges)), edges.T), (count, count))
         _, self._component = csgraph.connected_components(graph, directed=False)
 
-    def _snap_points(self, positions: dict[str, Float64]) -> None:
+    def _snap_points(self, positions: dict[str, Doubles]) -> None:
         """Find the vertex of each point."""
         used = np.unique(self._triangles)
         tree = cKDTree(self._welded[used])
@@ -228,7 +226,7 @@ class _HeadImport:
                 )
             name_of_vertex[vertex] = name
 
-    def _separate_lips(self, positions: dict[str, Float64]) -> None:
+    def _separate_lips(self, positions: dict[str, Doubles]) -> None:
         """Move inner points of closed lips to the correct lip."""
         skin, local, inside = self._skin
         if local[self._points["8.2"]] < 0:
@@ -326,7 +324,7 @@ class _HeadImport:
             self._warnings.append("no eyeballs separate from the skin: the eyes do not rotate")
         return {fap: field[self._weld_of] for fap, field in fields.items()}, roles[self._weld_of]
 
-    def _eye_of(self, middle: Float64, size: Float64) -> int:
+    def _eye_of(self, middle: Doubles, size: Doubles) -> int:
         """Return 1 for the left eyeball, 2 for the right eyeball, 0 for other objects."""
         round_enough = size.min() > 0.4 * size.max() and 0.1 < size.max() / EYE_DISTANCE_M < 0.9
         for number, eye in enumerate(self._eyes, start=1):
@@ -334,7 +332,7 @@ class _HeadImport:
                 return number
         return 0
 
-    def _split_eyeballs(self, roles: NDArray[np.int8]) -> tuple[list[MeshPiece], list[Index]]:
+    def _split_eyeballs(self, roles: NDArray[np.int8]) -> tuple[list[MeshPiece], list[Integers]]:
         """Split pieces so that each eyeball is separate; return them and their vertex rows."""
         pieces, rows = [], []
         first = 0

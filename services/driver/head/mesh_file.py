@@ -11,9 +11,10 @@ import trimesh
 from PIL import Image
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import Float64, GlbFile, check_glb
+from kouxing.services.driver.head.glb_file import GlbFile, check_glb
 from kouxing.services.driver.head.glb_pieces import read_pieces
 from kouxing.services.driver.head.mesh_pieces import MeshPiece
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import check_content, read_file
 
@@ -131,7 +132,7 @@ def _parse_trimesh(mesh: Any) -> MeshPiece:
     )
 
 
-def numbered_vertices(mesh: Path, pieces: list[MeshPiece]) -> tuple[Float64, dict[str, Float64]]:
+def numbered_vertices(mesh: Path, pieces: list[MeshPiece]) -> tuple[Doubles, dict[str, Doubles]]:
     """Return the vertices (V, 3) in file order: all of them, and by mesh name.
 
     Raises ``UserError`` if a vertex line of an OBJ file is invalid.

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
-from kouxing.services.driver.head.glb_file import Float64
 from kouxing.services.driver.head.head import FORMAT
+from kouxing.shared.arrays import Doubles, Integers
 
 _MIN_SHIFT_M = 2e-9  # smaller displacements by one FAP unit are omitted
 _WHITE = np.full((2, 2, 3), 255, np.uint8)
 _NODES = ("kouxing", "body", "head")  # nodes of an exported GLB that are not parts
 _MAX_NAME_LENGTH = 60
 
-FapFields = dict[int, Float64]  # FAP: displacements (V, 3) by one unit, m
+FapFields = dict[int, Doubles]  # FAP: displacements (V, 3) by one unit, m
 
 
 @dataclass(slots=True)
@@ -24,20 +24,20 @@ class MeshPiece:
     """A part of a mesh with one material (a glTF primitive), in scene axes."""
 
     name: str
-    vertices: Float64
-    triangles: NDArray[np.int64]
-    uv: Float64
-    colors: Float64
+    vertices: Doubles
+    triangles: Integers
+    uv: Doubles
+    colors: Doubles
     texture: bytes
     material: dict[str, Any]
-    head_weight: Float64 | None  # None without a skeleton
-    shapes: dict[str, Float64] = field(default_factory=dict)  # displacements by name
+    head_weight: Doubles | None  # None without a skeleton
+    shapes: dict[str, Doubles] = field(default_factory=dict)  # displacements by name
     rest: dict[str, float] = field(default_factory=dict)  # weights of shapes in the mesh at rest
     is_mirrored: bool = False  # by a negative scale: its triangles face inwards
-    jaw_arm: Float64 | None = None  # positions relative to a jaw bone, times its weights
+    jaw_arm: Doubles | None = None  # positions relative to a jaw bone, times its weights
 
 
-def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
+def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> Integers:
     """Return for each vertex (V,) the first vertex at the same position.
 
     Vertices whose texture coordinates are also equal stay separate. Programs write such duplicates
@@ -51,7 +51,7 @@ def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
     _, kind, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
     doubled = np.zeros(len(first), dtype=bool)
     doubled[inverse[count[kind.ravel()] > 1]] = True
-    welded: NDArray[np.int64] = np.where(doubled[inverse], np.arange(len(vertices)), first[inverse])
+    welded: Integers = np.where(doubled[inverse], np.arange(len(vertices)), first[inverse])
     return welded
 
 
@@ -79,10 +79,10 @@ def pack_head(
     pieces: list[MeshPiece],
     *,
     fields: list[FapFields],
-    head_weight: Float64,
+    head_weight: Doubles,
     fapu: dict[str, float],
     feature_points: dict[str, int],
-    eye_centers: Float64,
+    eye_centers: Doubles,
 ) -> dict[str, NDArray[Any]]:
     """Convert pieces, in the head's axes, m, to the arrays of a head file (``assemble_head``).
 

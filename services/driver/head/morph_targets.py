@@ -3,13 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.high_level_faps import EXPRESSION_NAMES, EXPRESSIONS
 from kouxing.shared.face.shapes import ARKIT, VRM
-
-Float32 = NDArray[np.float32]
 
 _ANGLE_UNITS_PER_WEIGHT = 1 / RADIANS_PER_ANGLE_UNIT  # a weight of 1 is 1 rad
 _MIN_FAP_SHIFT_M = 2e-5
@@ -21,7 +19,7 @@ class MorphTarget(NamedTuple):
     """A morph target to export."""
 
     name: str
-    faps: Float32  # (68,) at weight 1
+    faps: Floats  # (68,) at weight 1
     min_shift_m: float = _MIN_SHIFT_M  # smaller displacements are omitted
     turns_eyes: bool = True  # whether it moves the eyeballs; otherwise nodes rotate them
 

@@ -9,25 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-Float32 = NDArray[np.float32]
+from kouxing.shared.arrays import Floats, Integers
 
 
 @dataclass(frozen=True, slots=True)
 class NormalUpdater:
     """Updates the normals of a deformable surface where its vertices move."""
 
-    rest: Float32  # (V, 3), normals of the neutral face
+    rest: Floats  # (V, 3), normals of the neutral face
     triangles: NDArray[np.uint32]  # triangles that the basis deforms
-    vertices: NDArray[np.int64]  # vertices whose normals change
+    vertices: Integers  # vertices whose normals change
     incidence: sparse.csr_array  # (vertices, triangles)
 
     @classmethod
     def of(
         cls,
-        vertices: Float32,
+        vertices: Floats,
         triangles: NDArray[np.uint32],
         basis: sparse.csr_array,
-        welds: NDArray[np.int64] | None = None,
+        welds: Integers | None = None,
     ) -> NormalUpdater:
         """Find the vertices of a ``Head`` whose normals change.
 
@@ -49,7 +49,7 @@ class NormalUpdater:
             incidence=_incidence(welded[around], len(vertices))[same[soft]],
         )
 
-    def normals(self, vertices: Float32) -> Float32:
+    def normals(self, vertices: Floats) -> Floats:
         """Return the normals (V, 3) of deformed vertices (V, 3)."""
         normals = self.rest.copy()
         a, b, c = vertices[self.triangles.T]
@@ -62,7 +62,7 @@ class NormalUpdater:
         return normals
 
 
-def _cross(a: Float32, b: Float32) -> Float32:
+def _cross(a: Floats, b: Floats) -> Floats:
     """Return cross products by columns. numpy's own function takes several times as long."""
     out = np.empty_like(a)
     out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
@@ -79,9 +79,7 @@ def _incidence(triangles: NDArray[Any], num_vertices: int) -> sparse.csr_array:
     )
 
 
-def _normals(
-    vertices: Float32, triangles: NDArray[np.uint32], welded: NDArray[np.int64]
-) -> Float32:
+def _normals(vertices: Floats, triangles: NDArray[np.uint32], welded: Integers) -> Floats:
     a, b, c = vertices[triangles.T]
     normals = _incidence(welded, len(vertices)) @ _cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)

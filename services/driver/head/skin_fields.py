@@ -9,10 +9,10 @@ A field is the displacement by one FAP unit, m. FAPs of missing points have no e
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.driver.head.mesh_pieces import FapFields
-from kouxing.services.driver.head.surface import Float, Geodesics, Index, smoothest_fields
+from kouxing.services.driver.head.surface import Geodesics, smoothest_fields
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_WIDTH_FAPS
 
 INNER_LIPS = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
@@ -48,10 +48,10 @@ class SkinFields:
 
     def __init__(
         self,
-        vertices: Float,
-        triangles: Index,
+        vertices: Doubles,
+        triangles: Integers,
         points: dict[str, int],
-        eyes: Float,
+        eyes: Doubles,
         fapu: dict[str, float],
     ) -> None:
         self.fields: FapFields = {}
@@ -65,14 +65,16 @@ class SkinFields:
         self._add_brow_fields()
         self._add_zone_fields()
 
-    def jaw_fields(self, vertices: Float) -> FapFields:
+    def jaw_fields(self, vertices: Doubles) -> FapFields:
         """Return the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
         lever = self._jaw_share(vertices[:, 2])
         full_weight = np.ones(len(vertices))
         moved = {3: lever, 14: full_weight, 15: lever}
         return {fap: self._axis_field(fap, weight) for fap, weight in moved.items()}
 
-    def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> FapFields:
+    def tongue_fields(
+        self, vertices: Doubles, rows: Integers, tip: int, body: int | None
+    ) -> FapFields:
         """Return the fields (R, 3) of a tongue, ``rows`` (R,) of a mesh, without the jaw's motion.
 
         ``tip`` and ``body`` are the vertices of the points 6.1 and, if known, 6.2.
@@ -88,17 +90,17 @@ class SkinFields:
         fields[46] = self._axis_field(46, hump * (1 - at_tip))
         return fields
 
-    def _point(self, name: str) -> Float:
-        point: Float = self._vertices[self._points[name]]
+    def _point(self, name: str) -> Doubles:
+        point: Doubles = self._vertices[self._points[name]]
         return point
 
-    def _points_named(self, *names: str) -> Index:
+    def _points_named(self, *names: str) -> Integers:
         return np.array([self._points[name] for name in names if name in self._points], np.int64)
 
-    def _distance(self, *names: str) -> Float:
+    def _distance(self, *names: str) -> Doubles:
         return self._geodesics.distance(self._points_named(*names))
 
-    def _axis_field(self, fap: int, weight: Float) -> Float:
+    def _axis_field(self, fap: int, weight: Doubles) -> Doubles:
         """Return a field (V, 3) along the axis of a FAP."""
         entry = FAPS[fap - 1]
         axis, sign = DIRECTION_AXES[entry.direction]
@@ -106,10 +108,10 @@ class SkinFields:
         field[:, axis] = sign * weight * self._fapu[entry.fapu] / FAP_UNITS_PER_FAPU
         return field
 
-    def _add_field(self, fap: int, weight: Float) -> None:
+    def _add_field(self, fap: int, weight: Doubles) -> None:
         self.fields[fap] = self._axis_field(fap, weight)
 
-    def _smoothest_fields(self, points: Index, fixed: NDArray[np.bool_]) -> Float:
+    def _smoothest_fields(self, points: Integers, fixed: Mask) -> Doubles:
         held = np.setdiff1d(np.flatnonzero(fixed), points)
         return smoothest_fields(self._vertices, self._triangles, points, held)
 
@@ -176,10 +178,10 @@ class SkinFields:
                 left = left - left[self._points[name]] * field
             self._add_field(fap, left)
 
-    def _jaw_share(self, z: Float) -> Float:
+    def _jaw_share(self, z: Doubles) -> Doubles:
         """Return how far a depth follows the jaw rotation, 1 at the chin."""
         chin = self._point("2.1")[2]
-        lever: Float = np.maximum(z - chin + _HINGE_DISTANCE * self._unit, 0) / (
+        lever: Doubles = np.maximum(z - chin + _HINGE_DISTANCE * self._unit, 0) / (
             _HINGE_DISTANCE * self._unit
         )
         return lever

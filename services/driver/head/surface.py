@@ -1,15 +1,13 @@
 """Geodesic distances, zones of influence and smooth fields on surfaces."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from kouxing.shared.arrays import Doubles, Integers
 
 
-def find_edges(quads: Index) -> tuple[Index, Index]:
+def find_edges(quads: Integers) -> tuple[Integers, Integers]:
     """Return the undirected edges (E, 2) of quads (F, 4) or triangles (F, 3).
 
     The smaller vertex number comes first. The second result is the number of the edge after each
@@ -23,7 +21,7 @@ def find_edges(quads: Index) -> tuple[Index, Index]:
 class Geodesics:
     """Shortest paths along the edges of a surface of triangles or quads, and quad diagonals."""
 
-    def __init__(self, vertices: Float, faces: Index) -> None:
+    def __init__(self, vertices: Doubles, faces: Integers) -> None:
         pairs, _ = find_edges(faces)
         if faces.shape[1] == 4:
             pairs = np.concatenate([pairs, faces[:, [0, 2]], faces[:, [1, 3]]])
@@ -32,14 +30,14 @@ class Geodesics:
             (np.maximum(length, 1e-9), (pairs[:, 0], pairs[:, 1])), (len(vertices),) * 2
         )
 
-    def distance(self, sources: Index) -> Float:
+    def distance(self, sources: Integers) -> Doubles:
         """Return the distance (V,) to the nearest source; inf where no source is connected."""
-        distance: Float = csgraph.dijkstra(
+        distance: Doubles = csgraph.dijkstra(
             self._graph, directed=False, indices=sources, min_only=True
         )
         return distance
 
-    def zone(self, moving: Index, fixed: Index) -> Float:
+    def zone(self, moving: Integers, fixed: Integers) -> Doubles:
         """Return weights (V,): 1 on ``moving``, 0 on ``fixed``, a raised cosine in between.
 
         ``w = 1/2 - 1/2 cos(pi dF / (dF + dM))`` with the geodesic distances ``dM`` and ``dF`` to
@@ -51,13 +49,13 @@ class Geodesics:
         fraction = reached.astype(float)
         both = reached & np.isfinite(to_fixed)
         fraction[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
-        weight: Float = 0.5 - 0.5 * np.cos(np.pi * fraction)
+        weight: Doubles = 0.5 - 0.5 * np.cos(np.pi * fraction)
         return weight
 
 
 def smoothest_fields(
-    vertices: Float, triangles: Index, points: Index | list[Index], fixed: Index
-) -> Float:
+    vertices: Doubles, triangles: Integers, points: Integers | list[Integers], fixed: Integers
+) -> Doubles:
     """Return the smoothest fields (V, P) with value 1 at ``points[p]`` and 0 at the other points.
 
     They minimize the squared Laplacian (cotangent weights) integrated over the surface. ``points``
@@ -80,7 +78,7 @@ def smoothest_fields(
     return fields
 
 
-def _laplacian(vertices: Float, triangles: Index) -> tuple[sparse.csr_array, Float]:
+def _laplacian(vertices: Doubles, triangles: Integers) -> tuple[sparse.csr_array, Doubles]:
     rows, columns, weights = [], [], []
     area = np.zeros(len(vertices))
     for corner in range(3):

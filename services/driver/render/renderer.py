@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from kouxing.services.driver import picture
 from kouxing.services.driver.head.head import Head, HeadPart
 from kouxing.services.driver.render import shaders
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 
 UInt8 = NDArray[np.uint8]
-Float32 = NDArray[np.float32]
 
 Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB of center and edge
 
@@ -36,7 +36,7 @@ class Camera:
     target: tuple[float, float, float] = (0.0, 0.018, 0.0)
     field_of_view_deg: float = 15.0  # vertical
 
-    def view_projection(self, width_px: int, height_px: int) -> Float32:
+    def view_projection(self, width_px: int, height_px: int) -> Floats:
         """Return the matrix (4, 4) from the head's axes to clip space."""
         eye = np.array(self.position)
         ahead = np.array(self.target) - eye
@@ -175,13 +175,13 @@ class Renderer:
         self._targets += [target, color, depth]
         return target
 
-    def draw(self, faps: Float32) -> UInt8:
+    def draw(self, faps: Floats) -> UInt8:
         """Draw FAPs (68,); return pixels (H, W, 3), or (H, W, 4) with alpha if transparent."""
         self._upload(*self.head.pose(faps), faps)
         self._draw()
         return self._read()
 
-    def measure_stages_s(self, faps: Float32) -> dict[str, float]:
+    def measure_stages_s(self, faps: Floats) -> dict[str, float]:
         """Draw one picture; return the durations of deform, upload, draw and read-back, seconds."""
         times = [time.perf_counter()]
 
@@ -200,7 +200,7 @@ class Renderer:
         names = ("deform", "upload", "draw", "read back")
         return dict(zip(names, np.diff(times).tolist(), strict=True))
 
-    def _upload(self, vertices: Float32, normals: Float32, faps: Float32) -> None:
+    def _upload(self, vertices: Floats, normals: Floats, faps: Floats) -> None:
         self._mouth_light = mouth_light(faps)
         self._stage[:, :3], self._stage[:, 3:] = vertices, normals
         self._moving.write(self._stage)
@@ -218,7 +218,7 @@ class Renderer:
         pixels = np.frombuffer(raw, np.uint8).reshape(height, width, channels)[::-1]
         return _remove_background(pixels) if self.transparent else pixels
 
-    def draw_on_screen(self, faps: Float32) -> None:
+    def draw_on_screen(self, faps: Floats) -> None:
         """Draw into the window that the context belongs to."""
         screen = self._context.screen
         screen.viewport = (0, 0, *self.size)
@@ -298,7 +298,7 @@ def _remove_background(pixels: UInt8) -> UInt8:
     return out
 
 
-def mouth_light(faps: Float32) -> float:
+def mouth_light(faps: Floats) -> float:
     """Return the fraction of the light on teeth and tongue, 0 to 1, for FAPs (68,).
 
     Little light passes a small mouth or protruding lips. The light passes the gap between the lips,

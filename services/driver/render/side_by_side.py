@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from kouxing.services.driver.render.renderer import Float32, Renderer, UInt8
+from kouxing.services.driver.render.renderer import Renderer, UInt8
+from kouxing.shared.arrays import Floats
 
 _CAPTION_FRACTION = 1 / 20  # height of the letters, as a fraction of the picture
 
@@ -20,7 +21,7 @@ class SideBySideRenderer:
         self._renderer = renderer
         self._captions = _draw_captions(captions, width_px, height_px)
 
-    def draw(self, faps: Float32) -> UInt8:
+    def draw(self, faps: Floats) -> UInt8:
         """Draw faces (num_faces, 68); the picture has the format of ``Renderer.draw``."""
         faces = np.concatenate([self._renderer.draw(face) for face in faps], axis=1)
         picture = Image.fromarray(faces)

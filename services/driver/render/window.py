@@ -5,14 +5,12 @@ from collections.abc import Callable
 
 import glfw
 import moderngl
-import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import BACKGROUND, Background, Camera, Renderer
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 
-Float32 = NDArray[np.float32]
 TITLE = "kouxing"
 
 
@@ -71,7 +69,7 @@ class Window:
         """The window's OpenGL context, which other renderers can share."""
         return self._context
 
-    def draw(self, faps: Float32) -> bool:
+    def draw(self, faps: Floats) -> bool:
         """Show FAPs (68,) and process user input; return False after the window was closed."""
         glfw.poll_events()
         if glfw.window_should_close(self._window):

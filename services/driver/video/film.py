@@ -4,20 +4,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.driver.render.captions import CaptionDrawer
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySideRenderer
 from kouxing.services.driver.video.video_renderer import VideoRenderer, interpolate
 from kouxing.services.driver.video.video_writer import write_picture
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation
 from kouxing.shared.face.high_level_faps import expression_faps, viseme_faps
 
 # media time in seconds, and FAPs (68,); for faces side by side (num_faces, 68)
-TimedFaps = tuple[float, NDArray[np.float32]]
+TimedFaps = tuple[float, Floats]
 
 
 def expand_frames(animation: FapAnimation) -> list[TimedFaps]:
@@ -53,7 +53,7 @@ def render_video(
     renderer: Renderer | SideBySideRenderer,
     *,
     frame_rate_hz: float,
-    samples: NDArray[np.float32] | None,
+    samples: Floats | None,
     captions: CaptionDrawer | None = None,
     on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> int:

@@ -4,17 +4,16 @@ from fractions import Fraction
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
-Float32 = NDArray[np.float32]
 _MIN_TEMPO = 0.5  # minimum tempo of one filter
 _EARLY_S = 0.02  # atempo's output is this much earlier than its input
 _MIN_SAMPLES = 4096  # atempo returns nothing for fewer samples
 
 
-def stretch_time(samples: Float32, speed: float) -> Float32:
+def stretch_time(samples: Floats, speed: float) -> Floats:
     """Return audio (n,), 16 kHz, at a speed of 0.25 to 1: (round(n / speed),)."""
     if speed == 1.0:
         return samples

@@ -8,17 +8,17 @@ from collections import deque
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.driver.render.captions import CaptionDrawer
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySideRenderer
 from kouxing.services.driver.video.video_writer import open_writer
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
 MAX_SILENCE_S = 600.0  # longest gap in the audio that is filled with silence
-Faps = NDArray[np.float32]
+Faps = Floats
 
 
 class VideoRenderer:
@@ -71,7 +71,7 @@ class VideoRenderer:
         if not self._frames or time_s > self._frames[-1][0]:
             self._frames.append((time_s, faps))
 
-    def add_audio(self, media_time: int, samples: NDArray[np.float32]) -> None:
+    def add_audio(self, media_time: int, samples: Floats) -> None:
         """Add audio (n,); a gap before it is filled with silence.
 
         Raises ``UserError`` if the gap is too long, or the file cannot be written.

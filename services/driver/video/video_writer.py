@@ -31,6 +31,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import (
     UnfinishedFile,
@@ -39,7 +40,6 @@ from kouxing.shared.files.output_file import (
     write_error,
 )
 
-Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".webp")
@@ -239,7 +239,7 @@ class VideoWriter:
         self._num_images += 1
         self._encode(self._video, frame)
 
-    def write_audio(self, samples: Float32) -> None:
+    def write_audio(self, samples: Floats) -> None:
         """Append mono audio (N,), -1 to 1."""
         if not len(samples) or self._audio is None:
             return
@@ -309,7 +309,7 @@ class PictureSequence:
             file.write(picture.encode(image))
         self._num_images += 1
 
-    def write_audio(self, samples: Float32) -> None:
+    def write_audio(self, samples: Floats) -> None:
         """Ignore the audio."""
 
     def close(self) -> Path:

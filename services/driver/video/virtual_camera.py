@@ -4,8 +4,8 @@ import importlib
 
 import numpy as np
 
-from kouxing.services.driver.head.head import Float32
 from kouxing.services.driver.render.renderer import Renderer
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError, install_command
 
 
@@ -34,7 +34,7 @@ class VirtualCamera:
             ) from error
         self.device: str = self._camera.device
 
-    def draw(self, faps: Float32, now_s: float) -> None:
+    def draw(self, faps: Floats, now_s: float) -> None:
         """Send a picture of a face (68,) if one is due."""
         if now_s >= self._due_s:
             self._due_s = max(self._due_s + self._interval_s, now_s)

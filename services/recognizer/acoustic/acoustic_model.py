@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.arrays import Floats, Integers
 from kouxing.shared.phones.inventory import PhoneInventory
 
 # Place of a phone between two pauses. The phone before a pause is lengthened; a single
 # phone counts as BEFORE_PAUSE.
 AFTER_PAUSE, WITHIN_PHRASE, BEFORE_PAUSE = range(3)
 NUM_PHRASE_POSITIONS = 3
-
-Floats: TypeAlias = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +27,7 @@ class Topology:
     """
 
     phone_lm: PhoneLanguageModel
-    first_state: NDArray[np.int64]  # (phones + 1,) phone p has states first_state[p] to [p + 1]
+    first_state: Integers  # (phones + 1,) phone p has states first_state[p] to [p + 1]
     log_stay: Floats  # (states,) log-probability of staying in a state
     log_leave: Floats  # (states,) log-probability of leaving it
     lm_scale: float = 1.0  # weight of the phone language model's log-probabilities

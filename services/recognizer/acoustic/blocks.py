@@ -52,7 +52,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, Floats, ScoreRequest
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, ScoreRequest
 from kouxing.services.recognizer.acoustic.light import LightModel, build_light_model
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import (
@@ -66,6 +66,7 @@ from kouxing.services.recognizer.acoustic.network import (
     run_onnx_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
+from kouxing.shared.arrays import Floats
 from kouxing.shared.fast_record import Record
 
 FORMAT = "blocks 2"

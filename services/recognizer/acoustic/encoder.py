@@ -29,7 +29,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.model_file import load_component
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_ENCODER_FRAME,
@@ -38,6 +37,7 @@ from kouxing.services.recognizer.acoustic.network import (
     run_onnx_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.shared.arrays import Floats
 
 ENCODER_PATH = Path(__file__).parents[1] / "models" / "encoder.npz"
 FORMAT = "encoder 1"

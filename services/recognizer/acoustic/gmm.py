@@ -35,7 +35,6 @@ import numpy as np
 from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     AcousticStream,
-    Floats,
     ScoreRequest,
 )
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
@@ -47,6 +46,7 @@ from kouxing.services.recognizer.front_end.features import (
     compute_cepstra,
 )
 from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
+from kouxing.shared.arrays import Floats
 
 FORMAT = "gmm 3"
 _MAX_MIXTURES = 1024

@@ -27,7 +27,6 @@ import numpy as np
 from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     AcousticStream,
-    Floats,
     ScoreRequest,
     Topology,
 )
@@ -39,6 +38,7 @@ from kouxing.services.recognizer.acoustic.encoder import (
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
+from kouxing.shared.arrays import Floats
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 
 _ACOUSTIC_SCALE = 1.0

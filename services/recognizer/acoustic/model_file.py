@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import NUM_PHRASE_POSITIONS, Topology
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.array_file import read_arrays
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
@@ -45,7 +46,7 @@ class Archive:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
         return array
 
-    def floats(self, name: str, *shape: int) -> NDArray[np.float32]:
+    def floats(self, name: str, *shape: int) -> Floats:
         """Return an array of finite numbers of a given shape; ValueError if it does not fit."""
         values = self.array(name, shape).astype(np.float32)
         if not np.isfinite(values).all():

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.arrays import Floats
 
 MAX_POSITIONS = 1500  # rows of the table of positions
 FRAMES_PER_ENCODER_FRAME = 2  # feature frames from one encoder frame to the next

@@ -29,8 +29,8 @@ the textbook's 2.
 import kaldi_native_fbank as knf
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.audio.pcm import FULL_SCALE
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
@@ -73,7 +73,7 @@ def _filter_bank() -> knf.OnlineFbank:
     return knf.OnlineFbank(options)
 
 
-def _cepstral_matrix() -> NDArray[np.float32]:
+def _cepstral_matrix() -> Floats:
     """Return the discrete cosine transform (HTK book, eq. 5.14); row 0 keeps the energy."""
     band = np.arange(NUM_BANDS) + 0.5
     order = np.arange(1, NUM_STATIC)
@@ -108,7 +108,7 @@ class LogMel:
         self._bank = _filter_bank()
         self._num_read = 0
 
-    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    def accept_waveform(self, samples: Floats) -> Floats:
         """Accept samples, shape (n,), 16 kHz, in [-1, 1].
 
         Returns the new feature frames, shape (frames, 41): log energy, 40 log-mel bands.
@@ -124,7 +124,7 @@ class LogMel:
         return np.maximum(rows, np.float32(LOG_FLOOR))
 
 
-def compute_cepstra(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+def compute_cepstra(log_mel: Floats) -> Floats:
     """Compute log energy and cepstra 1 to 12, (frames, 41) to (frames, 13)."""
     static = np.empty((len(log_mel), NUM_STATIC), dtype=np.float32)
     for row in range(len(log_mel)):  # row by row: rounding depends on the number of rows
@@ -138,9 +138,9 @@ class DeltaFeatures:
     def __init__(self, half_width: int) -> None:
         self.look_ahead_frames = 2 * half_width
         self._half_width = half_width
-        self._context: NDArray[np.float32] | None = None
+        self._context: Floats | None = None
 
-    def append(self, static: NDArray[np.float32]) -> NDArray[np.float32]:
+    def append(self, static: Floats) -> Floats:
         """Append static features, shape (n, 13); return the complete rows, (m, 39)."""
         if len(static) == 0:
             return np.empty((0, NUM_FEATURES), dtype=np.float32)
@@ -150,30 +150,30 @@ class DeltaFeatures:
         self._context = known[-2 * self.look_ahead_frames :]
         return _append_deltas(known, self._half_width)
 
-    def finish(self) -> NDArray[np.float32]:
+    def finish(self) -> Floats:
         """Return the remaining rows at the end, shape (look-ahead, 39)."""
         if self._context is None:
             return np.empty((0, NUM_FEATURES), dtype=np.float32)
         return self.append(np.repeat(self._context[-1:], self.look_ahead_frames, axis=0))
 
 
-def append_deltas(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
+def append_deltas(static: Floats, half_width: int) -> Floats:
     """Append the differences of a whole recording: (frames, 13) to (frames, 39)."""
     look_ahead = 2 * half_width
     before, after = (np.repeat(edge, look_ahead, axis=0) for edge in (static[:1], static[-1:]))
     return _append_deltas(np.concatenate([before, static, after]), half_width)
 
 
-def compute_cepstra_batch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+def compute_cepstra_batch(log_mel: Floats) -> Floats:
     """Like :func:`compute_cepstra` with one matrix product, for training; rounding may differ."""
     return log_mel @ _CEPSTRAL
 
 
-def _append_deltas(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
+def _append_deltas(static: Floats, half_width: int) -> Floats:
     steps = range(1, half_width + 1)
     norm = np.float32(sum(2 * step * step for step in steps))
 
-    def differences(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def differences(values: Floats) -> Floats:
         num_rows = max(0, len(values) - 2 * half_width)
         total = np.zeros((num_rows, values.shape[1]), np.float32)
         for step in steps:
@@ -190,13 +190,13 @@ def _append_deltas(static: NDArray[np.float32], half_width: int) -> NDArray[np.f
 class RunningMean:
     """Subtracts a running mean of speech from features, starting from a prior, (k,)."""
 
-    def __init__(self, prior: NDArray[np.float32]) -> None:
+    def __init__(self, prior: Floats) -> None:
         self._prior = prior.astype(np.float64)
         self._prior_frames = np.full(len(prior), _PRIOR_FRAMES)
         self._prior_frames[0] = _ENERGY_PRIOR_FRAMES
         self.reset()
 
-    def normalize(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+    def normalize(self, features: Floats) -> Floats:
         """Subtract the running mean from the first k features of each row, (n, k or more)."""
         out = features.copy()
         _normalize(out, self._prior, self._prior_frames, self._state)
@@ -209,12 +209,7 @@ class RunningMean:
 
 
 @numba.njit(cache=True)
-def _normalize(
-    features: NDArray[np.float32],
-    prior: NDArray[np.float64],
-    prior_frames: NDArray[np.float64],
-    state: NDArray[np.float64],
-) -> None:
+def _normalize(features: Floats, prior: Doubles, prior_frames: Doubles, state: Doubles) -> None:
     num_static = prior.shape[0]
     keep = 1.0 - 1.0 / _MEAN_MEMORY_FRAMES
     for row in range(features.shape[0]):

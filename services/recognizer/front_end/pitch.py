@@ -8,9 +8,8 @@ import math
 from typing import Any
 
 import kaldi_native_fbank
-import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.audio.pcm import FULL_SCALE
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
@@ -49,7 +48,7 @@ class PitchTracker:
     def _new_tracker(self) -> Any:
         return kaldi_native_fbank.OnlinePitch(self._options, self._outputs)
 
-    def track(self, samples: NDArray[np.float32]) -> float:
+    def track(self, samples: Floats) -> float:
         """Return the pitch in Hz after the next 20 ms, 16 kHz mono, shape (320,); 0 if unvoiced.
 
         The pitch is measured about 10 ms before the end.

@@ -28,9 +28,9 @@ from math import gcd
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.shared.arrays import Floats
 
 _HALF_WIDTH = 32  # samples of the lower rate
 _CUTOFF = 15 / 16  # relative to half the lower rate
@@ -50,13 +50,13 @@ class Resampler:
         self._num_in = 0
         self._num_out = 0
 
-    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    def accept_waveform(self, samples: Floats) -> Floats:
         """Accept finite samples, (n,) or (n, channels); return the new samples at 16 kHz, (m,)."""
         mono = _mix_and_clip(samples)
         self._num_in += len(mono)
         return mono if self._rate_hz == SAMPLE_RATE_HZ else self._resample(mono)
 
-    def finish(self) -> NDArray[np.float32]:
+    def finish(self) -> Floats:
         """Return the remaining samples at the end of the stream."""
         if self._rate_hz == SAMPLE_RATE_HZ:
             return np.empty(0, dtype=np.float32)
@@ -65,7 +65,7 @@ class Resampler:
         num_total = -(-self._num_in * SAMPLE_RATE_HZ // self._rate_hz)  # rounded up
         return rest[: len(rest) - max(0, self._num_out - num_total)]
 
-    def _resample(self, mono: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _resample(self, mono: Floats) -> Floats:
         self._known = np.concatenate([self._known, mono])
         up, down = _ratio(self._rate_hz)
         half = self._filter.shape[1] // 2
@@ -80,17 +80,17 @@ class Resampler:
         return out
 
 
-def to_16_khz(samples: NDArray[np.float32], sample_rate_hz: int) -> NDArray[np.float32]:
+def to_16_khz(samples: Floats, sample_rate_hz: int) -> Floats:
     """Resample a whole recording of shape (n,) or (n, channels) to 16 kHz mono."""
     resampler = Resampler(sample_rate_hz)
     return np.concatenate([resampler.accept_waveform(samples), resampler.finish()])
 
 
-def _mix_and_clip(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+def _mix_and_clip(samples: Floats) -> Floats:
     """Return samples as one channel, (n,), in [-1, 1]."""
     has_channels = samples.ndim == 2 and samples.shape[1] > 1
     mono = samples.mean(axis=1) if has_channels else samples.reshape(-1)
-    clipped: NDArray[np.float32] = np.minimum(np.maximum(mono, -1.0), 1.0)
+    clipped: Floats = np.minimum(np.maximum(mono, -1.0), 1.0)
     return clipped.astype(np.float32, copy=False)
 
 
@@ -101,7 +101,7 @@ def _ratio(rate_hz: int) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=8)
-def _filter_table(rate_hz: int) -> NDArray[np.float32]:
+def _filter_table(rate_hz: int) -> Floats:
     """Return the filter at n = min(L, 640) phases and at the next sample, (n + 1, taps).
 
     Row p is for positions p / n after a sample.
@@ -114,19 +114,13 @@ def _filter_table(rate_hz: int) -> NDArray[np.float32]:
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0, 1 - (time / half) ** 2)))
     table = np.sinc(_CUTOFF * lower * time) * window
     table /= table.sum(axis=1, keepdims=True)  # every phase keeps a constant signal
-    rounded: NDArray[np.float32] = table.astype(np.float32)
+    rounded: Floats = table.astype(np.float32)
     return rounded
 
 
 @numba.njit(cache=True, nogil=True)
 def _interpolate(
-    known: NDArray[np.float32],
-    first: int,
-    table: NDArray[np.float32],
-    num_before: int,
-    up: int,
-    down: int,
-    out: NDArray[np.float32],
+    known: Floats, first: int, table: Floats, num_before: int, up: int, down: int, out: Floats
 ) -> None:
     num_taps, num_phases = table.shape[1], len(table) - 1
     for index in range(len(out)):
@@ -142,7 +136,7 @@ def _interpolate(
 
 
 @numba.njit(cache=True, nogil=True)
-def _filter(known: NDArray[np.float32], begin: int, weights: NDArray[np.float32]) -> np.float32:
+def _filter(known: Floats, begin: int, weights: Floats) -> np.float32:
     total = np.float32(0.0)
     for tap in range(len(weights)):
         total += weights[tap] * known[begin + tap]

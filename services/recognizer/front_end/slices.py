@@ -4,16 +4,16 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_seconds
 from kouxing.shared.phones.events import Progress
 
 SLICE_SAMPLES = 320  # at 16 kHz: 20 ms, one FAP frame
 
 
-def split_slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
+def split_slices(samples: Floats, num_before: int) -> Iterator[Floats]:
     """Split samples, (n,), at multiples of 20 ms of the stream; ``num_before`` samples precede."""
     begin = 0
     while begin < len(samples):
@@ -22,7 +22,7 @@ def split_slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDAr
         begin = end
 
 
-def level_db(samples: NDArray[np.float32]) -> float:
+def level_db(samples: Floats) -> float:
     """Return the RMS level in decibels relative to full scale; -120 is silence."""
     if len(samples) == 0:
         return -120.0
@@ -31,7 +31,7 @@ def level_db(samples: NDArray[np.float32]) -> float:
     return max(-120.0, 10.0 * math.log10(power + 1e-12))
 
 
-def zero_crossing_rate(samples: NDArray[np.float32]) -> float:
+def zero_crossing_rate(samples: Floats) -> float:
     """Return the number of sign changes per sample, 0 to 1.
 
     Source: Zhang et al. 2021, eq. 2, divided by the number of samples; 0 counts as positive.
@@ -51,12 +51,10 @@ class SliceMeter:
     def __init__(self, start: int = 0) -> None:
         self.media_time = start  # end of the audio so far
         self._start = start
-        self._chunks: list[NDArray[np.float32]] = []  # audio of the incomplete slice
+        self._chunks: list[Floats] = []  # audio of the incomplete slice
         self._pitch = PitchTracker(start // SLICE_SAMPLES)
 
-    def accept_waveform(
-        self, samples: NDArray[np.float32]
-    ) -> Iterator[tuple[NDArray[np.float32], Progress | None]]:
+    def accept_waveform(self, samples: Floats) -> Iterator[tuple[Floats, Progress | None]]:
         """Accept samples, (n,); yield chunks, each with the slice that ends there."""
         for chunk in split_slices(samples, self.media_time - self._start):
             self.media_time += len(chunk)
@@ -78,7 +76,7 @@ class SliceMeter:
 
 
 def measure_slices(
-    samples: NDArray[np.float32], with_progress: Callable[[Sequence[int]], Iterable[int]] = iter
+    samples: Floats, with_progress: Callable[[Sequence[int]], Iterable[int]] = iter
 ) -> list[Progress]:
     """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does.
 

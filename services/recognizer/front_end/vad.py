@@ -17,8 +17,8 @@ It ends when the voice has been improbable for half a second. A pre-roll restore
 the detection of speech (see :mod:`kouxing.services.recognizer.live.speech_segmenter`).
 """
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.encoder import VoiceKind
+from kouxing.shared.arrays import Floats
 
 _NO_EVIDENCE, _ENOUGH = 0.75, 0.12
 _IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such frames do

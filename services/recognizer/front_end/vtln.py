@@ -50,7 +50,6 @@ import math
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.front_end.features import (
     BAND_HZ,
@@ -64,6 +63,7 @@ from kouxing.services.recognizer.front_end.features import (
     WINDOW_S,
     LogMel,
 )
+from kouxing.shared.arrays import Doubles, Floats
 
 _DECIMATION = 4
 _RATE_HZ = SAMPLE_RATE_HZ / _DECIMATION
@@ -90,11 +90,11 @@ _STEP_MEL = float(HIGHEST_MEL - LOWEST_MEL) / (NUM_BANDS + 1)
 _LOWEST_MEL = float(LOWEST_MEL)
 
 
-def _low_pass_taps() -> NDArray[np.float64]:
+def _low_pass_taps() -> Doubles:
     """Return a windowed sinc of unit gain."""
     time = np.arange(_NUM_TAPS) - (_NUM_TAPS - 1) / 2
     taps = np.sinc(2 * _CUTOFF_HZ / SAMPLE_RATE_HZ * time) * np.hamming(_NUM_TAPS)
-    normalized: NDArray[np.float64] = taps / taps.sum()
+    normalized: Doubles = taps / taps.sum()
     return normalized
 
 
@@ -110,7 +110,7 @@ class PitchedLogMel:
         self._samples = np.zeros(_NUM_TAPS - _DECIMATION, dtype=np.float32)
         self._low = np.zeros(_SPAN_SAMPLES - _FRAME_SAMPLES)
 
-    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    def accept_waveform(self, samples: Floats) -> Floats:
         """Accept samples, shape (n,), 16 kHz, in [-1, 1].
 
         Returns the new feature frames, shape (frames, 43): log energy, 40 log-mel bands, the pitch
@@ -141,12 +141,7 @@ class VocalTractNormalizer:
         """Current warp factor of the speaker's formants, 1 to 1.3."""
         return float(_warp_factor(self._state))
 
-    def warp(
-        self,
-        log_mel: NDArray[np.float32],
-        pitch_hz: NDArray[np.float32],
-        strength: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
+    def warp(self, log_mel: Floats, pitch_hz: Floats, strength: Floats) -> Floats:
         """Warp feature frames of speech, given their pitch and its strength, (n,) each.
 
         Returns frames like ``log_mel``, (n, 41): the log energy unchanged, the bands warped by the
@@ -162,9 +157,7 @@ class VocalTractNormalizer:
 
 
 @numba.njit(cache=True, nogil=True)
-def _low_pass(
-    samples: NDArray[np.float32], taps: NDArray[np.float64], out: NDArray[np.float64]
-) -> None:
+def _low_pass(samples: Floats, taps: Doubles, out: Doubles) -> None:
     for row in range(len(out)):
         total = 0.0
         for tap in range(len(taps)):
@@ -173,9 +166,7 @@ def _low_pass(
 
 
 @numba.njit(cache=True, nogil=True)
-def _track(
-    low: NDArray[np.float64], pitch_hz: NDArray[np.float32], strength: NDArray[np.float32]
-) -> None:
+def _track(low: Doubles, pitch_hz: Floats, strength: Floats) -> None:
     for frame in range(len(pitch_hz)):
         phi = _correlation(low[_HOP_SAMPLES * frame : _HOP_SAMPLES * frame + _SPAN_SAMPLES])
         lag, peak = _period(phi)
@@ -184,7 +175,7 @@ def _track(
 
 
 @numba.njit(cache=True, nogil=True)
-def _correlation(low: NDArray[np.float64]) -> NDArray[np.float64]:
+def _correlation(low: Doubles) -> Doubles:
     """Return the normalized cross-correlation (Talkin 1995) of the last window at each lag."""
     num_lags = _MAX_LAG_SAMPLES - _MIN_LAG_SAMPLES + 1
     low = low - low.mean()  # an offset would look like a pitch
@@ -201,7 +192,7 @@ def _correlation(low: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _period(phi: NDArray[np.float64]) -> tuple[float, float]:
+def _period(phi: Doubles) -> tuple[float, float]:
     """Return lag and height of the first good peak, interpolated by a parabola, or zeros."""
     threshold = _PEAK_RATIO * phi.max()
     for k in range(1, len(phi) - 1):
@@ -214,18 +205,13 @@ def _period(phi: NDArray[np.float64]) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _warp_factor(state: NDArray[np.float64]) -> float:
+def _warp_factor(state: Doubles) -> float:
     log_ratio = state[0] / (_PRIOR_FRAMES + state[1])  # log of reference over mean
     return min(max(math.exp(_EXPONENT * log_ratio), 1.0), MAX_FACTOR)
 
 
 @numba.njit(cache=True, nogil=True)
-def _warp(
-    frames: NDArray[np.float32],
-    voice: NDArray[np.float32],
-    centers_hz: NDArray[np.float64],
-    state: NDArray[np.float64],
-) -> None:
+def _warp(frames: Floats, voice: Floats, centers_hz: Doubles, state: Doubles) -> None:
     keep = 1.0 - 1.0 / _MEMORY_FRAMES
     num_bands = len(centers_hz)
     for row in range(len(frames)):

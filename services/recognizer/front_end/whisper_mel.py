@@ -36,6 +36,7 @@ from kouxing.services.recognizer.front_end.features import (
     WINDOW_SAMPLES,
     count_frames,
 )
+from kouxing.shared.arrays import Doubles, Floats, Integers
 
 NUM_MELS = 80
 FLOOR_BANDS = 2.0  # Whisper's floor, below the loudest band: eight decades
@@ -47,7 +48,7 @@ _LOG_STEP = math.log(6.4) / 27  # a mel above the knee
 _HANN = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(WINDOW_SAMPLES) / WINDOW_SAMPLES)
 
 
-def mel_bands() -> NDArray[np.float64]:
+def mel_bands() -> Doubles:
     """Return the weights of the bands, B, shape (201, 80)."""
     knee = _KNEE_HZ / _HZ_PER_MEL
     highest = knee + math.log(SAMPLE_RATE_HZ / 2 / _KNEE_HZ) / _LOG_STEP
@@ -56,7 +57,7 @@ def mel_bands() -> NDArray[np.float64]:
     hz = np.fft.rfftfreq(WINDOW_SAMPLES, 1 / SAMPLE_RATE_HZ)[:, None]
     low, center, high = edges[:-2], edges[1:-1], edges[2:]
     triangles = np.minimum((hz - low) / (center - low), (high - hz) / (high - center))
-    bands: NDArray[np.float64] = np.maximum(triangles, 0) * 2 / (high - low)
+    bands: Doubles = np.maximum(triangles, 0) * 2 / (high - low)
     return bands
 
 
@@ -71,7 +72,7 @@ class WhisperMel:
     def __init__(self) -> None:
         self._samples = np.empty(0, dtype=np.float32)
 
-    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    def accept_waveform(self, samples: Floats) -> Floats:
         """Accept samples, (n,), 16 kHz, in [-1, 1]; return the new feature frames, (frames, 80)."""
         known = np.concatenate([self._samples, samples.astype(np.float32, copy=False)])
         num_frames = count_frames(len(known))
@@ -83,9 +84,7 @@ class WhisperMel:
 
 
 @numba.njit(cache=True, nogil=True)
-def _windows(
-    samples: NDArray[np.float32], window: NDArray[np.float64], num_frames: int
-) -> NDArray[np.float64]:
+def _windows(samples: Floats, window: Doubles, num_frames: int) -> Doubles:
     out = np.empty((num_frames, len(window)))
     for row in range(num_frames):
         for k in range(len(window)):
@@ -94,9 +93,7 @@ def _windows(
 
 
 @numba.njit(cache=True, nogil=True)
-def _log_mel(
-    spectrum: NDArray[np.complex128], bands: NDArray[np.float64], edges: NDArray[np.int64]
-) -> NDArray[np.float32]:
+def _log_mel(spectrum: NDArray[np.complex128], bands: Doubles, edges: Integers) -> Floats:
     num_rows, num_bins = spectrum.shape
     out = np.empty((num_rows, len(edges)), dtype=np.float32)
     power = np.empty(num_bins)

@@ -8,9 +8,7 @@ chooses one.
 from collections.abc import Sequence
 from typing import Protocol, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kouxing.shared.arrays import Floats
 from kouxing.shared.phones.events import LipPositions
 
 # FAP frames are due every 20 ms of audio. An encoder frame ends this much earlier, because windows
@@ -22,7 +20,7 @@ class LipPredictorStream(Protocol):
     """Predicts the lip positions of one session, segment by segment."""
 
     def process_encoder_frame(
-        self, known_s: float, frames: NDArray[np.float32], features: NDArray[np.float32]
+        self, known_s: float, frames: Floats, features: Floats
     ) -> list[LipPositions]:
         """Return the lip positions that an encoder frame determines.
 

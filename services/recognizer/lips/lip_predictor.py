@@ -38,12 +38,12 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.encoder import load_encoder
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_component
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.lips.mouth_profile import MouthProfile, parse_mouth_profile
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipPositions

@@ -26,13 +26,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_constants import MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.files.user_file import open_file
-
-Floats = NDArray[np.float32]
 
 _MAGIC = b"kouxing voice 1\n"  # the historical name, kept for existing files
 _DIGEST_BYTES = 32

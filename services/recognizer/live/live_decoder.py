@@ -18,7 +18,6 @@ import numpy as np
 from kouxing.services.recognizer.acoustic.acoustic_model import (
     AFTER_PAUSE,
     WITHIN_PHRASE,
-    Floats,
     Topology,
     empty_scores,
 )
@@ -27,6 +26,7 @@ from kouxing.services.recognizer.live.speech_scorer import FrameScores, ScoreEve
 from kouxing.services.recognizer.live.speech_segmenter import SpeechEnd, SpeechStart
 from kouxing.services.recognizer.search.decoder import Decoder, PathSegment
 from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
+from kouxing.shared.arrays import Floats
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
 

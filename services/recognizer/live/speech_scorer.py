@@ -12,7 +12,6 @@ from typing import TypeAlias
 from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     AcousticStream,
-    Floats,
     ScoreRequest,
 )
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, BlockStream
@@ -30,6 +29,7 @@ from kouxing.services.recognizer.live.speech_segmenter import (
     SpeechSegmenter,
     SpeechStart,
 )
+from kouxing.shared.arrays import Floats
 from kouxing.shared.fast_record import Record, replace
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Progress, Waveform
 

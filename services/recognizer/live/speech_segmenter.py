@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Floats, FrontEnd
+from kouxing.services.recognizer.acoustic.acoustic_model import FrontEnd
 from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, EncoderStream, load_encoder
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_S, WINDOW_S
@@ -25,6 +25,7 @@ from kouxing.services.recognizer.live.voice_traits import (
     VoiceTraitsStream,
     load_voice_readout,
 )
+from kouxing.shared.arrays import Floats
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import LipPositions
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.features import frame_at
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.services.recognizer.front_end.slices import SliceMeter
@@ -18,6 +18,7 @@ from kouxing.services.recognizer.lips.lip_prediction import LipPredictor, choose
 from kouxing.services.recognizer.live.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.live.speech_scorer import SpeechScorer
 from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import (

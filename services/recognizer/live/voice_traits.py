@@ -27,9 +27,9 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.encoder import EncoderOutput, VoiceKind, load_encoder
 from kouxing.services.recognizer.acoustic.model_file import Archive, load_component
+from kouxing.shared.arrays import Floats
 
 TRAITS_PATH = Path(__file__).parents[1] / "models" / "traits.npz"
 FORMAT = "traits 1"

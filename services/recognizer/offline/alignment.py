@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats, Topology
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
 from kouxing.services.recognizer.front_end.features import (
     HOP_S,
     SAMPLE_RATE_HZ,
@@ -29,6 +28,7 @@ from kouxing.services.recognizer.search.forced_path import (
     segments_of_path,
     viterbi_path,
 )
+from kouxing.shared.arrays import Floats, Integers
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
@@ -52,7 +52,7 @@ class Alignment:
         return self.fit >= MIN_FIT
 
 
-def align_text(model: AcousticModel, samples: NDArray[np.float32], text: str) -> list[Phone]:
+def align_text(model: AcousticModel, samples: Floats, text: str) -> list[Phone]:
     """Find the onset and duration of each phone and pause of a text.
 
     ``samples`` are 16 kHz mono, (n,). The text is in a spelling that the model's language can read.
@@ -68,7 +68,7 @@ def align_text(model: AcousticModel, samples: NDArray[np.float32], text: str) ->
 
 def align_syllables(
     model: AcousticModel,
-    samples: NDArray[np.float32],
+    samples: Floats,
     syllables: Sequence[Syllable],
     with_progress: WithProgress = iter,
 ) -> Alignment:
@@ -113,7 +113,7 @@ def align_syllables(
 
 
 def _score_recording(
-    model: AcousticModel, samples: NDArray[np.float32], num_frames: int, with_progress: WithProgress
+    model: AcousticModel, samples: Floats, num_frames: int, with_progress: WithProgress
 ) -> Floats:
     """Score a recording second by second; return the scores of all frames, (frames, states)."""
     front_end, stream = model.create_front_end(), model.create_stream()
@@ -139,7 +139,7 @@ def _best_phone_scores(scores: Floats, topology: Topology) -> Floats:
 
 
 def _fit(
-    graph: UtteranceGraph, path: NDArray[np.int64], scores: Floats, topology: Topology, silence: int
+    graph: UtteranceGraph, path: Integers, scores: Floats, topology: Topology, silence: int
 ) -> float:
     """Compare a path's states with the best phone of each frame.
 

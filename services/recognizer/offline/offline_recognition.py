@@ -3,8 +3,9 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.live.recognizer import Recognizer
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone

@@ -3,9 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError, install_command
 
@@ -30,7 +28,7 @@ class Transcriber:
                 f"{folder}: sherpa-onnx cannot load the model: {error}; copy it again"
             ) from None
 
-    def transcribe(self, samples: NDArray[np.float32]) -> str:
+    def transcribe(self, samples: Floats) -> str:
         """Return the text of audio, 16 kHz mono, shape (n,); empty without speech."""
         stream = self._recognizer.create_stream()
         stream.accept_waveform(MEDIA_RATE_HZ, samples)

@@ -58,6 +58,7 @@ from kouxing.services.recognizer.search.path_records import (
     compact_records,
     count_record_paths,
 )
+from kouxing.shared.arrays import Doubles, Floats
 
 _MIN_RECORDS = 4 * MAX_TOKENS
 
@@ -126,7 +127,7 @@ class Decoder:
         for values, new in zip(self._tokens, other._tokens, strict=True):
             values[: self._num_tokens] = new[: self._num_tokens]
 
-    def advance(self, scores: NDArray[np.float32]) -> NDArray[np.float64]:
+    def advance(self, scores: Floats) -> Doubles:
         """Search the next frames, given the scores of their states, (frames, states).
 
         Returns the confidence in the last phone after each frame, (frames,).
@@ -134,8 +135,8 @@ class Decoder:
         return self.advance_until(scores, 0, math.inf)[1]
 
     def advance_until(
-        self, scores: NDArray[np.float32], known_phone: int, min_confidence: float
-    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        self, scores: Floats, known_phone: int, min_confidence: float
+    ) -> tuple[NDArray[np.int32], Doubles]:
         """Search the next frames until the last phone is confident and is not ``known_phone``.
 
         Returns the last phone and the confidence in it after each frame, (frames,) each.

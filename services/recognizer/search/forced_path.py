@@ -14,15 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.search.decoder import PathSegment
+from kouxing.shared.arrays import Doubles, Floats, Integers
 
 # scores of its frames, and columns, stay, leave and skip of its nodes
-_BlockInputs: TypeAlias = tuple[
-    NDArray[np.float32],
-    NDArray[np.int64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]
+_BlockInputs: TypeAlias = tuple[Floats, Integers, Doubles, Doubles, Doubles]
 MAX_BAND_NODES = 2**15  # 14 minutes of fluent speech
 
 
@@ -30,21 +25,21 @@ MAX_BAND_NODES = 2**15  # 14 minutes of fluent speech
 class UtteranceGraph:
     """The states of an utterance in order. Pauses are optional."""
 
-    states: NDArray[np.int64]  # (nodes,) HMM state of each node
-    skip_from: NDArray[np.int64]  # (nodes,) node before an optional pause, or -1
-    phone_number: NDArray[np.int64]  # (nodes,) running number of the phone, pauses included
-    phones: NDArray[np.int64]  # (running numbers,) indices into the inventory's phones
+    states: Integers  # (nodes,) HMM state of each node
+    skip_from: Integers  # (nodes,) node before an optional pause, or -1
+    phone_number: Integers  # (nodes,) running number of the phone, pauses included
+    phones: Integers  # (running numbers,) indices into the inventory's phones
     num_last: int  # number of nodes of the last pause, which is optional too
 
     @property
-    def num_needed(self) -> NDArray[np.int64]:
+    def num_needed(self) -> Integers:
         """Number of frames from each node to the end of the last phone, (nodes,)."""
         is_phone = self.phones[self.phone_number] != self.phones[0]
         return np.cumsum(is_phone[::-1])[::-1]
 
 
 def build_utterance_graph(
-    phones: Sequence[int], syllables: Sequence[int], first_state: NDArray[np.int64], *, silence: int
+    phones: Sequence[int], syllables: Sequence[int], first_state: Integers, *, silence: int
 ) -> UtteranceGraph:
     """Lay out the states of an utterance, with an optional pause at each syllable boundary.
 
@@ -83,12 +78,8 @@ def build_utterance_graph(
 
 
 def viterbi_path(
-    scores: NDArray[np.float32],
-    columns: NDArray[np.int64],
-    graph: UtteranceGraph,
-    log_stay: NDArray[np.float32],
-    log_leave: NDArray[np.float32],
-) -> tuple[NDArray[np.int64], float]:
+    scores: Floats, columns: Integers, graph: UtteranceGraph, log_stay: Floats, log_leave: Floats
+) -> tuple[Integers, float]:
     """Find the best path through a graph.
 
     Parameters
@@ -163,14 +154,14 @@ def viterbi_path(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _advance(
-    row: NDArray[np.float64],
-    scores: NDArray[np.float32],
-    columns: NDArray[np.int64],
-    stay: NDArray[np.float64],
-    leave: NDArray[np.float64],
-    skip: NDArray[np.float64],
+    row: Doubles,
+    scores: Floats,
+    columns: Integers,
+    stay: Doubles,
+    leave: Doubles,
+    skip: Doubles,
     num_skipped: int,
-) -> NDArray[np.float64]:
+) -> Doubles:
     """Return the row after a block, (nodes,), given the row before it."""
     num_nodes = len(row)
     # padding before the first node
@@ -192,12 +183,12 @@ def _advance(
 
 @numba.njit(cache=True, nogil=True)
 def _find_origins(
-    row: NDArray[np.float64],
-    scores: NDArray[np.float32],
-    columns: NDArray[np.int64],
-    stay: NDArray[np.float64],
-    leave: NDArray[np.float64],
-    skip: NDArray[np.float64],
+    row: Doubles,
+    scores: Floats,
+    columns: Integers,
+    stay: Doubles,
+    leave: Doubles,
+    skip: Doubles,
     num_skipped: int,
 ) -> NDArray[np.int8]:
     """Return where the best path to each node of a block comes from, (frames, nodes).
@@ -225,14 +216,14 @@ def _find_origins(
 
 
 @numba.njit(cache=True, nogil=True)
-def _backtrace(back: NDArray[np.int8], low: int, num_skipped: int, path: NDArray[np.int64]) -> None:
+def _backtrace(back: NDArray[np.int8], low: int, num_skipped: int, path: Integers) -> None:
     """Fill a block of the path, (frames + 1,), from its last node."""
     for frame in range(len(path) - 1, 0, -1):
         origin = back[frame - 1, path[frame] - low]
         path[frame - 1] = path[frame] - (0, 1, num_skipped)[origin]
 
 
-def segments_of_path(path: NDArray[np.int64], graph: UtteranceGraph) -> list[PathSegment]:
+def segments_of_path(path: Integers, graph: UtteranceGraph) -> list[PathSegment]:
     """Return the phones with their frames, given the node of every frame."""
     runs = graph.phone_number[path]
     starts = np.concatenate([[0], np.flatnonzero(np.diff(runs)) + 1])

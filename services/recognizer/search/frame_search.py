@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.search.path_records import IMPOSSIBLE, NO_RECORD, Tokens
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, ContextGraph
+from kouxing.shared.arrays import Doubles, Floats, Integers
 
 NO_TOKEN = -1
 MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
@@ -22,9 +23,9 @@ class Hmms(NamedTuple):
     """The phones' HMMs and the search weights; see ``Topology``."""
 
     silence: int
-    first_state: NDArray[np.int64]
-    log_stay: NDArray[np.float32]
-    log_leave: NDArray[np.float32]
+    first_state: Integers
+    log_stay: Floats
+    log_leave: Floats
     lm_scale: np.float32
     phone_penalty: np.float32
     rate_weight: np.float32
@@ -37,15 +38,15 @@ class SearchState(NamedTuple):
     token_of: NDArray[np.int16]  # token of each context, or NO_TOKEN; (contexts,)
     records: NDArray[np.int32]  # (records, 3)
     # rate of change, and the square roots of the phones' probabilities at the last frame
-    rate: NDArray[np.float32]  # (1 + phones,)
+    rate: Floats  # (1 + phones,)
 
 
 @numba.njit(cache=True, nogil=True)
 def advance_frames(
     frame: int,
-    observed: NDArray[np.float32],
+    observed: Floats,
     phones: NDArray[np.int32],
-    confidence: NDArray[np.float64],
+    confidence: Doubles,
     known_phone: int,
     min_confidence: float,
     search: SearchState,
@@ -83,9 +84,7 @@ def advance_frames(
 
 
 @numba.njit(cache=True, nogil=True)
-def _phone_penalty(
-    frame: int, observed: NDArray[np.float32], rate: NDArray[np.float32], hmms: Hmms
-) -> np.float32:
+def _phone_penalty(frame: int, observed: Floats, rate: Floats, hmms: Hmms) -> np.float32:
     """Update the rate of change by a frame's scores; return the penalty of phones that start."""
     if hmms.rate_weight == 0.0:
         return hmms.phone_penalty
@@ -131,7 +130,7 @@ def _start_phones(
     num_records: int,
     hmms: Hmms,
     graph: ContextGraph,
-) -> tuple[int, int, NDArray[np.float32], NDArray[np.int32]]:
+) -> tuple[int, int, Floats, NDArray[np.int32]]:
     """Record the phones that may end before the frame, and start the phones that may follow.
 
     Returns the numbers of tokens and records; the best score that enters each token, and its
@@ -182,10 +181,7 @@ def _start_phones(
 
 @numba.njit(cache=True, nogil=True)
 def _look_up_phones(
-    context: int,
-    graph: ContextGraph,
-    log_prob: NDArray[np.float32],
-    next_context: NDArray[np.int32],
+    context: int, graph: ContextGraph, log_prob: Floats, next_context: NDArray[np.int32]
 ) -> None:
     """Fill in the log-probability of each phone after a context, and the context it leads to."""
     chain = np.empty(_MAX_CHAIN, np.int32)
@@ -206,10 +202,10 @@ def _look_up_phones(
 
 @numba.njit(cache=True, nogil=True)
 def _advance_states(
-    observed: NDArray[np.float32],
+    observed: Floats,
     num_tokens: int,
     tokens: Tokens,
-    entry: NDArray[np.float32],
+    entry: Floats,
     entry_link: NDArray[np.int32],
     hmms: Hmms,
     graph: ContextGraph,

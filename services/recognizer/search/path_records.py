@@ -6,6 +6,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats
+
 NO_RECORD = -1
 IMPOSSIBLE = np.float32(-1e30)  # score of a state that no path reaches
 
@@ -14,8 +16,8 @@ class Tokens(NamedTuple):
     """Preallocated arrays of the tokens; only the first ones are in use."""
 
     context: NDArray[np.int32]  # (tokens,)
-    top: NDArray[np.float32]  # (tokens,)
-    score: NDArray[np.float32]  # (tokens, states)
+    top: Floats  # (tokens,)
+    score: Floats  # (tokens, states)
     link: NDArray[np.int32]  # (tokens, states)
 
 

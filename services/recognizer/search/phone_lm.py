@@ -28,6 +28,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Floats, Mask
 from kouxing.shared.phones.inventory import PhoneInventory
 
 MAX_ORDER = 16  # phones in an n-gram
@@ -38,10 +39,10 @@ class ContextGraph(NamedTuple):
 
     first_arc: NDArray[np.int32]  # (contexts + 1,) context c has arcs first_arc[c] to [c + 1]
     arc_phone: NDArray[np.uint8]  # (arcs,) ascending in each context
-    arc_log_prob: NDArray[np.float32]  # (arcs,)
+    arc_log_prob: Floats  # (arcs,)
     arc_context: NDArray[np.int32]  # (arcs,) context after the arc's phone
     backoff_state: NDArray[np.int32]  # (contexts,) h'
-    log_backoff: NDArray[np.float32]  # (contexts,)
+    log_backoff: Floats  # (contexts,)
     last_phone: NDArray[np.uint8]  # (contexts,) undefined for context 0
 
 
@@ -52,8 +53,8 @@ class PhoneLanguageModel:
     inventory: PhoneInventory
     num_children: NDArray[np.uint8]  # (nodes,)
     phone: NDArray[np.uint8]  # (nodes,) index into the inventory's phones
-    log_prob: NDArray[np.float32]  # (nodes,)
-    log_backoff: NDArray[np.float32]  # (nodes,)
+    log_prob: Floats  # (nodes,)
+    log_backoff: Floats  # (nodes,)
 
     @cached_property
     def levels(self) -> list[int]:
@@ -84,7 +85,7 @@ class PhoneLanguageModel:
 @numba.njit(cache=True)
 def _find_contexts(
     num_children: NDArray[np.uint8], phone: NDArray[np.uint8]
-) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.int32]]:
+) -> tuple[NDArray[np.int32], Mask, NDArray[np.int32]]:
     """Return each node's context, whether the node is a context, and its back-off context's node.
 
     A node that is not a context leads to its back-off context.

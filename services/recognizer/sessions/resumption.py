@@ -8,12 +8,11 @@ from collections import deque
 from collections.abc import Iterable
 from typing import TypeAlias
 
-import numpy as np
 from kouxing_client.audio import MAX_KEPT_MESSAGES
 from kouxing_client.messages import Message
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.live.live_decoder import StreamOutput
+from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SpeechChange, Waveform
@@ -26,7 +25,7 @@ WARM_UP_S = 2.8  # duration of the reprocessed audio; docs/recognition.md explai
 # aligned as in an uninterrupted session.
 GRID_S = 0.16
 
-Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
+Chunk: TypeAlias = tuple[int, Floats]  # media time; samples, (n, channels)
 
 
 class ReplayWindow:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import SoundEvent
 
@@ -19,7 +19,7 @@ class Articulation(Protocol):
     """Data about the current speech for modifiers."""
 
     @property
-    def syllable_onsets_s(self) -> NDArray[np.float64]:
+    def syllable_onsets_s(self) -> Doubles:
         """Media time of each syllable's vowel onset, shape (num_syllables,), ascending."""
 
     def usual_level_db(self, time_s: float) -> float | None:
@@ -30,7 +30,7 @@ class Articulation(Protocol):
 class SyllableArticulation:
     """Syllable onsets without usual levels; implements ``Articulation``."""
 
-    syllable_onsets_s: NDArray[np.float64]
+    syllable_onsets_s: Doubles
 
     def usual_level_db(self, time_s: float) -> float | None:
         """Return None (unknown)."""
@@ -41,7 +41,7 @@ class SyllableArticulation:
 class MouthFrame(Record, frozen=True):
     """The mouth at one time."""
 
-    faps: NDArray[np.float64]  # (num_mouth_faps,) FAP units, in the order of MOUTH_FAPS
+    faps: Doubles  # (num_mouth_faps,) FAP units, in the order of MOUTH_FAPS
     articulation: Articulation = SyllableArticulation(np.zeros(0))  # unknown
 
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.fast_record import Record
-
-Array = NDArray[np.float64]
 
 TRANSITION_S = 0.04  # duration of the change to a new target trajectory
 SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
@@ -19,8 +17,8 @@ SLOW_TRANSITION_S = 0.14  # duration after an interruption, and from rest
 class FapState(Record, frozen=True):
     """Value and velocity of FAPs at one time."""
 
-    value: Array  # FAP units
-    velocity: Array  # FAP units per second
+    value: Doubles  # FAP units
+    velocity: Doubles  # FAP units per second
 
     def __add__(self, other: FapState) -> FapState:
         return FapState(self.value + other.value, self.velocity + other.velocity)
@@ -29,12 +27,12 @@ class FapState(Record, frozen=True):
         return FapState(self.value - other.value, self.velocity - other.velocity)
 
 
-def stationary_state(value: Array) -> FapState:
+def stationary_state(value: Doubles) -> FapState:
     """Return the state of FAPs (num_mouth_faps,) that do not move."""
     return FapState(value, np.zeros(NUM_MOUTH_FAPS))
 
 
-def clip_state(state: FapState, lowest: Array, highest: Array) -> FapState:
+def clip_state(state: FapState, lowest: Doubles, highest: Doubles) -> FapState:
     """Clip FAPs to their limits. The velocity of a clipped FAP is 0."""
     value = np.minimum(np.maximum(state.value, lowest), highest)
     return FapState(value, np.where(value == state.value, state.velocity, 0.0))
@@ -45,7 +43,7 @@ class Transition:
     """Blends two trajectories: their difference decays along a cubic, with one duration per FAP."""
 
     difference: FapState  # at ``start_s``
-    duration_s: Array
+    duration_s: Doubles
     start_s: float = 0.0
     longest_s: float = field(init=False)
 
@@ -64,14 +62,14 @@ class Transition:
         )
         return FapState(self.value_at(time_s), velocity)
 
-    def value_at(self, time_s: float) -> Array:
+    def value_at(self, time_s: float) -> Doubles:
         """Return the value of the remaining difference."""
         elapsed_s = time_s - self.start_s
         if elapsed_s >= self.longest_s:
             return np.zeros(len(self.duration_s))
         u, start = np.minimum(elapsed_s / self.duration_s, 1.0), self.difference
         # cubic Hermite spline from (value, velocity) to (0, 0)
-        rest: Array = (1.0 + 2.0 * u) * start.value + u * self.duration_s * start.velocity
+        rest: Doubles = (1.0 + 2.0 * u) * start.value + u * self.duration_s * start.velocity
         return (1.0 - u) ** 2 * rest
 
 
@@ -83,7 +81,7 @@ NO_TRANSITION = Transition(
 class RestTransition:
     """Moves the mouth to rest while media time does not advance."""
 
-    def __init__(self, mouth: FapState, neutral: Array, duration_s: float) -> None:
+    def __init__(self, mouth: FapState, neutral: Doubles, duration_s: float) -> None:
         self._neutral = stationary_state(neutral)
         self._transition = Transition(mouth - self._neutral, np.full(NUM_MOUTH_FAPS, duration_s))
         self._elapsed_s = 0.0

@@ -14,10 +14,10 @@ fast visemes miss their targets, which explains about half of the reduction in r
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.lip_model import Articulation
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, pop_until
+from kouxing.shared.arrays import Doubles, Floats
 from kouxing.shared.face.faps import LIP_HEIGHT_FAPS
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
@@ -52,7 +52,7 @@ class AmplitudeModifier:
         self._goal = 1.0
         self._gain = TwoPoleFilter(1.0)
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+    def apply(self, faps: Floats, context: FrameContext) -> None:
         """Scale the openings of a frame, FAPs (68,), in place."""
         self._levels += context.levels
         until_s = min(context.known_s, context.time_s + _LEAD_S)
@@ -80,7 +80,7 @@ class AmplitudeModifier:
         self._goal = 1.0 + _PER_DB * louder_db
 
 
-def _rate_gain(syllable_onsets_s: NDArray[np.float64], until_s: float) -> float:
+def _rate_gain(syllable_onsets_s: Doubles, until_s: float) -> float:
     """Return the gain for the rate of the last syllables before ``until_s``."""
     num_started = int(syllable_onsets_s.searchsorted(until_s, side="right"))
     intervals = np.diff(syllable_onsets_s[max(num_started - _NUM_INTERVALS - 1, 0) : num_started])

@@ -21,10 +21,8 @@ do not grow, so that the jaw does not drop too far. Horizontal movements are sma
 visible, so they count twice.
 """
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.expression_motion import CLOSED, JAW, LOWER, OPEN, UPPER
 from kouxing.shared.face.faps import MOUTH_WIDTH_FAPS
 from kouxing.shared.face.smoothing import TwoPoleFilter
@@ -48,12 +46,12 @@ class ExpressivenessModifier:
         self.amount = amount
         self._shown = TwoPoleFilter(amount)
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+    def apply(self, faps: Floats, context: FrameContext) -> None:
         """Scale the mouth of a frame, FAPs (68,), in place."""
         scale_mouth(faps, self._shown.step(self.amount, context.step_s, _EASE_S))
 
 
-def scale_mouth(faps: NDArray[np.float32], amount: float) -> None:
+def scale_mouth(faps: Floats, amount: float) -> None:
     """Scale the mouth movements of FAPs (68,) by ``amount``, in place."""
     if amount == 1.0:
         return

@@ -8,10 +8,10 @@ action units 1, 2, 4, 5, 6, 12 and 15). Closures stay closed, as in
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.expressiveness import scale_mouth
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.smoothing import TwoPoleFilter
 
@@ -21,7 +21,7 @@ _VISIBLE = 1e-3  # weaker feelings are not shown
 _SIZE = 0.25  # increase of the mouth's movements at full arousal
 
 
-def _named_faps(**units: float) -> NDArray[np.float32]:
+def _named_faps(**units: float) -> Floats:
     """Return FAPs (68,) from units by name; ``S`` in a name means both sides."""
     faps = np.zeros(NUM_FAPS, np.float32)
     for name, value in units.items():
@@ -65,7 +65,7 @@ class FeelingModifier:
         self.amount = amount
         self._arousal, self._valence = TwoPoleFilter(0.0), TwoPoleFilter(0.0)
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+    def apply(self, faps: Floats, context: FrameContext) -> None:
         """Add the feeling to a frame, FAPs (68,), in place."""
         arousal, valence = (
             motion.step(self._goal(value, context), context.step_s, _FILTER_S)

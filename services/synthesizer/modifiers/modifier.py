@@ -4,10 +4,8 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.services.synthesizer.lips.lip_model import Articulation
+from kouxing.shared.arrays import Floats
 from kouxing.shared.fast_record import Record
 
 
@@ -31,7 +29,7 @@ class FrameContext(Record, frozen=True, kw_only=True):
 class Modifier(Protocol):
     """Changes the frames of one session; may have state."""
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+    def apply(self, faps: Floats, context: FrameContext) -> None:
         """Change a frame, FAPs (68,) in FAP units, in place."""
 
 

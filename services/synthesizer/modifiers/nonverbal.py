@@ -15,9 +15,9 @@ import math
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext, pop_until
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.expression_motion import EXPRESSION_FAPS, ExpressionMotion
 from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import DEGREE, FAP_NUMBER
@@ -36,14 +36,14 @@ _OPEN_VOWEL = VISEMES[VISEME_NAMES.index("A:")]
 _HEAD_PITCH = FAP_NUMBER["head_pitch"] - 1
 
 
-def _open_mouth(amount: float, pitch_deg: float) -> NDArray[np.float32]:
+def _open_mouth(amount: float, pitch_deg: float) -> Floats:
     """Return FAPs (68,) of an open mouth and a lifted head."""
-    faps: NDArray[np.float32] = np.float32(amount) * _OPEN_VOWEL
+    faps: Floats = np.float32(amount) * _OPEN_VOWEL
     faps[_HEAD_PITCH] = pitch_deg * DEGREE
     return faps
 
 
-def _make_breath() -> NDArray[np.float32]:
+def _make_breath() -> Floats:
     faps = _open_mouth(_BREATH_OPENING, _BREATH_DEG)
     for name in ("stretch_l_nose", "stretch_r_nose"):
         faps[FAP_NUMBER[name] - 1] = _NOSTRILS
@@ -53,7 +53,7 @@ def _make_breath() -> NDArray[np.float32]:
 class ExpressionModifier(ExpressionMotion):
     """Expressions that leave the lips to speech."""
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+    def apply(self, faps: Floats, context: FrameContext) -> None:
         """Add the expressions to a frame, FAPs (68,), in place."""
         self.add(faps, context.step_s, is_speaking=context.is_speaking)
 
@@ -67,7 +67,7 @@ class NonverbalModifier:
         self._loudest_db = -math.inf
         self._loudness = 0.0
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+    def apply(self, faps: Floats, context: FrameContext) -> None:
         """Add laughter and breath to a frame, FAPs (68,), in place."""
         self._levels += context.levels
         until_s = min(context.known_s, context.time_s + _LEAD_S)

@@ -28,10 +28,10 @@ the sound.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.services.synthesizer.modifiers.prosody import Prosody, ProsodyTracker
+from kouxing.shared.arrays import Floats
 from kouxing.shared.face.faps import DEGREE
 from kouxing.shared.face.idle_motion import (
     EYES_PITCH,
@@ -102,7 +102,7 @@ class SpeechMotionModifier:
             self._has_heard_pause |= self._is_listening and not listening
             self._is_listening = listening
 
-    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
+    def apply(self, faps: Floats, context: FrameContext) -> None:
         """Add the motion to a frame, FAPs (68,), in place."""
         now_s, step_s = context.elapsed_s, context.step_s
         prosody = self._prosody.update(context)

@@ -22,6 +22,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 from kouxing.services.synthesizer.lips.trajectory import FapState
+from kouxing.shared.arrays import Doubles, Mask
 from kouxing.shared.fast_record import Record
 
 _STEP_S = 1e-3  # step of the numerical derivative
@@ -33,11 +34,11 @@ class SequenceParameters(Record, frozen=True, kw_only=True):
     Viseme arrays have shape (num_visemes, 1, num_mouth_faps).
     """
 
-    offset_s: NDArray[np.float64]
-    log_alpha: NDArray[np.float64]
-    theta_minus: NDArray[np.float64]
-    theta_plus: NDArray[np.float64]
-    target: NDArray[np.float64]  # (num_visemes + num_silences, num_mouth_faps)
+    offset_s: Doubles
+    log_alpha: Doubles
+    theta_minus: Doubles
+    theta_plus: Doubles
+    target: Doubles  # (num_visemes + num_silences, num_mouth_faps)
     closing: list[tuple[int, NDArray[np.intp]]]  # closing visemes, and the FAPs that close
 
 
@@ -63,19 +64,16 @@ def build_sequence_parameters(
     )
 
 
-def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def softmax(log_weights: Doubles) -> Doubles:
     """Return weights that sum to one along the first axis."""
-    weights: NDArray[np.float64] = np.exp(log_weights - np.maximum.reduce(log_weights))
+    weights: Doubles = np.exp(log_weights - np.maximum.reduce(log_weights))
     weights /= np.add.reduce(weights)
     return weights
 
 
 def log_weights(
-    parameters: VisemeParameters,
-    sequence: SequenceParameters,
-    timeline: Timeline,
-    time_s: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    parameters: VisemeParameters, sequence: SequenceParameters, timeline: Timeline, time_s: Doubles
+) -> Doubles:
     """Return the log weights (num_visemes + num_silences, num_times, num_mouth_faps).
 
     ``time_s`` has shape (num_times,).
@@ -98,11 +96,8 @@ def log_weights(
 
 
 def _close_lips(
-    parameters: VisemeParameters,
-    sequence: SequenceParameters,
-    tau: NDArray[np.float64],
-    weights: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    parameters: VisemeParameters, sequence: SequenceParameters, tau: Doubles, weights: Doubles
+) -> Doubles:
     """Apply the closure rule (Wang & Cai 2003, eq. 7) to closing visemes."""
     closed = weights
     for row, faps in sequence.closing:
@@ -127,9 +122,9 @@ def _close_lips(
 def blend(
     parameters: VisemeParameters,
     timeline: Timeline,
-    time_s: NDArray[np.float64],
+    time_s: Doubles,
     sequence: SequenceParameters | None = None,
-) -> NDArray[np.float64]:
+) -> Doubles:
     """Return the mouth FAPs (num_times, num_mouth_faps) of a timeline at times (num_times,).
 
     ``sequence`` is ``build_sequence_parameters`` of the timeline, if known.
@@ -140,11 +135,11 @@ def blend(
     sequence = sequence or build_sequence_parameters(parameters, timeline)
     weights = softmax(log_weights(parameters, sequence, timeline, time_s))  # (E + S, F, P)
     weights *= sequence.target[:, None]
-    curves: NDArray[np.float64] = np.add.reduce(weights)  # Wang & Cai 2003, eq. 6
+    curves: Doubles = np.add.reduce(weights)  # Wang & Cai 2003, eq. 6
     return curves
 
 
-def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray[np.bool_]:
+def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> Mask:
     """Return a mask of the visemes that act at a time: the pair around it, and within ``reach_s``.
 
     With ``reach_s`` 0 this is the pair of Li 2011, eq. 11, from apex to apex. A longer reach is

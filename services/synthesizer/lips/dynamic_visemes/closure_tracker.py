@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
+from kouxing.shared.arrays import Doubles, Mask
 from kouxing.shared.fast_record import replace
 
 _MAX_LATE_S = 0.1  # closures recognized later than this after their apex are not shown
@@ -24,7 +25,7 @@ class ClosureTracker:
     def __init__(self, parameters: VisemeParameters, frame_rate_hz: float) -> None:
         self._target = parameters.target
         self._frame_s = 1.0 / frame_rate_hz
-        self._closes: NDArray[np.bool_] = parameters.closes > 0.0  # (num_visemes, num_mouth_faps)
+        self._closes: Mask = parameters.closes > 0.0  # (num_visemes, num_mouth_faps)
         self._any_closes = parameters.any_closes
         self._shown: set[int] = set()  # phone indices
         self._postponed_s: dict[int, float] = {}  # apex by phone index
@@ -53,9 +54,7 @@ class ClosureTracker:
         moved = replace(timeline, apex_start_s=start_s, apex_end_s=end_s)
         return moved.select(np.argsort(start_s, kind="stable")), is_new
 
-    def shorten(
-        self, duration_s: NDArray[np.float64], timeline: Timeline, time_s: float
-    ) -> NDArray[np.float64]:
+    def shorten(self, duration_s: Doubles, timeline: Timeline, time_s: float) -> Doubles:
         """Shorten a transition that starts at ``time_s`` so that it ends before the next closures.
 
         ``duration_s`` and the result have shape (num_mouth_faps,).
@@ -68,9 +67,7 @@ class ClosureTracker:
                 shortened[closes] = np.minimum(shortened[closes], left_s)
         return shortened
 
-    def record_closures(
-        self, timeline: Timeline, time_s: float, mouth: NDArray[np.float64]
-    ) -> None:
+    def record_closures(self, timeline: Timeline, time_s: float, mouth: Doubles) -> None:
         """Record which closures the mouth, FAPs (num_mouth_faps,), shows at a time."""
         for row in self._closing_rows(timeline):
             if timeline.apex_start_s[row] - self._frame_s <= time_s:

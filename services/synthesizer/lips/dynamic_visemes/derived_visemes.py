@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.face.faps import (
     LIP_HEIGHT_FAPS,
     MOUTH_FAPS,
@@ -16,7 +16,6 @@ from kouxing.shared.face.faps import (
 )
 from kouxing.shared.files.tsv_tables import read_table
 
-Array = NDArray[np.float64]
 _OPENING = (3, *LIP_HEIGHT_FAPS)  # with the jaw
 
 
@@ -49,8 +48,8 @@ def load_derived_visemes() -> tuple[DerivedViseme, ...]:
 
 
 def append_derived_visemes(
-    arrays: Mapping[str, Array], index: Mapping[str, int]
-) -> dict[str, Array]:
+    arrays: Mapping[str, Doubles], index: Mapping[str, int]
+) -> dict[str, Doubles]:
     """Append the rows of the derived visemes to arrays with a row for each trained viseme.
 
     ``index`` is the row of each trained viseme. A derived viseme has the dominance of its base and
@@ -65,7 +64,7 @@ def append_derived_visemes(
     return {name: np.concatenate([array, rows[name]]) for name, array in arrays.items()}
 
 
-def compute_derived_targets(targets: Array, index: Mapping[str, int]) -> Array:
+def compute_derived_targets(targets: Doubles, index: Mapping[str, int]) -> Doubles:
     """Return the targets (num_derived, num_mouth_faps) from the trained visemes' targets."""
     made = np.empty((len(load_derived_visemes()), len(MOUTH_FAPS)))
     opening, width, protrusion, tongue = (

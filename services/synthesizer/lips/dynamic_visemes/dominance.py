@@ -20,31 +20,30 @@ closure rule is geometric instead of arithmetic (`log_closure`).
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from kouxing.shared.arrays import Doubles
 
 _PAUSE_SCALE_S = 0.05  # the silence of a pause this long has 63 % of the full dominance
 
 
 def log_dominance(
-    tau_s: Array, log_alpha: Array, theta_minus: Array, theta_plus: Array, c: float
-) -> Array:
+    tau_s: Doubles, log_alpha: Doubles, theta_minus: Doubles, theta_plus: Doubles, c: float
+) -> Doubles:
     """Return the log dominance of a viseme (Li 2011, eq. 5); all shapes broadcast."""
     theta = np.where(tau_s >= 0.0, theta_minus, theta_plus)
     return log_alpha - theta * np.abs(tau_s) ** c  # Li 2011, eq. 5
 
 
-def log_silence(inside_s: Array, log_alpha: Array | float, theta: Array, c: float) -> Array:
+def log_silence(inside_s: Doubles, log_alpha: Doubles | float, theta: Doubles, c: float) -> Doubles:
     """Return the log dominance of the silence before or after speech (Li 2011, eq. 6 and 7).
 
     ``inside_s`` is how far a time is inside the speech: -sigma before it, nu after it.
     """
-    weights: Array = log_alpha - np.copysign(theta * np.abs(inside_s) ** c, inside_s)
+    weights: Doubles = log_alpha - np.copysign(theta * np.abs(inside_s) ** c, inside_s)
     return weights
 
 
-def log_pause(log_right: Array, log_left: Array, pause_s: Array) -> Array:
+def log_pause(log_right: Doubles, log_left: Doubles, pause_s: Doubles) -> Doubles:
     """Return the log dominance of the silence between two words.
 
     Wang & Cai 2003, section 3, give no formula: the silence is where the models of both neighbors
@@ -52,14 +51,14 @@ def log_pause(log_right: Array, log_left: Array, pause_s: Array) -> Array:
     function is half the harmonic mean of both models (a smooth minimum) times ``1 - exp(-pause /
     scale)``. A model at an infinite distance has no effect.
     """
-    strength: Array = np.log(-np.expm1(-pause_s / _PAUSE_SCALE_S))
-    both: Array = np.logaddexp(-log_right, -log_left)
+    strength: Doubles = np.log(-np.expm1(-pause_s / _PAUSE_SCALE_S))
+    both: Doubles = np.logaddexp(-log_right, -log_left)
     return strength - both
 
 
 def log_closure(
-    log_viseme: Array, log_others: Array, tau_s: Array, reach_s: float, closure_ratio: float
-) -> Array:
+    log_viseme: Doubles, log_others: Doubles, tau_s: Doubles, reach_s: float, closure_ratio: float
+) -> Doubles:
     """Return the log dominance of a closing lip, which outweighs all others at its apex.
 
     Wang & Cai 2003, eq. 7 interpolates linearly from the viseme's own dominance at ``reach_s`` to

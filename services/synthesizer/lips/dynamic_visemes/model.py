@@ -24,7 +24,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     active_visemes,
@@ -47,6 +46,7 @@ from kouxing.services.synthesizer.lips.trajectory import (
     clip_state,
     stationary_state,
 )
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.fast_record import Record
 from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
@@ -80,10 +80,10 @@ class VisemeArticulation(Record, frozen=True):
     """The articulation of a timeline of visemes; implements ``Articulation``."""
 
     timeline: Timeline
-    level_db: NDArray[np.float64]  # (num_visemes,) usual level, relative to the speaker's mean
+    level_db: Doubles  # (num_visemes,) usual level, relative to the speaker's mean
 
     @property
-    def syllable_onsets_s(self) -> NDArray[np.float64]:
+    def syllable_onsets_s(self) -> Doubles:
         """Syllable onsets; see ``Articulation``."""
         return self.timeline.syllable_s
 
@@ -188,5 +188,5 @@ class VisemeStream:
     def _clip_to_hull(self, state: FapState) -> FapState:
         return clip_state(state, self._lowest, self._highest)
 
-    def _frame(self, faps: NDArray[np.float64]) -> MouthFrame:
+    def _frame(self, faps: Doubles) -> MouthFrame:
         return MouthFrame(faps, VisemeArticulation(self._current, self._parameters.level_db))

@@ -19,6 +19,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     VISEMES,
 )
+from kouxing.shared.arrays import Doubles, Mask
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.files.user_file import check_content, parse_json, read_text
@@ -54,32 +55,32 @@ class VisemeParameters:
     columns as ``MOUTH_FAPS``; silence arrays have shape (num_mouth_faps,).
     """
 
-    alpha: NDArray[np.float64]  # dominance at the apex
-    theta_minus: NDArray[np.float64]  # decay before the apex, s**-c
-    theta_plus: NDArray[np.float64]  # decay after the apex, s**-c
-    offset_s: NDArray[np.float64]  # t_o: the FAP's apex minus the acoustic apex, seconds
-    target: NDArray[np.float64]  # T, FAP units
-    closes: NDArray[np.float64]  # 1 where the closure rule applies, else 0
-    level_db: NDArray[np.float64]  # (num_visemes,) usual level relative to the speaker's mean
-    alpha_left: NDArray[np.float64]
-    alpha_right: NDArray[np.float64]
-    theta_left: NDArray[np.float64]  # s**-c
-    theta_right: NDArray[np.float64]  # s**-c
-    offset_left_s: NDArray[np.float64]  # t_l: from the start of speech, seconds
-    offset_right_s: NDArray[np.float64]  # t_r: from the end of speech, seconds
-    neutral: NDArray[np.float64]  # T_0, FAP units
+    alpha: Doubles  # dominance at the apex
+    theta_minus: Doubles  # decay before the apex, s**-c
+    theta_plus: Doubles  # decay after the apex, s**-c
+    offset_s: Doubles  # t_o: the FAP's apex minus the acoustic apex, seconds
+    target: Doubles  # T, FAP units
+    closes: Doubles  # 1 where the closure rule applies, else 0
+    level_db: Doubles  # (num_visemes,) usual level relative to the speaker's mean
+    alpha_left: Doubles
+    alpha_right: Doubles
+    theta_left: Doubles  # s**-c
+    theta_right: Doubles  # s**-c
+    offset_left_s: Doubles  # t_l: from the start of speech, seconds
+    offset_right_s: Doubles  # t_r: from the end of speech, seconds
+    neutral: Doubles  # T_0, FAP units
     c: float
     closure_ratio: float  # C of Wang & Cai 2003, eq. 7
     closure_reach_s: float  # T of Wang & Cai 2003, eq. 7, seconds
     # columns for each viseme: offset_s, log alpha, theta_minus and theta_plus;
     # (num_visemes, 4, num_mouth_faps)
-    dominance: NDArray[np.float64] = dataclasses.field(init=False)
+    dominance: Doubles = dataclasses.field(init=False)
     # silence after speech, then before it, (2, 1, 1, num_mouth_faps)
-    silence_log_alpha: NDArray[np.float64] = dataclasses.field(init=False)
-    silence_theta: NDArray[np.float64] = dataclasses.field(init=False)
-    silence_offset_s: NDArray[np.float64] = dataclasses.field(init=False)
+    silence_log_alpha: Doubles = dataclasses.field(init=False)
+    silence_theta: Doubles = dataclasses.field(init=False)
+    silence_offset_s: Doubles = dataclasses.field(init=False)
     # (num_visemes,) whether any FAP closes
-    any_closes: NDArray[np.bool_] = dataclasses.field(init=False)
+    any_closes: Mask = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
         for name in (field.name for field in fields(self) if field.init):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, visemes_of
 from kouxing.services.synthesizer.lips.known_phones import RECOGNIZED_AFTER_S
+from kouxing.shared.arrays import Doubles, Integers, Mask
 from kouxing.shared.fast_record import Record, replace
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -53,15 +54,15 @@ class Timeline(Record, frozen=True, kw_only=True):
     """Visemes sorted by time, and the silences before, between and after words."""
 
     viseme: NDArray[np.intp]  # (num_visemes,) rows of VisemeParameters
-    apex_start_s: NDArray[np.float64]  # (num_visemes,) seconds
-    apex_end_s: NDArray[np.float64]  # (num_visemes,) seconds, not before apex_start_s
-    phone_index: NDArray[np.int64]  # (num_visemes,) Phone.index, or EXPECTED_PHONE_INDEX
-    silence_start_s: NDArray[np.float64]  # (num_silences,) end of speech; -inf before all speech
-    silence_end_s: NDArray[np.float64]  # (num_silences,) start of speech; inf after all speech
-    syllable_s: NDArray[np.float64]  # (num_syllables,) onset of each syllable's vowel
+    apex_start_s: Doubles  # (num_visemes,) seconds
+    apex_end_s: Doubles  # (num_visemes,) seconds, not before apex_start_s
+    phone_index: Integers  # (num_visemes,) Phone.index, or EXPECTED_PHONE_INDEX
+    silence_start_s: Doubles  # (num_silences,) end of speech; -inf before all speech
+    silence_end_s: Doubles  # (num_silences,) start of speech; inf after all speech
+    syllable_s: Doubles  # (num_syllables,) onset of each syllable's vowel
     open_phone: OpenPhone | None = None
 
-    def select(self, selected: NDArray[np.bool_] | NDArray[np.intp]) -> Timeline:
+    def select(self, selected: Mask | NDArray[np.intp]) -> Timeline:
         """Return a timeline with selected visemes (mask or rows), all silences and syllables."""
         return Timeline(
             viseme=self.viseme[selected],

@@ -7,12 +7,12 @@ of other languages have visemes that are derived from these (``derived_visemes``
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.derived_visemes import (
     compute_derived_targets,
     load_derived_visemes,
 )
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import LIP_HEIGHT_FAPS, LOWER_LIP_FAPS
 from kouxing.shared.files.tsv_tables import read_table
@@ -63,7 +63,7 @@ def check_visemes(inventory: PhoneInventory) -> None:
         )
 
 
-def static_targets() -> NDArray[np.float64]:
+def static_targets() -> Doubles:
     """Return the static targets T (num_visemes, num_mouth_faps), FAP units, as MOUTH_FAPS."""
     table = (list(row.values()) for row in read_table(__package__, "targets.tsv"))
     rows = {viseme: [float(value) for value in values] for viseme, *values in table}

@@ -27,14 +27,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from kouxing.services.synthesizer.lips.ferguson.phone_table import MAX_OPENING
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
 from kouxing.shared.files.tsv_tables import read_table
-
-Array = NDArray[np.float64]
 
 # feature points from the subject's right to the left
 LINES = {
@@ -74,10 +73,10 @@ class LipLine:
     closed: CubicSpline  # x -> y
     travel: CubicSpline  # x -> dy
 
-    def heights(self, x: ArrayLike, openings: ArrayLike) -> Array:
+    def heights(self, x: ArrayLike, openings: ArrayLike) -> Doubles:
         """Return l (num_frames, num_points) at x (num_points,) for R (num_frames,)."""
         opening = np.asarray(openings, dtype=np.float64)[:, None]
-        heights: Array = self.closed(x) + opening * self.travel(x)  # Zhang 2021, eq. 4
+        heights: Doubles = self.closed(x) + opening * self.travel(x)  # Zhang 2021, eq. 4
         return heights
 
 
@@ -113,7 +112,7 @@ def _line(name: str) -> LipLine:
     )
 
 
-def contour(openings: ArrayLike, num_points: int) -> Array:
+def contour(openings: ArrayLike, num_points: int) -> Doubles:
     """Return the lip contour for openings R (num_frames,), 0 to 5.
 
     The result has shape (num_frames, 4, num_points, 2): lines as in ``LINES``, and x, y in mouth
@@ -127,7 +126,7 @@ def contour(openings: ArrayLike, num_points: int) -> Array:
     return points
 
 
-def compute_rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int) -> Array:
+def compute_rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: int) -> Doubles:
     """Return the lip contour for openings R and widths (num_frames,), like :func:`contour`.
 
     A width is the distance of the corners relative to the mouth at rest. If they approach each
@@ -142,12 +141,12 @@ def compute_rounded_contour(openings: ArrayLike, widths: ArrayLike, num_points: 
     return points
 
 
-def opening_to_faps(openings: ArrayLike) -> Array:
+def opening_to_faps(openings: ArrayLike) -> Doubles:
     """Return the mouth FAPs (num_frames, num_mouth_faps) for openings R (num_frames,), 0 to 5.
 
     Jaw and lip feature points travel as measured; the other FAPs are 0.
     """
     travels = {point.fap: point.travel for point in load_lip_points().values()}
     travel_of_fap = np.array([travels.get(fap, 0.0) for fap in MOUTH_FAPS])
-    faps: Array = np.asarray(openings, dtype=np.float64)[:, None] / MAX_OPENING * travel_of_fap
+    faps: Doubles = np.asarray(openings, dtype=np.float64)[:, None] / MAX_OPENING * travel_of_fap
     return faps

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from kouxing.services.synthesizer.lips.ferguson.contour import compute_rounded_contour
+from kouxing.shared.arrays import Doubles, Mask
 from kouxing.shared.fonts import text_runs
 
-Array = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 _POINTS_OF_LINE = 61
@@ -39,7 +39,7 @@ _SUPERSAMPLING = 3
 class Outline:
     """A filled polygon, or an open line."""
 
-    points: Array  # (num_points, 2), pixels
+    points: Doubles  # (num_points, 2), pixels
     color: str  # "#rrggbb"
     line_px: float | None = None  # line width; None for a filled polygon
 
@@ -94,7 +94,7 @@ def draw_mouth(
         bottom + (lower_edge - bottom) * height for height in (level, 1.0 - level)
     )
 
-    def between(above: Array, below: Array, where: NDArray[np.bool_]) -> Array:
+    def between(above: Doubles, below: Doubles, where: Mask) -> Doubles:
         upper, lower = (np.stack([x, line], axis=1)[where] for line in (above, below))
         return np.concatenate([upper, lower[::-1]])
 
@@ -112,7 +112,7 @@ def draw_mouth(
         Outline(inner_lower, _INSIDE, line_px),
     ]
 
-    def placed(points: Array) -> Array:
+    def placed(points: Doubles) -> Doubles:
         return np.array(center_px) + (points - [0.5, 0.0]) * [width_px, -width_px]
 
     return [Outline(placed(line.points), line.color, line.line_px) for line in outlines]

@@ -9,13 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kouxing.services.synthesizer.lips.ferguson.phone_table import PhoneTable
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import SILENCE
-
-Array = NDArray[np.float64]
 
 OPENING_TIME_S = 0.12  # time from a closed mouth to the first phone
 PAUSE_S = 0.2  # the mouth stays open in shorter gaps between phones
@@ -26,13 +25,13 @@ _MIN_STEP_S = 1e-3  # minimum time between key frames
 class KeyFrames:
     """The opening R(t) of a mouth; constant before the first and after the last key frame."""
 
-    times_s: Array  # (num_key_frames,) strictly ascending, at least one
-    openings: Array  # (num_key_frames,) R at these times, 0 to MAX_OPENING
+    times_s: Doubles  # (num_key_frames,) strictly ascending, at least one
+    openings: Doubles  # (num_key_frames,) R at these times, 0 to MAX_OPENING
 
-    def openings_at(self, times_s: ArrayLike) -> Array:
+    def openings_at(self, times_s: ArrayLike) -> Doubles:
         """Return R (n,) at times (n,)."""
         times = np.asarray(times_s)
-        openings: Array = np.interp(times, self.times_s, self.openings)  # Zhang 2021, eq. 6
+        openings: Doubles = np.interp(times, self.times_s, self.openings)  # Zhang 2021, eq. 6
         return openings
 
 

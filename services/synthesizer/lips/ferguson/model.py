@@ -21,7 +21,6 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.ferguson.contour import opening_to_faps
 from kouxing.services.synthesizer.lips.ferguson.key_frames import (
@@ -51,8 +50,6 @@ from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
-
-Array = NDArray[np.float64]
 
 _SNAP_S = 0.06  # a syllable this close to the start of a segment starts with the segment
 _EXPECTED_S = 0.15  # wait for an expected phone before the mouth closes

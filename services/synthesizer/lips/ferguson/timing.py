@@ -24,11 +24,10 @@ from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
     EnergySegment,
     segment_speech,
 )
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import Syllable
-
-Array = NDArray[np.float64]
 
 # Tuned on the training split for the error of syllable onsets.
 _DURATION_SD = 0.5  # standard deviation of a syllable's log duration
@@ -110,7 +109,7 @@ def phone_onsets(
 
 def syllable_times(
     slices: Sequence[Progress], syllables: Sequence[Syllable], table: PhoneTable
-) -> Array:
+) -> Doubles:
     """Return start and end of each syllable (num_syllables, 2), seconds.
 
     Raises ``UserError`` if there is no speech.
@@ -136,8 +135,8 @@ def syllable_times(
 class _TypicalValues:
     """Typical values of each syllable."""
 
-    duration_s: Array  # (num_syllables,)
-    crossings: Array  # (num_syllables,) maximum zero-crossing rate at the onset
+    duration_s: Doubles  # (num_syllables,)
+    crossings: Doubles  # (num_syllables,) maximum zero-crossing rate at the onset
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,10 +158,10 @@ class OnsetCrossings:
         ahead = np.pad(smooth, (0, _ONSET_SLICES - 1), mode="edge")
         self._maximum = np.lib.stride_tricks.sliding_window_view(ahead, _ONSET_SLICES).max(axis=1)
 
-    def at(self, times_s: Array) -> Array:
+    def at(self, times_s: Doubles) -> Doubles:
         """Return the rate, 0 to 1, of a consonant that starts at each time."""
         slices = np.rint((times_s - self._start_s) / SLICE_S).astype(np.intp)
-        maximum: Array = self._maximum[np.clip(slices, 0, len(self._maximum) - 1)]
+        maximum: Doubles = self._maximum[np.clip(slices, 0, len(self._maximum) - 1)]
         return maximum
 
 
@@ -178,14 +177,14 @@ def _cheapest_assignment(
     total_cost[0, 0] = 0.0
     best = np.zeros((num_segments + 1, num_syllables + 1, 2), dtype=np.int16)
 
-    def consider(row: int, merged: int, num: int, cost: Array | float) -> None:
+    def consider(row: int, merged: int, num: int, cost: Doubles | float) -> None:
         """Consider ending any ``num`` syllables with segment ``row``, the last of ``merged``."""
         total = total_cost[row - merged, : num_syllables + 1 - num] + cost
         is_better = total < total_cost[row, num:]
         total_cost[row, num:][is_better] = total[is_better]
         best[row, num:][is_better] = merged, num
 
-    def hiss_cost(times_s: Array, first: int, num: int) -> Array:
+    def hiss_cost(times_s: Doubles, first: int, num: int) -> Doubles:
         """Return the cost of onsets of the ``first``-th of ``num`` syllables at some times."""
         typical = text.crossings[first : num_syllables + 1 - num + first]
         misfit = 0.5 * ((onset_crossings.at(times_s) - typical) / _HISS_SD) ** 2
@@ -216,13 +215,13 @@ def _speech_ratio(segments: Sequence[EnergySegment], typical_s: float) -> float:
     return sum(segment.end_s - segment.start_s for segment in segments) / typical_s
 
 
-def _typical_durations(syllables: Sequence[Syllable], table: PhoneTable) -> Array:
+def _typical_durations(syllables: Sequence[Syllable], table: PhoneTable) -> Doubles:
     return np.array([sum(table.duration_s[phone] for phone in phones) for phones in syllables])
 
 
-def _duration_cost(ratio: Array) -> Array:
+def _duration_cost(ratio: Doubles) -> Doubles:
     """Return the cost of a duration, given its ratio to the typical duration."""
-    misfit: Array = 0.5 * (np.log(ratio) / _DURATION_SD) ** 2
+    misfit: Doubles = 0.5 * (np.log(ratio) / _DURATION_SD) ** 2
     return misfit
 
 

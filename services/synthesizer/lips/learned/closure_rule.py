@@ -17,12 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.face.smoothing import smooth_step
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
-
-Array = NDArray[np.float64]
 
 _MIN_PROBABILITY, _MAX_PROBABILITY = 0.002, 0.998  # probabilities are clipped to this range
 # maximum duration of a closure after the onset of its phone; a phone known later closes nothing
@@ -47,7 +46,7 @@ class ClosureRule:
     parted: float = 0.02  # for an opening above 100, up to 300
     rounded: float = 0.012  # for a width below -100
 
-    def log_odds(self, faps: Array, sound: float, phones: float) -> float:
+    def log_odds(self, faps: Doubles, sound: float, phones: float) -> float:
         """Return the log odds of a closure.
 
         ``faps`` are the predicted mouth FAPs (num_mouth_faps,). ``sound`` are the predicted log
@@ -155,17 +154,17 @@ def compute_closure_amount(log_odds: float, doubt: float) -> float:
     return smooth_step(0.5 + 0.5 * log_odds / doubt)
 
 
-def close_lips(faps: Array, amount: float) -> None:
+def close_lips(faps: Doubles, amount: float) -> None:
     """Move both lips, FAPs (num_mouth_faps,), toward their closure, in place."""
     _move_to_rest(faps, amount, _INNER, _OUTER)
 
 
-def move_lip_to_teeth(faps: Array, amount: float) -> None:
+def move_lip_to_teeth(faps: Doubles, amount: float) -> None:
     """Move the lower lip toward the upper teeth, in place."""
     _move_to_rest(faps, amount, _LOWER, _LOWER_OUTER)
 
 
-def separate_lips(faps: Array) -> None:
+def separate_lips(faps: Doubles) -> None:
     """Separate lips that pass through each other, in place."""
     crossed = faps[_UPPER] + faps[_LOWER]
     if (crossed > 0.0).any():
@@ -173,7 +172,7 @@ def separate_lips(faps: Array) -> None:
 
 
 def _move_to_rest(
-    faps: Array, amount: float, inner: NDArray[np.intp], outer: NDArray[np.intp]
+    faps: Doubles, amount: float, inner: NDArray[np.intp], outer: NDArray[np.intp]
 ) -> None:
     """Move inner lips toward rest, and the outer lips by the same distance."""
     if amount > 0.0:

@@ -9,11 +9,9 @@ from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.trajectory import FapState, stationary_state
-
-Array = NDArray[np.float64]
+from kouxing.shared.arrays import Doubles
 
 HOLD_S = 0.04  # tolerated lateness of lip positions
 CLOSE_S = 0.1  # time from the last lip positions to rest
@@ -30,7 +28,7 @@ class _Knot:
 class LipTrack:
     """A mouth trajectory that starts at rest, mouth FAPs (num_mouth_faps,)."""
 
-    def __init__(self, neutral: Array) -> None:
+    def __init__(self, neutral: Doubles) -> None:
         self.hold_s = 0.0  # time for which the last frame is held before the mouth moves to rest
         self._rest = stationary_state(neutral)
         self._knots: list[_Knot] = []
@@ -40,7 +38,7 @@ class LipTrack:
         """Time of the last frame, seconds; minus infinity before the first frame."""
         return self._knots[-1].time_s if self._knots else -np.inf
 
-    def append(self, time_s: float, faps: Array) -> None:
+    def append(self, time_s: float, faps: Doubles) -> None:
         """Append a frame: media time, FAPs (num_mouth_faps,)."""
         if time_s - self.end_s <= MAX_GAP_S:
             velocity = (faps - self._knots[-1].state.value) / (time_s - self.end_s)

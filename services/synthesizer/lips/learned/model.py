@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.learned.closure_rule import (
@@ -47,10 +46,9 @@ from kouxing.services.synthesizer.lips.trajectory import (
     Transition,
     stationary_state,
 )
+from kouxing.shared.arrays import Doubles
 from kouxing.shared.face.faps import MOUTH_FAPS, MOUTH_WIDTH_FAPS, NUM_MOUTH_FAPS, TONGUE_FAPS
 from kouxing.shared.phones.events import LipPositions, Phone, SoundEvent, SpeechChange
-
-Array = NDArray[np.float64]
 
 _REST_S = 0.15  # duration of the return to rest without sound
 _FLUSHED_S = 0.3  # lip positions of this much audio may arrive after an interruption
@@ -184,7 +182,7 @@ class LearnedStream:
         self._mouth = self._rest.step(step_s)
         return self._frame(visemes.articulation)
 
-    def _follow_visemes(self, faps: Array, step_s: float) -> None:
+    def _follow_visemes(self, faps: Doubles, step_s: float) -> None:
         """Move like the dynamic visemes; the first lip positions start a transition from here."""
         self._mouth = FapState(faps, (faps - self._mouth.value) / step_s)
         self._on_track = self._mouth
@@ -219,7 +217,7 @@ class LearnedStream:
             self._late_s = max(0.0, frame.delay_s - self._delay_s)
         self._track.hold_s = HOLD_S + self._late_s if self._is_speaking else 0.0
 
-    def _stabilize(self, frame: LipPositions) -> Array:
+    def _stabilize(self, frame: LipPositions) -> Doubles:
         """Return the FAPs of the next lip positions, stabilized and with closures."""
         faps = frame.faps.astype(np.float64)
         if frame.time_s - self._track.end_s <= MAX_GAP_S:
