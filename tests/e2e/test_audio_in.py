@@ -113,6 +113,18 @@ def test_webrtc_streams_sound_and_returns_frames_despite_lost_packets(
     assert opening[SHAPES_TYPE] > 0.2
 
 
+async def post_offer(page: str, body: str | bytes, content_type: str = SDP) -> tuple[int, str]:
+    """Return the status and the text of the answer to an offer; the session is closed again."""
+    headers = {"Content-Type": content_type}
+    async with (
+        aiohttp.ClientSession() as http,
+        http.post(f"{page}whip", data=body, headers=headers) as answer,
+    ):
+        if answer.status == 201:
+            await http.delete(page.rstrip("/") + answer.headers["Location"])
+        return answer.status, await answer.text()
+
+
 @pytest.mark.parametrize(
     ("body", "content_type", "status", "text"),
     [
@@ -126,15 +138,9 @@ def test_webrtc_streams_sound_and_returns_frames_despite_lost_packets(
 def test_whip_rejects_bodies_that_are_not_opus_offers(
     system: System, body: str | bytes, content_type: str, status: int, text: str
 ) -> None:
-    async def post() -> None:
-        headers = {"Content-Type": content_type}
-        async with (
-            aiohttp.ClientSession() as http,
-            http.post(f"{system.page}whip", data=body, headers=headers) as answer,
-        ):
-            assert (answer.status, text in await answer.text()) == (status, True)
-
-    asyncio.run(post())
+    answered = asyncio.run(post_offer(system.page, body, content_type))
+    assert answered[0] == status
+    assert text in answered[1]
 
 
 @pytest.mark.parametrize(
@@ -144,30 +150,20 @@ def test_whip_rejects_bodies_that_are_not_opus_offers(
 def test_whip_answers_with_opus_even_if_the_client_prefers_another_codec(
     system: System, codecs: list[str], status: int, answered: set[str]
 ) -> None:
-    async def post() -> None:
+    async def post() -> tuple[int, str]:
         offered = {codec.mimeType: codec for codec in RTCRtpSender.getCapabilities("audio").codecs}
         peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
         peer.addTransceiver("audio").setCodecPreferences(
             [offered[f"audio/{name}"] for name in codecs]
         )
         await peer.setLocalDescription(await peer.createOffer())
-        async with (
-            aiohttp.ClientSession() as http,
-            http.post(
-                f"{system.page}whip",
-                data=peer.localDescription.sdp,
-                headers={"Content-Type": SDP},
-            ) as answer,
-        ):
-            text = await answer.text()
-            assert answer.status == status
-            assert set(re.findall(r"^a=rtpmap:\d+ (\S+)", text, re.MULTILINE)) == answered
-            if status == 201:
-                resource = system.page.rstrip("/") + answer.headers["Location"]
-                await http.delete(resource)
+        answer = await post_offer(system.page, peer.localDescription.sdp)
         await peer.close()
+        return answer
 
-    asyncio.run(post())
+    received_status, text = asyncio.run(post())
+    assert received_status == status
+    assert set(re.findall(r"^a=rtpmap:\d+ (\S+)", text, re.MULTILINE)) == answered
 
 
 class _SpeechThenNothing(MediaStreamTrack):

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -79,15 +78,14 @@ def output_of(process: subprocess.Popen[str]) -> tuple[str, str]:
     return output, log
 
 
-def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_path: Path) -> None:
+def test_listen_follows_a_session_from_its_start_to_its_end(
+    system: System, client: Client, tmp_path: Path
+) -> None:
     recorded = tmp_path / "face.fap"
     waits = "waiting for session heard to open, as with kouxing speak my.wav --session heard"
     recorder = start_listening(system.control, "heard", "--output", recorded, first_message=waits)
     printer = start_listening(system.control, "heard", "--as", "syllables", first_message=waits)
-    with (
-        Client(system.control) as client,
-        client.open_session("heard", encoding="f32le", paced=False) as session,
-    ):
+    with client.open_session("heard", encoding="f32le", paced=False) as session:
         for listener in (recorder, printer):
             assert listener.stderr is not None
             assert listener.stderr.readline() == "following session heard\n"
@@ -103,8 +101,8 @@ def test_listen_follows_a_session_from_its_start_to_its_end(system: System, tmp_
     assert {*spoken} & {"a", "e", "yi", "wu", "yu"}
 
 
-def test_listen_without_a_name_follows_the_newest_session(system: System) -> None:
-    with Client(system.control) as client, client.open_session("older"):
+def test_listen_without_a_name_follows_the_newest_session(system: System, client: Client) -> None:
+    with client.open_session("older"):
         newer = client.open_session("newer")
         listener = start_listening(
             system.control, "--as", "phones", first_message="following session newer"
@@ -114,7 +112,7 @@ def test_listen_without_a_name_follows_the_newest_session(system: System) -> Non
 
 
 def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
-    system: System, command: CommandRunner
+    system: System, client: Client, command: CommandRunner
 ) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
         program.bind(("127.0.0.1", 0))
@@ -141,10 +139,7 @@ def test_send_sends_the_face_at_rest_and_every_session_of_a_name(
         while weight("mouthSmileLeft") > 0.01:
             pass
         for _ in range(2):
-            with (
-                Client(system.control) as client,
-                client.open_session("sent", encoding="f32le", paced=False) as session,
-            ):
+            with client.open_session("sent", encoding="f32le", paced=False) as session:
                 assert sender.stderr.readline() == "following session sent\n"
                 session.push(samples_of_file(SENTENCE))
                 session.finish()
@@ -180,9 +175,9 @@ def test_wrong_arguments_are_rejected(
     assert len(message.splitlines()) == 1
 
 
-def test_express_changes_the_face(system: System, command: CommandRunner) -> None:
+def test_express_changes_the_face(client: Client, command: CommandRunner) -> None:
     corner = FAP_NUMBER["raise_l_cornerlip"] - 1
-    with Client(system.control) as client, client.open_session("smiling") as session:
+    with client.open_session("smiling") as session:
         faces = session.results(FapFrame, keep_all=True)
 
         def wait_for_lip_corner(low: float, high: float) -> None:
@@ -277,38 +272,41 @@ def test_progress_appears_before_slow_modules_are_imported(command: str) -> None
     assert started.communicate(timeout=LIMIT_S)[1] == "loading []\n"
 
 
-def test_standard_output_may_be_closed() -> None:
-    command = shlex.join((sys.executable, "-m", "kouxing", "config"))
-    done = subprocess.run(
-        ["sh", "-c", f"{command} >&-"], cwd=ROOT, stderr=subprocess.PIPE, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
-
-
-def test_standard_input_may_be_closed() -> None:
-    command = shlex.join((sys.executable, "-m", "kouxing", "phones", "-"))
-    done = subprocess.run(
-        ["sh", "-c", f"{command} <&-"], cwd=ROOT, stderr=subprocess.PIPE, check=False
-    )
-    assert (done.returncode, b"no audio arrived" in done.stderr) == (2, True)
-
-
+KOUXING = [sys.executable, "-m", "kouxing"]
 RHUBARB = [sys.executable, "-c", "from kouxing.services.cli.rhubarb import main; main()"]
 
 
-def test_rhubarb_reports_a_closed_input_and_a_full_output() -> None:
-    run = partial(subprocess.run, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
-    done = run(["sh", "-c", f"{shlex.join([*RHUBARB, '-'])} <&-"])
-    assert (done.returncode, "no audio arrived" in done.stderr) == (1, True)
+@pytest.mark.parametrize(
+    ("command", "closing", "status", "message"),
+    [
+        ([*KOUXING, "config"], ">&-", 0, ""),
+        ([*KOUXING, "phones", "-"], "<&-", 2, "no audio arrived"),
+        ([*RHUBARB, "-"], "<&-", 1, "no audio arrived"),
+    ],
+)
+def test_standard_input_and_output_may_be_closed(
+    command: list[str], closing: str, status: int, message: str
+) -> None:
+    run = ["sh", "-c", f"{shlex.join(command)} {closing}"]
+    done = subprocess.run(run, cwd=ROOT, stderr=subprocess.PIPE, check=False, text=True)
+    assert done.returncode == status
+    assert message in done.stderr
+    assert bool(done.stderr) == bool(message)
+
+
+def test_rhubarb_reports_a_full_output() -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123 (a device)
-        done = run([*RHUBARB, "-q", str(VOWELS_FILE)], stdout=full)
+        command = [*RHUBARB, "-q", str(VOWELS_FILE)]
+        done = subprocess.run(
+            command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, check=False, text=True
+        )
     error = "cannot write standard output: the disk is full; free some space\n"
     assert (done.returncode, done.stderr) == (1, error)
 
 
 def test_an_error_keeps_its_status_if_its_log_is_full() -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123 (a device)
-        command = [sys.executable, "-m", "kouxing", "phones", "missing.wav"]
+        command = [*KOUXING, "phones", "missing.wav"]
         assert subprocess.run(command, cwd=ROOT, stderr=full, check=False).returncode == 2
 
 
@@ -338,7 +336,7 @@ def test_a_refused_overwrite_gives_one_line(tmp_path: Path) -> None:
     output = tmp_path / "my.glb"
     output.write_text("mine")
     terminal, other_end = os.openpty()
-    command = [sys.executable, "-m", "kouxing", "head", "export", str(output)]
+    command = [*KOUXING, "head", "export", str(output)]
     process = subprocess.Popen(
         command, cwd=ROOT, stdin=other_end, stdout=other_end, stderr=other_end
     )

@@ -77,11 +77,8 @@ def test_the_sound_is_the_audio_that_was_sent(streamed: StreamedSession) -> None
     np.testing.assert_allclose(sound / 32768, SENTENCE, atol=1e-4)
 
 
-def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
-    with (
-        Client(system.control) as client,
-        client.open_session(encoding="f32le", paced=False) as session,
-    ):
+def test_a_flush_returns_to_rest_within_150_ms(client: Client) -> None:
+    with client.open_session(encoding="f32le", paced=False) as session:
         streamed = StreamedSession(session)
         streamed.send(SENTENCE[:24000], chunk=8000)
         streamed.collect_until(lambda: streamed.times[-1:] >= [24000 - DELAY])
@@ -95,11 +92,8 @@ def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
     assert max(map(opening, after[8:])) < 1, "150 ms are 7.5 frames"
 
 
-def test_a_flush_also_drops_audio_that_is_still_queued(system: System) -> None:
-    with (
-        Client(system.control) as client,
-        client.open_session(encoding="f32le", paced=False) as session,
-    ):
+def test_a_flush_also_drops_audio_that_is_still_queued(client: Client) -> None:
+    with client.open_session(encoding="f32le", paced=False) as session:
         streamed = StreamedSession(session)
         session.push(np.tile(SENTENCE, 20))  # more than the recognizer decodes before the flush
         flushed = session.media_time

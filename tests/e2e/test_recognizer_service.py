@@ -120,6 +120,17 @@ def test_drops_audio_that_arrives_after_its_flush(service: Recognizer) -> None:
     assert session.audio.media_time == 3 * 640
 
 
+def test_hears_a_repeated_message_once_and_acknowledges_it_again(service: Recognizer) -> None:
+    service.start_session(UNPACED)
+    session = service._sessions["s"]
+    for number in range(2):
+        session.acknowledge_due_s = None
+        service.receive(replace(chunk(number, 640), sequence=1, acknowledge=True))
+        assert session.acknowledge_due_s is not None
+    service.decode_all()
+    assert session.stream.next_media_time == 640
+
+
 @pytest.mark.parametrize("paced", [False, True])
 def test_a_flush_drops_audio_that_is_not_decoded(service: Recognizer, paced: bool) -> None:
     service.start_session(with_opening(UNPACED, paced=paced))

@@ -106,21 +106,6 @@ def test_reports_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     assert "start kouxing in a folder that you can write to" in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (["--play", "nowhere.wav"], "no such file"),
-        (["--set", "recognizer.acustic=gmm"], "recognizer.acoustic"),
-    ],
-)
-def test_reports_a_mistake_before_anything_starts(
-    command: CommandRunner, arguments: list[str], word: str
-) -> None:
-    status, _, log = command("run", *arguments)
-    assert (status, log.startswith("kouxing: ")) == (2, True), log
-    assert word in log
-
-
 def test_names_the_option_of_a_port_that_is_taken(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = str(other.getsockname()[1])
