@@ -4,7 +4,6 @@ The other end is the product's own, so it checks what the package sends.
 """
 
 import asyncio
-import os
 import socket
 import threading
 from array import array
@@ -33,7 +32,7 @@ from kouxing_client import (
 )
 from kouxing_client import client as blocking
 from kouxing_client.base import MAX_UNREAD_RESULTS
-from kouxing_client.messages import EndOfFaps, Event
+from kouxing_client.messages import EndOfFaps
 
 from kouxing.shared.settings.keys import add_key, load_user_key
 from kouxing.shared.wire.face import SetFace
@@ -73,16 +72,6 @@ def test_the_client_finds_the_key_that_commands_use(
     assert find_key() == type(find_key())(key.public, key.secret, key.control)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     with pytest.raises(KouxingError, match="kouxing keys add"):
-        Client()
-    (tmp_path / "kouxing").mkdir()
-    path = tmp_path / "kouxing" / "client.key"
-    for text in ('{"public": "short"}', "[" * 100_000):
-        path.write_text(text)
-        with pytest.raises(KouxingError, match="is not a valid key file"):
-            Client()
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(KouxingError, match="is not a valid key file"):
         Client()
 
 
@@ -194,12 +183,6 @@ def test_audio_after_its_end_is_refused(client: Client) -> None:
             push(CHUNK)
 
 
-def test_refuses_an_array_with_another_number_of_channels(client: Client) -> None:
-    session = client.open_session("s")
-    with pytest.raises(KouxingError, match="num_channels=1"):
-        session.push(np.zeros((1600, 2), np.int16))
-
-
 def test_a_key_may_be_a_path(control: FakeControl, tmp_path: Path) -> None:
     add_key("laptop", ["client"], tmp_path / "laptop.key")
     for path in (tmp_path / "laptop.key", str(tmp_path / "laptop.key")):
@@ -295,17 +278,6 @@ def test_a_new_subscriber_receives_what_the_publisher_repeats(
     assert [next(frames).sequence for _ in range(2)] == [1, 2]
 
 
-def test_a_session_that_control_closes_ends(control: FakeControl, client: Client) -> None:
-    session = client.open_session("s")
-    events, frames = session.events(), session.frames()
-    closed = Event(session="s", name="session-closed", detail="idle")
-    while (event := events.get(0.05)) is None:  # until the subscription is in effect
-        control.publish(control.events, closed)
-    assert (event.name, event.detail) == ("session-closed", "idle")
-    with pytest.raises(KouxingError, match="control has closed the session: idle"):
-        list(frames)
-
-
 def test_a_closed_client_reports_that_it_is_closed(client: Client) -> None:
     session = client.open_session("s")
     client.close()
@@ -343,6 +315,8 @@ def test_values_of_numpy_do_not_end_the_client(control: FakeControl, client: Cli
     session = client.open_session("s")
     with pytest.raises(TypeError, match="numpy"):
         session.set_face(expressiveness=np.float32(1.5))  # type: ignore[arg-type]
+    with pytest.raises(KouxingError, match="num_channels=1"):
+        session.push(np.zeros((1600, 2), np.int16))
     session.skip(np.int64(1600))  # type: ignore[arg-type]
     session.push(CHUNK)
     assert session.media_time == 1600 + len(CHUNK) // 2
@@ -424,28 +398,16 @@ def test_the_asyncio_client_opens_follows_and_closes_a_session(control: FakeCont
     assert asyncio.run(run()) == [float(message.sequence) for message in published]
 
 
-@pytest.mark.parametrize(
-    ("host", "is_listening", "reason"),
-    [
-        ("no-such-host.invalid", True, "the host name 'no-such-host.invalid' is unknown"),
-        ("127.0.0.1", True, "another program answers there"),
-        ("127.0.0.1", False, "nothing listens there"),
-    ],
-)
-def test_the_client_reports_why_control_does_not_answer(
-    host: str, *, is_listening: bool, reason: str
-) -> None:
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        if is_listening:
-            other.listen()
-        control = f"tcp://{host}:{other.getsockname()[1]}"
+def test_the_client_reports_why_control_does_not_answer() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        control = f"tcp://127.0.0.1:{other.getsockname()[1]}"
         with (
             Client(control, insecure=True, timeout_s=0.1) as client,
-            pytest.raises(KouxingError, match=reason) as failure,
+            pytest.raises(KouxingError) as failure,
         ):
             client.status()
-    assert str(failure.value).startswith(f"control at {control} does not answer: ")
+    reason = f"control at {control} does not answer: another program answers there"
+    assert str(failure.value).startswith(reason)
 
 
 def test_a_session_disconnects_though_control_does_not_answer(

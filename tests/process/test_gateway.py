@@ -175,8 +175,6 @@ async def test_a_viewer_sets_the_expressions_of_its_face(
         assert "no session is shown" in (await receive_json(viewer, "error"))["text"]
         control.start("seen")
         await receive_json(viewer, "session", session="seen")
-        await viewer.send_json({"expressions": {"glee": 0.5}})
-        assert "use joy, sadness," in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"expressions": {"joy": 0.5, "squint": 1}, "hold_s": 7})
         await viewer.send_json({"expressions": {}})
         await viewer.send_json({"expressiveness": 2})
@@ -297,14 +295,8 @@ async def test_a_microphone_continues_after_a_bad_command(
     async with open_websockets(gateway.page, "microphone") as (microphone,):
         await microphone.send_json({"sample_rate_hz": 16000})
         await receive_json(microphone, "opened")
-        for command, reason in (
-            ("{", "expected a JSON object"),
-            ('{"lip_model": 1}', "lip_model is 1; it must be"),
-            ('{"expressions": {"glee": 1}}', "glee"),
-            ('{"skip": -1}', "skip must be"),
-        ):
-            await microphone.send_str(command)
-            assert reason in (await receive_json(microphone, "error"))["text"]
+        await microphone.send_str("{")
+        assert "expected a JSON object" in (await receive_json(microphone, "error"))["text"]
         control.refuse = True
         await microphone.send_json({"expressions": {"joy": 1}, "last": True})
         assert (await receive_json(microphone, "error"))["text"] == "start one"
@@ -332,8 +324,6 @@ async def test_microphone_and_sample_choose_their_lips(
         for lips in ("learned", "dynamic-visemes"):
             await microphone.send_json({"lip_model": lips})
             await receive_json(viewer, "face", lip_model=lips)
-        await viewer.send_json({"play": "sample", "lip_model": 1})
-        assert "lip_model is 1; it must be" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"lip_model": "learned"})
         assert "only for the sample sentence" in (await receive_json(viewer, "error"))["text"]
         await viewer.send_json({"play": "sample", "lip_model": "learned"})

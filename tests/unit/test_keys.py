@@ -93,12 +93,15 @@ def test_a_key_is_z85_in_every_program(text: str) -> None:
         load_user_key()
 
 
-def test_a_folder_is_not_a_key_and_is_closed(tmp_path: Path) -> None:
+def test_a_folder_and_a_pipe_are_no_keys_and_are_closed(tmp_path: Path) -> None:
     def next_descriptor() -> int:
         with tmp_path.joinpath("file").open("w") as file:
             return file.fileno()
 
     free = next_descriptor()
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(KouxingError, match="is not a valid key file"):
+        read_key(tmp_path / "pipe")
     with pytest.raises(KouxingError, match="Is a directory"):
         read_key(tmp_path)
     assert next_descriptor() == free
