@@ -207,7 +207,6 @@ class RecognizerService(SessionService):
             self._free_memory_at_s = math.inf
             trim_heap()
         self._report_stalled(now_s)
-        blocked = set()
         for session in self._sessions.values():
             session.acknowledge_if_due(now_s)
             self.metrics.count("resent", session.link.tick(now_s))
@@ -216,11 +215,11 @@ class RecognizerService(SessionService):
                 self.warn(ErrorCode.NO_LINK, text, session.name)
                 self.publish_event(EventName.ERROR, session.start, f"{ErrorCode.NO_LINK}: {text}")
             self.report_skipped(session.start, session.audio.skip_policy.take_report_s(now_s))
-            if session.link.is_full:
-                blocked.add(session.is_paced)
-        self._is_live_blocked = True in blocked or self._live_queued_s > MAX_QUEUED_S
+        full = [session for session in self._sessions.values() if session.link.is_full]
+        is_live_full = any(session.is_paced for session in full)
+        self._is_live_blocked = is_live_full or self._live_queued_s > MAX_QUEUED_S
         self.pause(self._audio, paused=self._is_live_blocked)
-        self._unpaced.is_blocked = False in blocked
+        self._unpaced.is_blocked = not all(session.is_paced for session in full)
         self._unpaced.limit_reading()
         return now_s + SESSION_TICK_S if self._sessions else self._free_memory_at_s
 
@@ -247,15 +246,16 @@ class RecognizerService(SessionService):
 
     def session_progress(self) -> dict[str, SessionProgress]:
         """Return the input progress of each session."""
-        read_s = {True: time.monotonic(), False: self._unpaced.last_read_s}  # by paced
-        return {
-            name: SessionProgress(
-                idle_s=max(0.0, read_s[session.is_paced] - session.last_audio_s),
+        now_s = time.monotonic()
+        progress = {}
+        for name, session in self._sessions.items():
+            read_s = now_s if session.is_paced else self._unpaced.last_read_s
+            progress[name] = SessionProgress(
+                idle_s=max(0.0, read_s - session.last_audio_s),
                 last_droppable_sequence=session.replay_window.last_droppable_sequence,
                 skipped_s=session.audio.skip_policy.skipped_s,
             )
-            for name, session in self._sessions.items()
-        }
+        return progress
 
     def gauges(self) -> dict[str, float]:
         """Return gauges of queued audio, unacknowledged messages and the light model."""

@@ -37,7 +37,7 @@ from kouxing.shared.phones import events
 from kouxing.shared.phones.events import AudioSkipped, EndOfSound, LipPositions, Phone, SpeechChange
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.service.message_loop import MAX_TURN_S
-from kouxing.shared.service.overload import CATCH_UP_S, MAX_LATE_FOR_S
+from kouxing.shared.service.overload import CATCH_UP_S, GRACE_PERIOD_S
 from kouxing.shared.service.session_service import SessionService
 from kouxing.shared.settings.endpoints import key_of
 from kouxing.shared.wire.control import EventName, SessionProgress, StartSession
@@ -225,7 +225,7 @@ class SynthesizerService(SessionService):
             time_s = to_seconds(message.media_time)
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
         if message.epoch > 1:
-            session.skip_policy.restart(time.monotonic() + CATCH_UP_S)
+            session.skip_policy.postpone(time.monotonic() + CATCH_UP_S)
         session.input_epoch = message.epoch
 
     def _accept(self, message: SpeechMessage, sender: Peer) -> SynthesizerSession | None:
@@ -261,9 +261,9 @@ class SynthesizerService(SessionService):
         now_s = time.monotonic()
         if isinstance(event, events.Progress | AudioSkipped):
             duration_s = max(0.0, event.time_s - session.newest_event_s)
-            session.skip_policy.add(duration_s, now_s, has_waiting=len(session.events) > 1)
+            session.skip_policy.add(duration_s, now_s, has_queued=len(session.events) > 1)
             session.newest_event_s = max(session.newest_event_s, event.time_s)
-        if session.is_paced and session.skip_policy.is_late(now_s, for_s=MAX_LATE_FOR_S):
+        if session.is_paced and session.skip_policy.is_late(now_s, by_s=GRACE_PERIOD_S):
             return  # newer events may have arrived
         if len(session.events) == 1:
             self._make_frames(session)

@@ -87,7 +87,7 @@ class Service(MessageLoop):
         self._hand_over_end_s = 0.0
         self._last_tick_s = self._tick_due_s = 0.0
         self._heartbeat_due_s = time.monotonic()
-        self._num_reported = 0  # sessions in earlier heartbeats
+        self._next_reported = 0  # index of the first session in the next heartbeat
         self._snapshot: dict[str, float] = {}  # newest rates and percentiles
         self._snapshot_due_s = -math.inf
         self._sent_ns = self._replied_ns = 0  # newest heartbeat, newest heartbeat with a reply
@@ -339,12 +339,12 @@ class Service(MessageLoop):
         if self.kind.role != "worker" or len(sessions) <= SESSIONS_PER_HEARTBEAT:
             return sessions
         names = list(sessions)
-        start = self._num_reported % len(names)
-        self._num_reported = start + SESSIONS_PER_HEARTBEAT
-        return {name: sessions[name] for name in (names + names)[start : self._num_reported]}
+        start = self._next_reported % len(names)
+        self._next_reported = start + SESSIONS_PER_HEARTBEAT
+        return {name: sessions[name] for name in (names + names)[start : self._next_reported]}
 
     def _check_replies(self, now_s: float) -> None:
-        """Start to look for the reason if control does not reply."""
+        """If control does not reply, reconnect if necessary, and look for the reason."""
         if self.control is not None and now_s - self._last_reply_s > NO_REPLY_S:
             self._last_reply_s = now_s
             if not self.control.can_send:  # another program was at the address, or other keys

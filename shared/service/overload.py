@@ -20,38 +20,38 @@ import math
 SLOWDOWN_FRACTION = 0.5  # fraction of the limit above which the block network runs less often
 LIGHT_MODEL_FRACTION = 0.75  # fraction of the limit above which a session uses the light model
 LIGHT_MODEL_HOLD_S = 2.0  # how long a session that is on time again keeps the light model
-MAX_LATE_FOR_S = 0.4  # maximum time for which a session may exceed its limit
+GRACE_PERIOD_S = 0.4  # time for which a session may exceed its limit
 REPORT_INTERVAL_S = 1.0  # interval between reports about one session
 CATCH_UP_S = 1.5  # time for which a moved session skips nothing
-ADAPTATION = 0.1  # fraction of the lateness to ignore if the newest audio is just as late
+ADAPTATION = 0.1  # fraction of the lateness that each call of ``adapt`` removes
 
 
 class SkipPolicy:
     """Decides when one live session skips audio. Times are in seconds, on any monotonic clock.
 
-    ``max_lag_s`` is the maximum delay of the session. It may be exceeded for ``MAX_LATE_FOR_S``.
-    From ``start_s`` on, the session may skip audio. A moved session first catches up.
+    ``max_lag_s`` is the maximum delay of the session. It may be exceeded for ``GRACE_PERIOD_S``.
+    The session skips nothing before ``start_s``, so that a moved session can catch up.
     """
 
     def __init__(self, max_lag_s: float, start_s: float = -math.inf) -> None:
         self.skipped_s = 0.0  # duration of the audio that was skipped
         self._max_lag_s = max_lag_s
-        self._start_s = start_s
+        self._start_s = start_s  # nothing is skipped before this time
         self._due_s: float | None = None  # when the newest audio was due; None: on arrival
         self._late_since_s = math.inf  # when the session exceeded its limit
-        self.is_behind = False  # far enough to run the block network less often
+        self.is_behind = False  # whether the block network must run less often
         self._light_until_s = -math.inf  # end of the use of the light model
         self._reported_s = 0.0  # the part of ``skipped_s`` that was reported
         self._report_due_s = -math.inf
 
-    def add(self, duration_s: float, now_s: float, *, has_waiting: bool) -> None:
+    def add(self, duration_s: float, now_s: float, *, has_queued: bool) -> None:
         """Record that audio has arrived, and whether other audio is queued before it."""
         due_s = now_s if self._due_s is None else self._due_s + duration_s
         if now_s < self._start_s:
             due_s = now_s
-        self._due_s = due_s if has_waiting else min(due_s, now_s)
+        self._due_s = due_s if has_queued else min(due_s, now_s)
 
-    def restart(self, start_s: float) -> None:
+    def postpone(self, start_s: float) -> None:
         """Skip nothing until ``start_s``, because the session has moved."""
         self._start_s = start_s
 
@@ -59,9 +59,9 @@ class SkipPolicy:
         """Record that the sender was silent. Its next audio is due on arrival."""
         self._due_s = None
 
-    def is_late(self, now_s: float, *, for_s: float = 0.0) -> bool:
-        """Return whether the newest audio exceeds the limit by more than ``for_s``."""
-        return self._late_s(0.0, now_s) > self._max_lag_s + for_s
+    def is_late(self, now_s: float, *, by_s: float = 0.0) -> bool:
+        """Return whether the newest audio exceeds the limit by more than ``by_s``."""
+        return self._late_s(0.0, now_s) > self._max_lag_s + by_s
 
     def adapt(self, now_s: float) -> None:
         """Record that no newer audio was found, so the newest audio may be on time."""
@@ -86,7 +86,7 @@ class SkipPolicy:
         else:  # after a stop of this process, the session has been late for some time
             since_s = now_s - (late_s - self._max_lag_s)
             self._late_since_s = min(since_s, self._late_since_s)
-        if now_s - self._late_since_s <= MAX_LATE_FOR_S:
+        if now_s - self._late_since_s <= GRACE_PERIOD_S:
             return False
         self._late_since_s = math.inf
         self.skipped_s += waiting_s

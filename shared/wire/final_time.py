@@ -5,7 +5,7 @@ from kouxing_client.messages import Message, Phone, Speech
 from kouxing.shared.clock import to_samples
 from kouxing.shared.wire.speech import AudioState, Progress
 
-QUIET = to_samples(0.5)  # speech is reported within this time after the onset of its first phone
+MAX_REPORT_DELAY_SAMPLES = to_samples(0.5)  # from the onset of a first phone to its ``speech``
 
 
 class FinalTimeTracker:
@@ -25,5 +25,5 @@ class FinalTimeTracker:
             case Phone(final=True):
                 final_until = message.media_time + message.duration
             case Progress(state=AudioState.RUNNING) if not self._is_speaking:
-                final_until = message.media_time - QUIET
+                final_until = message.media_time - MAX_REPORT_DELAY_SAMPLES
         self.media_time = max(self.media_time, final_until)

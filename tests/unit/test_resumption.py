@@ -18,7 +18,7 @@ from kouxing.services.recognizer.sessions.resumption import (
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.phones.events import Phone, SpeechChange, Waveform
 from kouxing.shared.wire.events import event_to_message
-from kouxing.shared.wire.final_time import QUIET, FinalTimeTracker
+from kouxing.shared.wire.final_time import MAX_REPORT_DELAY_SAMPLES, FinalTimeTracker
 from kouxing.shared.wire.speech import AudioState, Progress
 from tests import lips
 from tests.live_streams import LiveStream
@@ -133,8 +133,8 @@ def test_aligns_the_first_audio_with_the_grid() -> None:
 
 RESULTS_AND_FINAL_TIMES: list[tuple[Message, int]] = [
     (Progress(media_time=3200), 0),
-    (Progress(media_time=32_000), 32_000 - QUIET),
-    (Progress(media_time=40_000, state=AudioState.SKIPPED), 32_000 - QUIET),
+    (Progress(media_time=32_000), 32_000 - MAX_REPORT_DELAY_SAMPLES),
+    (Progress(media_time=40_000, state=AudioState.SKIPPED), 32_000 - MAX_REPORT_DELAY_SAMPLES),
     (Speech(active=True, media_time=30_400), 30_400),
     (Progress(media_time=48_000), 30_400),
     (event_to_message(phone(0, 2.0, 0.25)), 36_000),

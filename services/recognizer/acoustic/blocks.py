@@ -115,11 +115,11 @@ class BlockModel(NetworkModel):
         return [stream.take_settled_scores() for stream in streams]
 
     def _run(self, blocks: Sequence[tuple[BlockStream, Block]]) -> None:
-        log_posteriors, states, new = self.runner.run([block for _, block in blocks])
+        log_posteriors, states, new_cache = self.runner.run([block for _, block in blocks])
         scores = self.compute_scores(log_posteriors)
         # copies: a view would keep the whole batch
         for row, (stream, block) in enumerate(blocks):
-            stream.append_outputs(block, scores[row].copy(), states[row].copy(), new[row])
+            stream.append_outputs(block, scores[row].copy(), states[row].copy(), new_cache[row])
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,9 +173,9 @@ class BlockRunner:
         self._last_kept = [name for name in names if name.encode() in content]
         axes = {_NUM_KEPT: 1, **dict.fromkeys(self._last_kept, 0)}
         self._session = open_onnx_session(file, encode_integer_inputs(axes))
-        self.sizes, self._first_state = _sizes_of(self._session)
+        self.sizes, self._unused_state_width = _read_sizes(self._session)
         self._names = cache_names(self.sizes.layers)
-        prefix = EXTENSION_PREFIX if self._first_state else ""
+        prefix = EXTENSION_PREFIX if self._unused_state_width else ""
         self._state = f"{prefix}state"
         self._outputs = [f"{prefix}{name}" for name in _OUTPUTS[:2]] + _OUTPUTS[2:]
         unused = np.zeros((self.sizes.length, self.sizes.width), np.float32)
@@ -206,12 +206,12 @@ class BlockRunner:
         if len(blocks) > 1:
             rings = np.stack([block.past.rings for block in blocks], axis=1)
         inputs |= zip(self._names, rings, strict=True)
-        if self._first_state:  # the unused readout also needs a state
-            inputs["state"] = np.zeros((len(blocks), self._first_state), np.float32)
+        if self._unused_state_width:  # the unused readout also needs a state
+            inputs["state"] = np.zeros((len(blocks), self._unused_state_width), np.float32)
         start_s = time.thread_time()
-        log_posteriors, state, new = run_onnx_session(self._session, self._outputs, inputs)
+        log_posteriors, state, new_cache = run_onnx_session(self._session, self._outputs, inputs)
         BlockRunner.total_run_s += time.thread_time() - start_s
-        return log_posteriors, state, new
+        return log_posteriors, state, new_cache
 
 
 class BlockStream(AcousticStream):
@@ -236,10 +236,10 @@ class BlockStream(AcousticStream):
         self._num_settled = 0
         self._loudest = np.float32(-np.inf)  # band of the segment
         self._frames = np.zeros((_PADDING, NUM_MELS), np.float32)  # starts with the next block
-        self._ended = False
-        self._start_table()
+        self._has_ended = False
+        self._restart_positions()
 
-    def _start_table(self) -> None:
+    def _restart_positions(self) -> None:
         """Start at the first row of the table of positions, with an empty past."""
         self._row = 0  # table row of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
@@ -252,7 +252,7 @@ class BlockStream(AcousticStream):
     def append_frames(self, frames: Floats | None) -> None:
         """Append frames, (n, 80); None, the end of the segment, repeats the last frame."""
         if frames is None:
-            self._ended = True
+            self._has_ended = True
             num_more = _RIGHT_CONTEXT_FRAMES - (self._num_frames - 1) % FRAMES_PER_ENCODER_FRAME
             frames = np.repeat(self._frames[-1:], num_more if self._num_frames else 0, axis=0)
         elif len(frames):
@@ -266,7 +266,7 @@ class BlockStream(AcousticStream):
     def is_due(self) -> bool:
         """Whether the network must run."""
         num_encoder_frames = self._num_encoder_frames
-        return num_encoder_frames >= self._num_due or (self._ended and num_encoder_frames > 0)
+        return num_encoder_frames >= self._num_due or (self._has_ended and num_encoder_frames > 0)
 
     def is_due_after(self, num_frames: int) -> bool:
         """Return whether the network must run after this number of additional frames."""
@@ -294,7 +294,7 @@ class BlockStream(AcousticStream):
             num_more = min(num_complete, max_encoder_frames) - num_encoder_frames
             num_encoder_frames += num_more // sizes.block * sizes.block
         is_last = self._row + num_encoder_frames == MAX_POSITIONS or (
-            self._ended and num_encoder_frames == num_complete
+            self._has_ended and num_encoder_frames == num_complete
         )
         num_kept = 0 if is_last else max(0, num_encoder_frames + self._hop - sizes.length)
         return Block(
@@ -306,7 +306,9 @@ class BlockStream(AcousticStream):
             past=self._past,
         )
 
-    def append_outputs(self, block: Block, scores: Floats, state: Floats, new: Float16) -> None:
+    def append_outputs(
+        self, block: Block, scores: Floats, state: Floats, new_cache: Float16
+    ) -> None:
         """Append a block's scores, new state, keys and values; shapes as in ``BlockRunner.run``."""
         past = self._sizes.past
         end = FRAMES_PER_ENCODER_FRAME * block.num_settled
@@ -314,11 +316,11 @@ class BlockStream(AcousticStream):
         self.provisional = scores[end : FRAMES_PER_ENCODER_FRAME * block.num_encoder_frames]
         self._frames = self._frames[end:]
         if block.num_settled > block.num_kept:
-            self._start_table()
+            self._restart_positions()
             return
         if block.num_kept:
             slots = np.arange(self._row, self._row + block.num_kept) % past
-            self._rings[:, :, slots] = new
+            self._rings[:, :, slots] = new_cache
             self._past.num_cached = min(self._past.num_cached + block.num_kept, past)
             self._past.state = state
             self._row += block.num_kept
@@ -330,13 +332,13 @@ class BlockStream(AcousticStream):
         rows = np.concatenate([self._empty_scores, *self._settled])
         self._settled = []
         self._num_settled += len(rows)
-        if self._ended:
+        if self._has_ended:
             rows = rows[: len(rows) - (self._num_settled - self._num_frames)]
             self.reset()
         return rows
 
 
-def _sizes_of(session: Any) -> tuple[BlockSizes, int]:
+def _read_sizes(session: Any) -> tuple[BlockSizes, int]:
     """Read a network's sizes from its inputs and outputs; a run checks the other shapes.
 
     Also returns the width of the first readout's state if a second readout is used, otherwise 0.
@@ -403,6 +405,8 @@ def build_block_model(archive: Archive, network: NDArray[np.uint8]) -> BlockMode
     # differs from the file's constant, to check that the input replaces it
     num_kept = sizes.block + 1
     outputs = model.runner.run([Block(frames, 0, sizes.length, num_kept, num_kept, past)])
-    new = (1, 2 * sizes.layers, sizes.heads, num_kept, sizes.head_size)
-    check_outputs(outputs, [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new])
+    cache_shape = (1, 2 * sizes.layers, sizes.heads, num_kept, sizes.head_size)
+    check_outputs(
+        outputs, [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), cache_shape]
+    )
     return model

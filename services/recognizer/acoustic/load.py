@@ -39,10 +39,14 @@ def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
     path = model_path(str(name))
     archive = read_archive(path)
     try:
-        form = str(archive.array("format", ()))
-        if form not in _READERS:
-            raise ValueError(f"its format is {form!r}, not {' or '.join(_READERS)}")
-        model = light.parse_light_model(archive) if name == "light" else _READERS[form](archive)
+        stored_format = str(archive.array("format", ()))
+        if stored_format not in _READERS:
+            raise ValueError(f"its format is {stored_format!r}, not {' or '.join(_READERS)}")
+        model = (
+            light.parse_light_model(archive)
+            if name == "light"
+            else _READERS[stored_format](archive)
+        )
     except ValueError as error:
         raise UserError(f"acoustic model {path}: {error}; train the model again") from error
     except UserError as error:

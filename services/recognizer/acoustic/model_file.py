@@ -65,7 +65,7 @@ def read_archive(path: Path) -> Archive:
 
 
 def load_component(
-    path: Path, form: str, name: str, build: Callable[[Archive], Component]
+    path: Path, expected_format: str, name: str, build: Callable[[Archive], Component]
 ) -> Component:
     """Read a component of the recognizer, such as the encoder; ``name`` appears in errors.
 
@@ -73,9 +73,9 @@ def load_component(
     """
     archive = read_archive(path)
     try:
-        stored_form = str(archive.array("format", ()))
-        if stored_form != form:
-            raise ValueError(f"it has the format {stored_form!r}, expected {form!r}")
+        stored_format = str(archive.array("format", ()))
+        if stored_format != expected_format:
+            raise ValueError(f"it has the format {stored_format!r}, expected {expected_format!r}")
         return build(archive)
     except ValueError as error:
         raise UserError(f"{name} {path}: {error}; train it again") from error

@@ -17,10 +17,10 @@ _SLICE_MS = 20.0
 _PITCH_STEP = 0.01  # ratio of neighboring pitches minus 1; half of Kaldi's takes twice the time
 # Kaldi's feature (1.0001 - NCCF)^0.15 - 1, doubled: the normalized cross-correlation is over 0.8
 _VOICED = -0.43
-# Kaldi's tracker keeps all its input, 250 kB a second. A new tracker replaces it after this number
-# of slices. The new tracker starts earlier, so that both agree.
-_REPLACE_AFTER = 80
-_START_BEFORE = 20
+# Kaldi's tracker keeps all its input, 250 kB a second, so a new tracker replaces it regularly. The
+# new tracker starts earlier, so that both agree.
+_REPLACE_AFTER_SLICES = 80
+_OVERLAP_SLICES = 20
 
 
 class PitchTracker:
@@ -54,13 +54,13 @@ class PitchTracker:
         The pitch is measured about 10 ms before the end.
         """
         scaled = (samples * FULL_SCALE).tolist()  # Kaldi expects 16-bit samples
-        if self._num_slices % _REPLACE_AFTER == _REPLACE_AFTER - _START_BEFORE:
+        if self._num_slices % _REPLACE_AFTER_SLICES == _REPLACE_AFTER_SLICES - _OVERLAP_SLICES:
             self._trackers.append(self._new_tracker())
         for tracker in self._trackers:
             tracker.accept_waveform(MEDIA_RATE_HZ, scaled)
         self._num_slices += 1
         older = self._trackers[0]
-        if self._num_slices % _REPLACE_AFTER == 0:
+        if self._num_slices % _REPLACE_AFTER_SLICES == 0:
             self._trackers = self._trackers[-1:]
         if older.num_frames_ready == 0:
             return 0.0

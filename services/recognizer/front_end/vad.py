@@ -20,7 +20,7 @@ the detection of speech (see :mod:`kouxing.services.recognizer.live.speech_segme
 from kouxing.services.recognizer.acoustic.encoder import VoiceKind
 from kouxing.shared.arrays import Floats
 
-_NO_EVIDENCE, _ENOUGH = 0.75, 0.12
+_NO_EVIDENCE, _ENOUGH = 0.75, 0.12  # d, and the evidence at which speech starts
 _IMPROBABLE = 0.3  # one weak syllable does not end the speech, only many such frames do
 _STOP_ENCODER_FRAMES = 25  # half a second: longer than a closure or a breath between phrases
 

@@ -6,7 +6,7 @@ recurrent unit).
 ======== ============================================================ ==================
 symbol   meaning                                                      shape
 ======== ============================================================ ==================
-f        an encoder frame: its two log-mel frames, and the encoder's        (160 + encoder's,)
+f        an encoder frame: its two log-mel frames, and the encoder's  (160 + encoder's,)
          features
 x        principal components of f                                    (components,)
 u        relu(U x + b_u)                                              (units,)
@@ -59,6 +59,7 @@ NUM_OUTPUTS = NUM_LIP_FAPS + 2
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
 _MAX_SIZE = 4096  # limit for the numbers of features, components and units
+# columns of the tracked FAPs, of those on one side, and of the same FAPs on the other side
 _COLUMNS, _ONES, _OTHERS = (
     np.array([MOUTH_FAPS.index(fap) for fap in faps])
     for faps in (LIP_FAPS, OTHER_SIDE, OTHER_SIDE.values())

@@ -104,7 +104,7 @@ class SpeechScorer:
         return self._stream.uses_encoder_phones
 
     def set_light_model(self, uses_light_model: bool) -> None:
-        """Use the light model, or the session's own model from the next start of speech on."""
+        """Switch to the light model now, or back at the next start of speech."""
         self._needs_light = uses_light_model
         if (
             not uses_light_model

@@ -77,7 +77,7 @@ class SpeechStream:
         return self._segments[-1].scorer.uses_light_model
 
     def set_light_model(self, uses_light_model: bool) -> None:
-        """Use the light model, or the session's own model from the next start of speech on.
+        """Switch to the light model now, or back at the next start of speech.
 
         All audio so far must be decoded.
         """
@@ -259,8 +259,8 @@ class _AudioSegment:
 
     def _queue(self, samples: Floats) -> None:
         self.scorer.add_event(Waveform(time_s=to_seconds(self.media_time), samples=samples))
-        for piece, progress in self._meter.accept_waveform(samples):
-            self.scorer.accept_waveform(piece, progress)
+        for chunk, progress in self._meter.accept_waveform(samples):
+            self.scorer.accept_waveform(chunk, progress)
 
     def decode(self) -> list[StreamOutput]:
         """Return the new results at the session's times, without lip positions before the audio."""

@@ -2,15 +2,15 @@
 
 A linear readout of the audio encoder's hidden layers, every 20 ms:
 
-======== ============================================================= ==============
-symbol   meaning                                                       shape, unit
-======== ============================================================= ==============
-h        state of the encoder's recurrent layers                           (state width,)
+======== ============================================================= ======================
+symbol   meaning                                                       shape
+======== ============================================================= ======================
+h        state of the encoder's recurrent layers                       (state width,)
 W, b     weights of the readout                                        (state width, 4), (4,)
 y        arousal and valence (-1 to 1), evidence of laughter and       (4,)
          of breath (0 to 1)
 m        mean of arousal and valence over the session's voice          (2,)
-======== ============================================================= ==============
+======== ============================================================= ======================
 
     y = W^T h + b
 

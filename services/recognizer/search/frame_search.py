@@ -44,7 +44,7 @@ class SearchState(NamedTuple):
 @numba.njit(cache=True, nogil=True)
 def advance_frames(
     frame: int,
-    observed: Floats,
+    scores: Floats,
     phones: NDArray[np.int32],
     confidence: Doubles,
     known_phone: int,
@@ -64,14 +64,14 @@ def advance_frames(
     num_done, token, state = 0, 0, 0
     for number in range(num_tokens):
         token_of[tokens.context[number]] = number
-    while num_done < len(observed) and num_records + len(tokens.context) <= len(records):
+    while num_done < len(scores) and num_records + len(tokens.context) <= len(records):
         num_tokens = _prune(num_tokens, tokens, token_of)
-        penalty = _phone_penalty(frame + num_done, observed[num_done], rate, hmms)
+        penalty = _phone_penalty(frame + num_done, scores[num_done], rate, hmms)
         num_tokens, num_records, entry, entry_link = _start_phones(
             frame + num_done, penalty, search, num_tokens, num_records, hmms, graph
         )
         token, state = _advance_states(
-            observed[num_done], num_tokens, tokens, entry, entry_link, hmms, graph
+            scores[num_done], num_tokens, tokens, entry, entry_link, hmms, graph
         )
         confidence[num_done] = _normalize_scores(token, state, num_tokens, tokens, records, graph)
         phones[num_done] = graph.last_phone[tokens.context[token]]
@@ -84,11 +84,11 @@ def advance_frames(
 
 
 @numba.njit(cache=True, nogil=True)
-def _phone_penalty(frame: int, observed: Floats, rate: Floats, hmms: Hmms) -> np.float32:
+def _phone_penalty(frame: int, frame_scores: Floats, rate: Floats, hmms: Hmms) -> np.float32:
     """Update the rate of change by a frame's scores; return the penalty of phones that start."""
     if hmms.rate_weight == 0.0:
         return hmms.phone_penalty
-    probabilities = np.exp(observed - observed.max())
+    probabilities = np.exp(frame_scores - frame_scores.max())
     total = probabilities.sum()
     overlap = np.float32(0.0)
     for phone in range(len(hmms.first_state) - 1):
@@ -202,7 +202,7 @@ def _look_up_phones(
 
 @numba.njit(cache=True, nogil=True)
 def _advance_states(
-    observed: Floats,
+    frame_scores: Floats,
     num_tokens: int,
     tokens: Tokens,
     entry: Floats,
@@ -227,7 +227,7 @@ def _advance_states(
                 moved, moved_link = entry[token], entry_link[token]
             if moved > value:
                 value, from_link = moved, moved_link
-            score[token, state] = max(value + observed[first + state], IMPOSSIBLE)
+            score[token, state] = max(value + frame_scores[first + state], IMPOSSIBLE)
             link[token, state] = from_link
             if score[token, state] > top[token]:
                 top[token] = score[token, state]

@@ -38,7 +38,7 @@ class AudioQueue:
         media_time, samples = chunk
         end = media_time + len(samples) * MEDIA_RATE_HZ // self._rate_hz
         duration_s = to_seconds(max(0, end - self._end))
-        self.skip_policy.add(duration_s, now_s, has_waiting=bool(self._chunks))
+        self.skip_policy.add(duration_s, now_s, has_queued=bool(self._chunks))
         self._end = end
         self._chunks.append(chunk)
         self._num_samples += len(samples)

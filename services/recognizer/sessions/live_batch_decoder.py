@@ -98,7 +98,7 @@ class LiveBatchDecoder:
                 self._load_meter.add((network_weight - 1.0) * (BlockRunner.total_run_s - network_s))
             else:
                 self._decode([session for session in group if not self._queue_for_network(session)])
-        self._network.start(now_s, saves_time=self._hop_controller.hop > 1)
+        self._network.start(now_s, may_wait=self._hop_controller.hop > 1)
         self._on_batch()
 
     def _decode(self, sessions: Sequence[RecognizerSession]) -> None:

@@ -38,15 +38,15 @@ class NetworkThread:
             self._due_since_s = self._due_since_s if self._due else now_s
             self._due.append(session)
 
-    def start(self, now_s: float, *, saves_time: bool = False) -> None:
+    def start(self, now_s: float, *, may_wait: bool = False) -> None:
         """Decode the accepted audio of waiting sessions, unless the thread is busy.
 
-        With ``saves_time``, wait for several sessions, because a shared run takes less time.
+        With ``may_wait``, wait a little for more sessions, because a shared run takes less time.
         """
         if self._job is not None or not self._due:
             return
         is_early = now_s < self._due_since_s + MAX_WAIT_S
-        if saves_time and is_early and len(self._due) < MAX_SESSIONS:
+        if may_wait and is_early and len(self._due) < MAX_SESSIONS:
             return
         self._batch, self._due = self._due[:MAX_SESSIONS], self._due[MAX_SESSIONS:]
         for session in self._batch:
