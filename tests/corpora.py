@@ -1,10 +1,13 @@
-"""Small corpora on disk."""
+"""Small corpora on disk, and training on them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
+import pytest
 import soundfile
 from numpy.typing import NDArray
 
@@ -39,3 +42,11 @@ def write_noises(folder: Path) -> Path:
     for kind in kinds:
         soundfile.write(folder / f"{kind}.wav", rng.normal(0, 0.1, 32_000), RATE_HZ)
     return folder
+
+
+def interrupt(recipe: ModuleType, writer: str, train: Callable[[], object]) -> None:
+    """Interrupt training when its recipe calls the function that writes the model."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recipe, writer, Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train()

@@ -4,6 +4,7 @@ import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,27 @@ class Mesh:
     texture: bytes = b""  # PNG
 
 
+def add_view(document: dict[str, Any], binary: bytearray, data: bytes) -> int:
+    """Append data to the binary chunk; return the number of its buffer view."""
+    place = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
+    document["bufferViews"].append(place)
+    binary += data + b"\0" * (-len(data) % 4)
+    document["buffers"] = [{"byteLength": len(binary)}]
+    return len(document["bufferViews"]) - 1
+
+
+def add_accessor(
+    document: dict[str, Any], binary: bytearray, array: NDArray[Any], kind: str, component: int
+) -> int:
+    """Append an accessor; return its number."""
+    view = add_view(document, binary, array.tobytes())
+    accessor = {"bufferView": view, "componentType": component, "type": kind, "count": len(array)}
+    if kind == "VEC3":
+        accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+    document["accessors"].append(accessor)
+    return len(document["accessors"]) - 1
+
+
 def write_glb(path: Path, meshes: list[Mesh], **rest: Any) -> Path:
     binary = bytearray()
     document: dict[str, Any] = {
@@ -51,20 +73,7 @@ def write_glb(path: Path, meshes: list[Mesh], **rest: Any) -> Path:
         **rest,
     }
 
-    def view(data: bytes) -> int:
-        document["bufferViews"].append(
-            {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
-        )
-        binary.extend(data + b"\0" * (-len(data) % 4))
-        return len(document["bufferViews"]) - 1
-
-    def accessor(array: NDArray[Any], kind: str, component: int) -> int:
-        entry = {"bufferView": view(array.tobytes()), "componentType": component, "type": kind}
-        if kind == "VEC3":
-            entry |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        document["accessors"].append(entry | {"count": len(array)})
-        return len(document["accessors"]) - 1
-
+    accessor = partial(add_accessor, document, binary)
     for mesh in meshes:
         attributes = {"POSITION": accessor(mesh.vertices.astype("<f4"), "VEC3", 5126)}
         if mesh.normals is not None:
@@ -75,9 +84,9 @@ def write_glb(path: Path, meshes: list[Mesh], **rest: Any) -> Path:
             attributes["COLOR_0"] = accessor(mesh.colors.astype("<f4"), "VEC3", 5126)
         surface: dict[str, Any] = {}
         if mesh.texture:
-            document.setdefault("images", []).append(
-                {"bufferView": view(mesh.texture), "mimeType": "image/png"}
-            )
+            view = add_view(document, binary, mesh.texture)
+            image = {"bufferView": view, "mimeType": "image/png"}
+            document.setdefault("images", []).append(image)
             document.setdefault("textures", []).append({"source": len(document["images"]) - 1})
             surface["baseColorTexture"] = {"index": len(document["textures"]) - 1}
         document["materials"].append({"pbrMetallicRoughness": surface})
@@ -95,7 +104,6 @@ def write_glb(path: Path, meshes: list[Mesh], **rest: Any) -> Path:
             entry["extras"] = {"targetNames": list(mesh.targets)}
         document["meshes"].append(entry)
         document["nodes"].append({"name": mesh.name, "mesh": len(document["meshes"]) - 1})
-    document["buffers"] = [{"byteLength": len(binary)}]
     write_chunks(path, document, binary)
     return path
 
@@ -176,20 +184,6 @@ def add_vrm(
         }
     extension = ("VRM", "VRMC_vrm")[version]
     document |= {"extensionsUsed": [extension], "extensions": {extension: about}}
-
-
-def add_accessor(
-    document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int
-) -> int:
-    """Append an accessor; return its number."""
-    place = {"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes}
-    document["bufferViews"].append(place)
-    view = len(document["bufferViews"]) - 1
-    accessor = {"bufferView": view, "componentType": component, "type": kind, "count": len(array)}
-    document["accessors"].append(accessor)
-    binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
-    document["buffers"][0]["byteLength"] = len(binary)
-    return len(document["accessors"]) - 1
 
 
 def add_skeleton(

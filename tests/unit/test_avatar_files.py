@@ -23,6 +23,7 @@ from kouxing.shared.face.shapes import ARKIT, OCULUS, VRM
 from tests.glb_writer import (
     TRANSFORMS,
     add_skeleton,
+    add_view,
     add_vrm,
     edit,
     read_chunks,
@@ -110,16 +111,16 @@ def sparse_shapes(document: dict[str, Any], binary: bytearray) -> None:
         for target in mesh["primitives"][0].get("targets", []):
             _, shifts = content(document, binary, target["POSITION"], "<f4")
             moved = np.flatnonzero(shifts.any(axis=1))
-            views = document["bufferViews"]
-            for data in (moved.astype("<u4").tobytes(), shifts[moved].tobytes()):
-                views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
-                binary += data
+            indices, values = (
+                {"bufferView": add_view(document, binary, array.tobytes())}
+                for array in (moved.astype("<u4"), shifts[moved])
+            )
             accessor = document["accessors"][target["POSITION"]]
             del accessor["bufferView"]
             accessor["sparse"] = {
                 "count": len(moved),
-                "indices": {"bufferView": len(views) - 2, "componentType": 5125},
-                "values": {"bufferView": len(views) - 1},
+                "indices": indices | {"componentType": 5125},
+                "values": values,
             }
 
 
@@ -151,12 +152,9 @@ def draco(document: dict[str, Any], binary: bytearray, **options: Any) -> None:
         del document["accessors"][number]["bufferView"]
     options = {"preserve_order": True, "quantization_bits": 16} | options
     encoded = DracoPy.encode(**arrays, **options)
-    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(encoded)}
-    document["bufferViews"].append(view)
-    binary += encoded + b"\0" * (-len(encoded) % 4)
     primitive["extensions"] = {
         "KHR_draco_mesh_compression": {
-            "bufferView": len(document["bufferViews"]) - 1,
+            "bufferView": add_view(document, binary, encoded),
             "attributes": {"POSITION": 0},
         }
     }

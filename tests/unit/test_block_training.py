@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from kouxing.training.networks.labels import STATES_PER_PHONE
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.training_set import load_examples
 from tests.block_networks import SMALL
-from tests.corpora import write_noises, write_speech
+from tests.corpora import interrupt, write_noises, write_speech
 from tests.system import HELLO
 from tests.whisper_folder import encoder_arrays, write_whisper
 
@@ -72,10 +71,7 @@ def test_trains_resumes_and_writes_model_and_card(
         sounds=[write_noises(tmp_path / "sounds")],
         any_license=False,
     )
-    with monkeypatch.context() as patch:
-        patch.setattr(recipe, "export_onnx", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            train(num_steps=2)
+    interrupt(recipe, "export_onnx", partial(train, num_steps=2))
     train(num_steps=3)
     assert "resuming after step 2" in capsys.readouterr().err
     model = load_model(output)

@@ -50,13 +50,6 @@ def test_an_added_command_runs_and_is_listed(added: list[str]) -> None:
     assert "wave" in result.output, "a suggestion"
 
 
-def test_the_options_of_render_are_in_panels() -> None:
-    printed = CliRunner().invoke(command_line.app, ["render", "--help"]).output
-    options, *panels = printed[printed.index("─ Options ─") :].split("╭─ ")
-    assert re.findall(r"│ (--\w+)", options) == ["--output", "--force", "--help"]
-    assert [panel.split()[0] for panel in panels] == ["Speech", "Lips", "Picture", "Curves"]
-
-
 @pytest.mark.parametrize("command", ["render", "lips", "listen", "phones", "speak"])
 def test_the_choices_of_an_option_are_not_broken_in_a_narrow_terminal(command: str) -> None:
     arguments = [command, "--help"]

@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from kouxing.training.encoder import batches, lip_teacher, recipe, targets, trai
 from kouxing.training.encoder.batches import BatchSource, draw_batch, draw_excerpts, network_inputs
 from kouxing.training.encoder.export import export_onnx, rebuild_encoder, save_encoder
 from kouxing.training.encoder.network import NUM_FEATURES, NUM_LIPS, AudioEncoder
-from kouxing.training.encoder.recipe import read_sources, refine_encoder, train_encoder
+from kouxing.training.encoder.recipe import Sources, read_sources, refine_encoder, train_encoder
 from kouxing.training.encoder.refinement import imitation_loss, refine
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, SourceRecording, TargetColumns
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES
@@ -27,7 +26,7 @@ from kouxing.training.networks import optimizer
 from kouxing.training.networks import whisper as whisper_weights
 from kouxing.training.networks.network import EncoderShape
 from kouxing.training.networks.onnx_graph import Graph
-from tests.corpora import write_noises, write_speech
+from tests.corpora import interrupt, write_noises, write_speech
 from tests.lip_clips import clip_name_for, write_training_clip
 from tests.system import HELLO
 from tests.whisper_folder import encoder_arrays, write_whisper
@@ -44,6 +43,29 @@ def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         whisper_weights, "EncoderShape", partial(EncoderShape, width=64, heads=2, inner=48)
     )
     return write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6, width=64))
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
+    monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
+
+
+def small_sources(folder: Path) -> partial[Sources]:
+    """Write recordings, noises and a clip; return the function that reads them."""
+    (folder / "clips").mkdir()
+    write_training_clip(folder / "clips", clip_name_for("train"), "anna", "CC0")
+    corpus = write_speech(folder / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
+    sounds = [write_noises(folder / "sounds")]
+    return partial(read_sources, [corpus], folder / "clips", sounds=sounds, any_license=False)
+
+
+def assert_resumed(output: Path, log: str) -> None:
+    """Check a model that was trained in two runs."""
+    assert "resuming after step 2" in log
+    assert load_encoder(output).num_features == NUM_FEATURES
+    assert "3 steps of" in output.with_suffix(".md").read_text()
+    assert {*output.parent.glob("encoder*")} == {output, output.with_suffix(".md")}
 
 
 def piece(samples: np.ndarray, voice: VoiceKind = VoiceKind.SPEECH) -> Piece:
@@ -118,34 +140,18 @@ def test_trains_resumes_and_writes_a_model(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
     monkeypatch.setattr(batches, "NUM_ENCODER_FRAMES", 30)
     monkeypatch.setattr(targets, "CHUNK_SIZE", 2)
-    monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
     monkeypatch.setattr(lip_teacher, "NUM_EPOCHS", 1)
-    corpus = write_speech(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
-    clips = tmp_path / "clips"
-    clips.mkdir()
-    write_training_clip(clips, clip_name_for("train"), "anna", "CC0")
-    write_training_clip(clips, clip_name_for("choice"), "berta", "MIT")
-    output = tmp_path / "encoder.npz"
-    sounds = [write_noises(tmp_path / "sounds")]
-
-    def train(untranscribed: list[Path], num_steps: int) -> None:
-        sources = read_sources([corpus], clips, untranscribed, sounds, any_license=False)
-        train_encoder(sources, output, whisper=whisper, num_steps=num_steps)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(recipe, "save_encoder", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            train(untranscribed=[corpus], num_steps=2)
+    sources, output = small_sources(tmp_path), tmp_path / "encoder.npz"
+    write_training_clip(tmp_path / "clips", clip_name_for("choice"), "berta", "MIT")
+    train = partial(train_encoder, output=output, whisper=whisper)
+    all_sources = sources(untranscribed=[tmp_path / "corpus"])
+    interrupt(recipe, "save_encoder", partial(train, all_sources, num_steps=2))
     with pytest.raises(UserError, match="targets of other recordings or models; delete it"):
-        train(untranscribed=[], num_steps=3)
-    train(untranscribed=[corpus], num_steps=3)
-    assert "resuming after step 2" in capsys.readouterr().err
-    assert load_encoder(output).num_features == NUM_FEATURES
-    assert "3 steps of" in output.with_suffix(".md").read_text()
-    assert {*tmp_path.glob("encoder*")} == {output, output.with_suffix(".md")}
+        train(sources(untranscribed=[]), num_steps=3)
+    train(all_sources, num_steps=3)
+    assert_resumed(output, capsys.readouterr().err)
 
 
 def test_rebuilds_an_exported_encoder(tmp_path: Path) -> None:
@@ -209,33 +215,16 @@ def test_refined_weights_are_averaged_with_the_first_ones(
 
 
 def test_refines_resumes_and_writes_a_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
-    monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
     torch.manual_seed(0)
     start, output = tmp_path / "start.npz", tmp_path / "encoder.npz"
     save_encoder(start, AudioEncoder(NUM_PHONES, width=16))
-    clips = tmp_path / "clips"
-    clips.mkdir()
-    write_training_clip(clips, clip_name_for("train"), "anna", "CC0")
-    sources = read_sources(
-        [write_speech(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})],
-        clips,
-        [],
-        [write_noises(tmp_path / "sounds")],
-        any_license=False,
-    )
+    sources = small_sources(tmp_path)(untranscribed=[])
     train = partial(refine_encoder, sources, output, start=start)
-    with monkeypatch.context() as patch:
-        patch.setattr(recipe, "save_encoder", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            train(num_steps=2)
+    interrupt(recipe, "save_encoder", partial(train, num_steps=2))
     train(num_steps=3)
-    assert "resuming after step 2" in capsys.readouterr().err
-    assert load_encoder(output).num_features == NUM_FEATURES
-    assert "3 steps of" in output.with_suffix(".md").read_text()
-    assert {*tmp_path.glob("encoder*")} == {output, output.with_suffix(".md")}
+    assert_resumed(output, capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(("name", "problem"), [("a", "no music or noise"), ("d", "no usable rec")])

@@ -74,11 +74,6 @@ def test_the_lip_model_of_the_guide_runs(tmp_path: Path, monkeypatch: pytest.Mon
     assert jaw[-1] < 1.0
 
 
-def test_an_unknown_lip_model_is_an_error() -> None:
-    with pytest.raises(UserError, match="unknown lip model 'muscles'; use one of dynamic-visemes"):
-        load_lip_model(name="muscles")
-
-
 @pytest.mark.parametrize(
     ("code", "error"),
     [

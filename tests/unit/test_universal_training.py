@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import soundfile
@@ -13,7 +12,7 @@ from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.training.networks import optimizer
 from kouxing.training.universal import alignment, recipe, trainer
 from kouxing.training.universal.recipe import train_universal
-from tests.corpora import write_manifest
+from tests.corpora import interrupt, write_manifest
 from tests.system import HELLO
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -49,17 +48,14 @@ def write_corpus(folder: Path) -> Path:
 
 @pytest.mark.slow
 def test_trains_resumes_and_writes_model_and_card(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "universal.npz"
     languages = [write_corpus(tmp_path / "corpus")]
     train = partial(
         train_universal, [], output, learners=[], languages=languages, clips=None, any_license=False
     )
-    with monkeypatch.context() as patch:
-        patch.setattr(recipe, "export_extension", Mock(side_effect=KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            train(num_steps=1)
+    interrupt(recipe, "export_extension", partial(train, num_steps=1))
     train(num_steps=2)
     assert "resuming after step 1" in capsys.readouterr().err
     model = load_model(output)
