@@ -127,10 +127,7 @@ class Containers:
         program = [sys.executable, "-m", "kouxing", *arguments]
         enter = ["unshare", "--mount", "sh", "-ec", ENTER_CONTAINER]
         enter += ["sh", str(self._numba), str(folder), str(self._hosts), target]
-        own = {
-            "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
-            "PYTHONPATH": CODE_PATH,
-        }
+        own = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": CODE_PATH}
         with self.log(host).open("ab") as log:
             return subprocess.Popen(
                 self._network.command(host, *enter, *program),

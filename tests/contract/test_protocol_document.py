@@ -31,12 +31,7 @@ from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.kinds import MESSAGES
 from kouxing.shared.wire.message import MAX_MESSAGE_BYTES
 from kouxing.shared.wire.schema import schema
-from kouxing.shared.wire.session import (
-    AudioChunk,
-    ErrorCode,
-    SessionMoved,
-    SessionOpened,
-)
+from kouxing.shared.wire.session import AudioChunk, ErrorCode, SessionMoved, SessionOpened
 from kouxing.shared.wire.speech import NewestFrame, Results
 from tests.samples import SAMPLES
 

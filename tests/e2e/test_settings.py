@@ -21,14 +21,7 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.settings.config import variable_name
 from tests.e2e.streaming import StreamedSession, stream_audio
-from tests.system import (
-    BLOCK_NETWORK,
-    LIMIT_S,
-    VOWELS_FILE,
-    System,
-    samples_of_file,
-    wait_until,
-)
+from tests.system import BLOCK_NETWORK, LIMIT_S, VOWELS_FILE, System, samples_of_file, wait_until
 
 FACE = SynthesizerConfig(
     lips="dynamic-visemes", delay_ms=160.0, frame_rate_hz=30.0, idle_motion=False

@@ -239,10 +239,7 @@ def test_http_for_a_proxy_creates_and_prints_a_token(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("certificate", "text"),
-    [
-        (__file__, "gateway.https: "),
-        ("/no/such/folder/new.pem", "No such file or directory"),
-    ],
+    [(__file__, "gateway.https: "), ("/no/such/folder/new.pem", "No such file or directory")],
 )
 def test_a_wrong_certificate_ends_the_gateway_with_a_message(certificate: str, text: str) -> None:
     process = gateway_process(gateway_https=certificate)

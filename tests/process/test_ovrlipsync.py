@@ -23,12 +23,7 @@ from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 from kouxing.shared.face.shapes import OCULUS
 from kouxing.shared.phones.events import LipPositions, Phone, Progress, SoundEvent, SpeechChange
 from tests.documents import code_blocks
-from tests.lips_package import (
-    FRAME_RATE_HZ,
-    Frames,
-    closure_at_the_end_of_speech,
-    server_faps,
-)
+from tests.lips_package import FRAME_RATE_HZ, Frames, closure_at_the_end_of_speech, server_faps
 from tests.system import DEMO, NODE, ROOT, samples_of_file
 
 SOURCE = ROOT / "clients" / "ovrlipsync"

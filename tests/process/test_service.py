@@ -94,10 +94,7 @@ class ServiceWithKey(Service):
 
 @pytest.mark.parametrize(("control", "warns"), [("10.0.0.1", True), ("127.0.0.1", False)])
 def test_warns_if_only_this_host_can_connect_but_control_is_for_others(
-    control: str,
-    warns: bool,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
+    control: str, warns: bool, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ServiceWithKey, "connects_to_control", False)
     config = ServiceConfig(control=f"tcp://{control}:5550", insecure=True)

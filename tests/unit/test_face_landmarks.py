@@ -8,10 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from kouxing.corpora.face_mesh import FaceMesh
-from kouxing.services.mouth_profiles.face_landmarks import (
-    LANDMARKS,
-    compute_mouth_faps,
-)
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import parse_landmark_file
 from kouxing.services.recognizer.lips.lip_predictor import LIP_FAPS
 from kouxing.shared.errors import UserError

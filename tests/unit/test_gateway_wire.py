@@ -13,10 +13,7 @@ from kouxing.services.gateway.audio.sample_sentence import SampleSentence
 from kouxing.services.gateway.messages import browser_messages
 from kouxing.services.gateway.messages.browser_messages import parse_face_settings
 from kouxing.services.gateway.messages.pcm_format import PcmFormat
-from kouxing.services.gateway.messages.shape_messages import (
-    make_avatar_encoder,
-    parse_shape_query,
-)
+from kouxing.services.gateway.messages.shape_messages import make_avatar_encoder, parse_shape_query
 from kouxing.services.gateway.viewers.viewer_handler import PAUSE_S, Viewer, ViewerHandler
 from kouxing.services.gateway.viewers.viewer_queue import (
     MAX_QUEUED,

@@ -128,9 +128,7 @@ def test_prediction_and_phone_decide_a_closure_together(
 
 
 @pytest.mark.parametrize("is_flushed", [True, False])
-def test_lips_do_not_pass_through_each_other_after_an_interrupted_closure(
-    is_flushed: bool,
-) -> None:
+def test_lips_do_not_pass_through_each_other_after_an_interrupted_closure(is_flushed: bool) -> None:
     face = speaking_face()
     closing = run(face, 0.0, 0.56, closing_lips(0.95))
     assert -400.0 < closing[-1][1][3] + closing[-1][1][4] < -100.0

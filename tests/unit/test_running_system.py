@@ -96,10 +96,7 @@ def test_finds_no_system_with_other_keys(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     ("address", "message"),
     [
-        (
-            "",
-            r"kouxing is not running .*, or set --control .*\. Tried: no answer",
-        ),
+        ("", r"kouxing is not running .*, or set --control .*\. Tried: no answer"),
         ("tcp://127.0.0.1:5550", "^no answer"),
     ],
 )

@@ -211,9 +211,7 @@ def test_a_session_moves_to_another_recognizer_and_resumes_where_it_was(cluster:
     assert record.next_sequence == 121, "the new recognizer has no audio yet"
 
 
-def test_late_heartbeat_of_an_ended_session_does_not_affect_its_successor(
-    cluster: Cluster,
-) -> None:
+def test_late_heartbeat_of_an_ended_session_does_not_affect_its_successor(cluster: Cluster) -> None:
     ended = cluster.open("demo")
     cluster.sessions.remove(ended, 0.0)
     record = cluster.open("demo")

@@ -23,14 +23,7 @@ from kouxing.training.model_files import save_universal
 from kouxing.training.networks.network import ReadoutShape
 from kouxing.training.universal.encoder import BLOCK_LENGTH, RIGHT_CONTEXT, FeatureEncoder
 from kouxing.training.universal.recipe import export_extension
-from tests.block_networks import (
-    BLOCK,
-    FRAMES,
-    LENGTH,
-    SCALE,
-    blocks,
-    networks,
-)
+from tests.block_networks import BLOCK, FRAMES, LENGTH, SCALE, blocks, networks
 from tests.live_streams import LiveStream
 from tests.system import HELLO
 

@@ -13,11 +13,7 @@ from kouxing.evaluation.recognizer import voice_activity
 from kouxing.evaluation.recognizer.aligned_corpus import AlignedRecording
 from kouxing.evaluation.recognizer.disturbances import add_sound, held_out_music
 from kouxing.evaluation.recognizer.synthetic_sounds import held_vowels, varying_noise
-from kouxing.evaluation.recognizer.voice_activity import (
-    evaluate_voice,
-    labeled_audio,
-    voice_states,
-)
+from kouxing.evaluation.recognizer.voice_activity import evaluate_voice, labeled_audio, voice_states
 from kouxing.evaluation.report.recognition_table import voice_table
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.errors import UserError
