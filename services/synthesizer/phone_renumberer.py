@@ -30,9 +30,9 @@ class PhoneRenumberer:
     def renumber(self, phone: Phone) -> Phone:
         """Return a phone or revision with its index in the session."""
         index = self._indices.get(phone.index, self._base + phone.index)
-        again = [void.index for void in self._void.values() if _is_same(void, phone)]
-        if again and index not in self._open:
-            index = self._indices[phone.index] = again[0]
+        matches = [void.index for void in self._void.values() if _is_same(void, phone)]
+        if matches and index not in self._open:
+            index = self._indices[phone.index] = matches[0]
             del self._void[index]
         renumbered = replace(phone, index=index)
         self._next = max(self._next, index + 1)

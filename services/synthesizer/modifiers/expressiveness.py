@@ -58,7 +58,7 @@ def scale_mouth(faps: Floats, amount: float) -> None:
     # For so few numbers, floats are faster than arrays.
     values = faps.tolist()
     more = amount - 1.0
-    is_open = 0.0  # at the middle of the inner lips, 0 to 1
+    openness = 0.0  # at the middle of the inner lips, 0 to 1
     for upper, lower in _LIPS:
         opening = -values[upper] - values[lower]
         beyond = max(opening - CLOSED, 0.0)  # excess of the gap
@@ -70,16 +70,16 @@ def scale_mouth(faps: Floats, amount: float) -> None:
         # a lower lip at the teeth (f) is also a closure
         apart = min(free_lower / (OPEN - CLOSED), 1.0)
         if upper == _LIPS[0][0]:
-            is_open = apart * min(beyond / (OPEN - CLOSED), 1.0)
+            openness = apart * min(beyond / (OPEN - CLOSED), 1.0)
         grown = apart * _growth(min(free, beyond), more) / max(free, 1.0)
         faps[upper] = values[upper] - grown * free_upper
         faps[lower] = values[lower] - grown * free_lower
-    faps[JAW] = values[JAW] + is_open * _growth(max(values[JAW], 0.0), more)
+    faps[JAW] = values[JAW] + openness * _growth(max(values[JAW], 0.0), more)
     for fap in _WIDTH:
         before = values[fap]
         width = before - _USUAL_WIDTH
         # at rest, the mouth is wider than in speech, but not spread
-        change = _SIDEWAYS * more * width * (is_open if width > 0.0 else 1.0)
+        change = _SIDEWAYS * more * width * (openness if width > 0.0 else 1.0)
         faps[fap] = max(before + change, min(before, _MIN_WIDTH))
     for fap in _PUSH:
         before = values[fap]

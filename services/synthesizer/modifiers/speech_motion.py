@@ -149,11 +149,8 @@ class SpeechMotionModifier:
 
     def _state(self, silence_s: float, now_s: float) -> ConversationState:
         if silence_s < _ENDING_S:
-            return (
-                ConversationState.STARTING
-                if now_s - self._start_s < _STARTING_S
-                else ConversationState.SPEAKING
-            )
+            is_starting = now_s - self._start_s < _STARTING_S
+            return ConversationState.STARTING if is_starting else ConversationState.SPEAKING
         if silence_s < _THINKING_S:
             return ConversationState.ENDING
         if self._is_listening:

@@ -13,7 +13,7 @@ vowels. The mouth therefore starts in time for a phone that will be recognized l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,11 +131,11 @@ def build_timeline(
     durations of phones that are not final are estimates.
     """
     in_order = sorted(phones, key=lambda phone: (phone.onset_s, phone.index))
-    silent = inventory.silence
-    quiet_s = sorted(
-        [*speech_ends_s, *(phone.onset_s for phone in in_order if phone.symbol == silent)]
+    silence = inventory.silence
+    pauses_s = sorted(
+        [*speech_ends_s, *(phone.onset_s for phone in in_order if phone.symbol == silence)]
     )
-    spoken = [phone for phone in in_order if phone.symbol != silent]
+    spoken = [phone for phone in in_order if phone.symbol != silence]
 
     visemes: list[_PlacedViseme] = []
     silences: list[tuple[float, float]] = []
@@ -147,34 +147,34 @@ def build_timeline(
         next_onset_s = following.onset_s if following is not None else np.inf
         if not phone.final and next_onset_s - phone.onset_s < _MIN_PHONE_S:
             continue  # revised to almost nothing
-        bound_s = next((end for end in quiet_s if phone.onset_s < end < next_onset_s), next_onset_s)
-        end_s = _end_of(phone, bound_s, is_estimate=is_live and not phone.final)
-        if is_live and bound_s == np.inf:
+        pause_s = next((time_s for time_s in pauses_s if time_s > phone.onset_s), np.inf)
+        max_end_s = min(pause_s, next_onset_s)
+        end_s = _end_of(phone, max_end_s, is_estimate=is_live and not phone.final)
+        if is_live and max_end_s == np.inf:
             open_phone = OpenPhone(end_s, _is_held(phone.symbol, inventory))
-        touching = end_s == next_onset_s
-        if not touching:
-            silent_s = end_s if open_phone is None else end_s + _EXPECTED_AFTER_S
-            silences.append((silent_s, next_onset_s))
+        is_touching = end_s == next_onset_s
+        if not is_touching:
+            silence_s = end_s if open_phone is None else end_s + _EXPECTED_AFTER_S
+            silences.append((silence_s, next_onset_s))
         end_s = max(end_s, phone.onset_s + _MIN_PHONE_S)
-        next_symbol = following.symbol if following is not None and touching else None
+        next_symbol = following.symbol if following is not None and is_touching else None
         visemes += _place_visemes(phone, next_symbol, end_s, inventory)
-    visemes.sort(key=lambda row: row[1:])
+    visemes.sort(key=lambda placed: placed[1:])  # by time
     if open_phone is not None:
-        visemes.append(
-            (
-                VISEME_INDEX[_expected_after(spoken[-1].symbol, inventory)],
-                open_phone.end_s + _EXPECTED_EDGE_S,
-                open_phone.end_s + _EXPECTED_AFTER_S,
-                EXPECTED_PHONE_INDEX,
-            )
+        expected = _PlacedViseme(
+            row=VISEME_INDEX[_expected_after(spoken[-1].symbol, inventory)],
+            apex_start_s=open_phone.end_s + _EXPECTED_EDGE_S,
+            apex_end_s=open_phone.end_s + _EXPECTED_AFTER_S,
+            phone_index=EXPECTED_PHONE_INDEX,
         )
+        visemes.append(expected)
     return Timeline(
-        viseme=np.array([row[0] for row in visemes], dtype=np.intp),
-        apex_start_s=np.array([row[1] for row in visemes], dtype=float),
-        apex_end_s=np.array([row[2] for row in visemes], dtype=float),
-        phone_index=np.array([row[3] for row in visemes], dtype=np.int64),
-        silence_start_s=np.array([row[0] for row in silences], dtype=float),
-        silence_end_s=np.array([row[1] for row in silences], dtype=float),
+        viseme=np.array([placed.row for placed in visemes], dtype=np.intp),
+        apex_start_s=np.array([placed.apex_start_s for placed in visemes], dtype=float),
+        apex_end_s=np.array([placed.apex_end_s for placed in visemes], dtype=float),
+        phone_index=np.array([placed.phone_index for placed in visemes], dtype=np.int64),
+        silence_start_s=np.array([start_s for start_s, _ in silences], dtype=float),
+        silence_end_s=np.array([end_s for _, end_s in silences], dtype=float),
         syllable_s=np.array(
             [phone.onset_s for phone in spoken if phone.symbol not in inventory.initials]
         ),
@@ -182,15 +182,20 @@ def build_timeline(
     )
 
 
-# VisemeParameters row, start and end of the apex in seconds, phone index
-_PlacedViseme: TypeAlias = tuple[int, float, float, int]
+class _PlacedViseme(NamedTuple):
+    """One viseme of the timeline."""
+
+    row: int  # in VisemeParameters
+    apex_start_s: float
+    apex_end_s: float
+    phone_index: int
 
 
-def _end_of(phone: Phone, bound_s: float, *, is_estimate: bool) -> float:
-    """Return the end of a phone, extended to the next phone or pause at ``bound_s`` if near."""
-    end_s = min(phone.onset_s + max(phone.duration_s, _MIN_PHONE_S), bound_s)
+def _end_of(phone: Phone, max_end_s: float, *, is_estimate: bool) -> float:
+    """Return the end of a phone, extended to ``max_end_s``, the next phone or pause, if near."""
+    end_s = min(phone.onset_s + max(phone.duration_s, _MIN_PHONE_S), max_end_s)
     max_gap_s = _MAX_ERROR_S if is_estimate else _TOUCHING_S
-    return bound_s if bound_s - end_s < max_gap_s else end_s
+    return max_end_s if max_end_s - end_s < max_gap_s else end_s
 
 
 def _place_visemes(
@@ -201,9 +206,8 @@ def _place_visemes(
     for viseme, fraction in visemes_of(phone.symbol, next_symbol, inventory):
         length_s = fraction * (end_s - phone.onset_s)
         edge_s = min(0.5 * length_s, EDGE_S)
-        placed.append(
-            (VISEME_INDEX[viseme], start_s + edge_s, start_s + length_s - edge_s, phone.index)
-        )
+        apex_s = (start_s + edge_s, start_s + length_s - edge_s)
+        placed.append(_PlacedViseme(VISEME_INDEX[viseme], *apex_s, phone.index))
         start_s += length_s
     return placed
 

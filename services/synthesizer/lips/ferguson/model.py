@@ -15,7 +15,7 @@ a *transition* keeps the mouth continuous in position and velocity.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -59,6 +59,14 @@ _REST_S = 0.15  # duration of the return to rest without sound
 _DERIVATIVE_STEP_S = 1e-3
 
 
+@dataclass(frozen=True, slots=True)
+class AveragePhone:
+    """The average of some phones."""
+
+    opening: float  # R
+    duration_s: float
+
+
 @dataclass(frozen=True)
 class FergusonLips:
     """The lip model of Zhang et al. 2021, for the phones of a language."""
@@ -74,16 +82,21 @@ class FergusonLips:
         return FergusonStream(self, start_s, delay_s=delay_s)
 
     @cached_property
-    def averages(self) -> dict[bool, tuple[float, float]]:
-        """Mean opening and duration, seconds, of initials (True) and vowels (False)."""
-        kinds = {True: sorted(self.inventory.initials), False: sorted(self.inventory.vowels)}
-        return {
-            is_initial: (
-                float(np.mean([self.table.opening[phone] for phone in phones])),
-                float(np.mean([self.table.duration_s[phone] for phone in phones])),
-            )
-            for is_initial, phones in kinds.items()
-        }
+    def average_initial(self) -> AveragePhone:
+        """The average initial of the language."""
+        return self._average(self.inventory.initials)
+
+    @cached_property
+    def average_vowel(self) -> AveragePhone:
+        """The average vowel of the language."""
+        return self._average(self.inventory.vowels)
+
+    def _average(self, phones: Collection[str]) -> AveragePhone:
+        in_order = sorted(phones)  # so that the rounding does not depend on the order of a set
+        return AveragePhone(
+            opening=float(np.mean([self.table.opening[phone] for phone in in_order])),
+            duration_s=float(np.mean([self.table.duration_s[phone] for phone in in_order])),
+        )
 
 
 class FergusonStream:
@@ -235,7 +248,7 @@ class FergusonStream:
 
         They replace the closing of the mouth, which is removed from ``frames``.
         """
-        averages = self._model.averages
+        initial, vowel = self._model.average_initial, self._model.average_vowel
         start_s = self._segmenter.start_s
         expected: list[tuple[float, float]] = []
         is_new = (
@@ -244,16 +257,16 @@ class FergusonStream:
             and (not phones or start_s > phones[-1].onset_s + _SNAP_S)
         )
         if is_new and start_s is not None:
-            opening, duration_s = averages[True]
-            next_s, next_opening = start_s + duration_s, averages[False][0]
+            next_s, next_opening = start_s + initial.duration_s, vowel.opening
             if frames and start_s - frames[-1][0] < PAUSE_S:
                 frames.pop()
             else:
                 expected.append((start_s - OPENING_TIME_S, 0.0))
-            expected.append((start_s, opening))
+            expected.append((start_s, initial.opening))
         elif frames and self._known_s < frames[-1][0] + _EXPECTED_S:
             next_s = frames.pop()[0]
-            next_opening = averages[phones[-1].symbol not in self._model.inventory.initials][0]
+            is_after_initial = phones[-1].symbol in self._model.inventory.initials
+            next_opening = vowel.opening if is_after_initial else initial.opening
         else:
             return []
         closed_s = next_s + _EXPECTED_S

@@ -27,7 +27,7 @@ _MIN_PROBABILITY, _MAX_PROBABILITY = 0.002, 0.998  # probabilities are clipped t
 # maximum duration of a closure after the onset of its phone; a phone known later closes nothing
 _HOLD_S = 0.08
 _EDGE_S = 0.02  # rise and fall time of a phone's evidence
-_MIDDLE = 0.3  # half width of a vowel's middle, as a fraction of its duration
+_MIDDLE_HALF_WIDTH = 0.3  # of a vowel, as a fraction of its duration
 _PARTED, _WIDE_APART = 100.0, 300.0  # opening, FAP units
 _ROUNDED = -100.0  # width, FAP units
 _INNER_UPPER, _INNER_LOWER, _LEFT_CORNER, _RIGHT_CORNER = map(MOUTH_FAPS.index, (4, 5, 6, 7))
@@ -125,7 +125,7 @@ class ClosingPhones:
         subtracted = min(log_odds, self._rule.other)
         if phone.symbol in self._vowels and self._is_between_closures(phone):
             from_middle = abs((time_s - phone.onset_s) / phone.duration_s - 0.5)
-            weight = max(0.0, 1.0 - from_middle / _MIDDLE)
+            weight = max(0.0, 1.0 - from_middle / _MIDDLE_HALF_WIDTH)
             subtracted = max(subtracted, self._rule.vowel * log_odds * weight)
         return subtracted
 

@@ -16,7 +16,7 @@ from kouxing.shared.arrays import Doubles
 HOLD_S = 0.04  # tolerated lateness of lip positions
 CLOSE_S = 0.1  # time from the last lip positions to rest
 _OPEN_S = 0.06  # time from rest to the first lip positions
-MAX_GAP_S = CLOSE_S + _OPEN_S  # maximum distance of two frames that are joined
+MAX_GAP_S = CLOSE_S + _OPEN_S  # maximum distance of two lip positions that are joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,17 +29,17 @@ class LipTrack:
     """A mouth trajectory that starts at rest, mouth FAPs (num_mouth_faps,)."""
 
     def __init__(self, neutral: Doubles) -> None:
-        self.hold_s = 0.0  # time for which the last frame is held before the mouth moves to rest
+        self.hold_s = 0.0  # how long the last lip positions are held before the mouth moves to rest
         self._rest = stationary_state(neutral)
         self._knots: list[_Knot] = []
 
     @property
     def end_s(self) -> float:
-        """Time of the last frame, seconds; minus infinity before the first frame."""
+        """Time of the last lip positions, seconds; minus infinity before the first."""
         return self._knots[-1].time_s if self._knots else -np.inf
 
     def append(self, time_s: float, faps: Doubles) -> None:
-        """Append a frame: media time, FAPs (num_mouth_faps,)."""
+        """Append lip positions: media time, FAPs (num_mouth_faps,)."""
         if time_s - self.end_s <= MAX_GAP_S:
             velocity = (faps - self._knots[-1].state.value) / (time_s - self.end_s)
         else:
@@ -50,7 +50,7 @@ class LipTrack:
         self._knots.append(_Knot(time_s, FapState(faps, velocity)))
 
     def forget_before(self, time_s: float) -> None:
-        """Drop frames that are no longer needed after a time."""
+        """Drop lip positions that are no longer needed after a time."""
         first = bisect_right(self._knots, time_s, key=lambda knot: knot.time_s) - 1
         del self._knots[: max(0, first)]
 

@@ -134,15 +134,16 @@ class LearnedStream:
                 self._flushed_until_s = -np.inf
                 self._is_speaking = event.active
 
-    def _add_lip_positions(self, frame: LipPositions) -> None:
-        numbers = (frame.time_s, frame.delay_s, frame.closure)
-        is_valid = all(map(math.isfinite, numbers)) and (np.abs(frame.faps) < _MAX_FAP).all()
-        is_new = frame.time_s > self._newest_s
-        if not is_valid or not is_new or frame.time_s + frame.delay_s <= self._flushed_until_s:
+    def _add_lip_positions(self, positions: LipPositions) -> None:
+        numbers = (positions.time_s, positions.delay_s, positions.closure)
+        is_valid = all(map(math.isfinite, numbers)) and (np.abs(positions.faps) < _MAX_FAP).all()
+        is_new = positions.time_s > self._newest_s
+        known_s = positions.time_s + positions.delay_s
+        if not is_valid or not is_new or known_s <= self._flushed_until_s:
             return
-        self._queue.append(frame)
-        self._newest_s = frame.time_s
-        self._known_s = frame.time_s + frame.delay_s
+        self._queue.append(positions)
+        self._newest_s = positions.time_s
+        self._known_s = known_s
         self._has_lip_positions = True
 
     def flush(self) -> None:
@@ -211,16 +212,16 @@ class LearnedStream:
         for phones in (self._bilabials, self._labiodentals):
             phones.forget_before(time_s - _MEMORY_S)
         while self._queue and self._track.end_s < time_s:
-            frame = self._queue.popleft()
-            self._track.append(frame.time_s, self._stabilize(frame))
+            positions = self._queue.popleft()
+            self._track.append(positions.time_s, self._stabilize(positions))
             # lip positions with a longer delay than the face are late
-            self._late_s = max(0.0, frame.delay_s - self._delay_s)
+            self._late_s = max(0.0, positions.delay_s - self._delay_s)
         self._track.hold_s = HOLD_S + self._late_s if self._is_speaking else 0.0
 
-    def _stabilize(self, frame: LipPositions) -> Doubles:
+    def _stabilize(self, positions: LipPositions) -> Doubles:
         """Return the FAPs of the next lip positions, stabilized and with closures."""
-        faps = frame.faps.astype(np.float64)
-        if frame.time_s - self._track.end_s <= MAX_GAP_S:
+        faps = positions.faps.astype(np.float64)
+        if positions.time_s - self._track.end_s <= MAX_GAP_S:
             change = faps - self._stable
             faps = self._stable + change**3 / (change**2 + _JITTER_SQUARED)
         else:
@@ -229,10 +230,10 @@ class LearnedStream:
         faps = faps.copy()
         separate_lips(faps)
         rule = self._rule
-        teeth = self._labiodentals.log_odds(frame.time_s) - _TEETH_LOG_ODDS
-        phones = self._bilabials.log_odds(frame.time_s)
-        closure = rule.log_odds(faps, log_odds_of(frame.closure), phones)
-        closure -= self._resting.silence_penalty_at(frame.time_s, frame.closure, phones)
+        teeth = self._labiodentals.log_odds(positions.time_s) - _TEETH_LOG_ODDS
+        phones = self._bilabials.log_odds(positions.time_s)
+        closure = rule.log_odds(faps, log_odds_of(positions.closure), phones)
+        closure -= self._resting.silence_penalty_at(positions.time_s, positions.closure, phones)
         move_lip_to_teeth(faps, compute_closure_amount(teeth, rule.doubt))
         closing = compute_closure_amount(closure, rule.doubt)
         before, newest = self._closing
