@@ -91,7 +91,7 @@ def half_open_connections(endpoint: str, source: str, seconds: float) -> None:
     """Hold many connections, each with an unfinished handshake or web request."""
     start = b"GET / HTTP/1.1\r\nHost: " if endpoint.startswith("http") else CURVE_GREETING[:40]
     end_s = time.monotonic() + seconds
-    with many_connections(_port_of(endpoint), NUM_CONNECTIONS, source) as connections:
+    with many_connections(_port_of(endpoint), source) as connections:
         for connection in connections:
             with contextlib.suppress(OSError):  # closed by the peer
                 connection.sendall(start)
@@ -111,12 +111,12 @@ def endless_handshake(endpoint: str, source: str, seconds: float) -> None:
 
 
 @contextlib.contextmanager
-def many_connections(port: int, number: int, source: str) -> Iterator[list[socket.socket]]:
-    """Hold up to ``number`` TCP connections; the peer or this process's limit may allow fewer."""
+def many_connections(port: int, source: str) -> Iterator[list[socket.socket]]:
+    """Hold up to ``NUM_CONNECTIONS`` TCP connections; the peer or this process's limit may allow fewer."""
     with contextlib.ExitStack() as stack:
         connections = []
         with contextlib.suppress(OSError):
-            for _ in range(number):
+            for _ in range(NUM_CONNECTIONS):
                 connection = socket.create_connection((LOCALHOST, port), 1.0, (source, 0))
                 connections.append(stack.enter_context(connection))
         yield connections

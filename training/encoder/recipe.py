@@ -94,7 +94,7 @@ def train_encoder(sources: Sources, output: Path, *, whisper: Path, num_steps: i
     columns = TargetColumns(len(inventory))
     batch_source = BatchSource(store.pieces(), sources.backgrounds, columns)
     trained = _train_network(batch_source, num_steps, checkpoint)
-    trained.rescale_lips(store.lips_mean, store.lips_deviation)
+    trained.rescale_lips(store.basis["lips_mean"], store.basis["lips_deviation"])
     teacher = "Whisper's encoder as a teacher (Radford et al. 2023, MIT license)"
     _write_model(output, trained, teacher, num_steps, sources)
     checkpoint.unlink()

@@ -122,17 +122,7 @@ class TargetStore:
         self.num_chunks = -(-len(recordings) // CHUNK_SIZE)
         folder.mkdir(parents=True, exist_ok=True)
         self._check_key()
-        self._basis = load_or_compute(folder / "basis.npz", self._compute_basis)
-
-    @property
-    def lips_mean(self) -> Floats:
-        """Mean of the lip teacher's outputs, (17,)."""
-        return self._basis["lips_mean"]
-
-    @property
-    def lips_deviation(self) -> Floats:
-        """Standard deviation of the lip teacher's outputs, (17,)."""
-        return self._basis["lips_deviation"]
+        self.basis = load_or_compute(folder / "basis.npz", self._compute_basis)
 
     def pieces(self) -> list[Piece]:
         """Return the pieces of all recordings; compute those that are missing."""
@@ -221,9 +211,9 @@ class TargetStore:
             voice = np.full(len(outputs.level), recording.voice, np.float32)
             voice[~self._is_audible(outputs, recording.voice)] = VoiceKind.NONE
             scalars = [outputs.pitch, outputs.level, outputs.effort, voice]
-            whisper = (outputs.whisper - self._basis["whisper_mean"]) @ self._basis["whisper"]
+            whisper = (outputs.whisper - self.basis["whisper_mean"]) @ self.basis["whisper"]
             lips = self._lip_teacher.predict_lips(TeacherFeatures(outputs.whisper, outputs.phones))
-            lips = (lips - self._basis["lips_mean"]) / self._basis["lips_deviation"]
+            lips = (lips - self.basis["lips_mean"]) / self.basis["lips_deviation"]
             rows: list[NDArray[np.floating]] = [*scalars, outputs.phones, whisper, lips]
             targets = np.column_stack(rows).astype(np.float16)
             trimmed = samples[: ENCODER_FRAME_SAMPLES * len(targets)]

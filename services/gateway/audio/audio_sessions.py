@@ -66,13 +66,13 @@ class AudioSession:
         """
         return [] if self.is_closed else self._session.take_errors()
 
-    async def finish(self, timeout_s: float) -> None:
-        """Stop sending, wait up to ``timeout_s`` for the last frame, then close the session."""
+    async def finish(self) -> None:
+        """Stop sending, wait for the last frame, then close the session."""
         try:
             if not self.is_closed:
                 await self._session.finish()
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(self.frames_ended.wait(), timeout_s)
+                    await asyncio.wait_for(self.frames_ended.wait(), LAST_FRAME_TIMEOUT_S)
                 await asyncio.sleep(LAST_PHONES_WAIT_S)
         except KouxingError as error:
             self._warn("close", str(error), self.name)
@@ -122,7 +122,7 @@ class AudioClient:
             yield opened
         finally:
             try:
-                await opened.finish(LAST_FRAME_TIMEOUT_S)
+                await opened.finish()
             finally:  # also if this task is cancelled
                 del self._open[opened.name]
 
