@@ -234,8 +234,7 @@ def _blink_durations_s(faps: Floats, rate_hz: float) -> Times:
     """Return the durations of the blinks, seconds."""
     closed = np.pad((faps[:, _LID] > _CLOSED_LID).astype(int), 1)
     changes = np.diff(closed)
-    durations: Times = (np.flatnonzero(changes < 0) - np.flatnonzero(changes > 0)) / rate_hz
-    return durations
+    return (np.flatnonzero(changes < 0) - np.flatnonzero(changes > 0)) / rate_hz
 
 
 def _is_still(faps: Floats) -> Mask:

@@ -93,5 +93,4 @@ def is_near(events_s: Doubles, others_s: Doubles, window_s: float) -> Mask:
         np.abs(others_s[np.clip(index, 0, len(others_s) - 1)] - events_s)
         for index in (after - 1, after)
     ]
-    near: Mask = np.minimum(*gaps) <= window_s + _ROUNDING_S
-    return near
+    return np.minimum(*gaps) <= window_s + _ROUNDING_S

@@ -147,5 +147,4 @@ def _mix(samples: Samples, sound: NDArray[np.floating], snr_db: float) -> Sample
 
 
 def _to_equal_level(samples: Samples) -> Samples:
-    scaled: Samples = samples / max(_EPSILON, float(np.sqrt(np.mean(samples**2))))
-    return scaled
+    return samples / max(_EPSILON, float(np.sqrt(np.mean(samples**2))))

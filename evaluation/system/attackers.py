@@ -112,7 +112,7 @@ def endless_handshake(endpoint: str, source: str, seconds: float) -> None:
 
 @contextlib.contextmanager
 def many_connections(port: int, source: str) -> Iterator[list[socket.socket]]:
-    """Hold up to ``NUM_CONNECTIONS`` TCP connections; the peer or this process's limit may allow fewer."""
+    """Hold TCP connections, fewer than all if the peer or this process's limit allows fewer."""
     with contextlib.ExitStack() as stack:
         connections = []
         with contextlib.suppress(OSError):

@@ -181,8 +181,7 @@ def _ages_s(frames: Sequence[tuple[float, float]], from_s: float, until_s: float
     newest_s = np.maximum.accumulate(due_s[order])
     times_s = np.arange(from_s, until_s, STEP_S)
     known = np.searchsorted(arrived_s[order], times_s, side="right") - 1
-    ages_s: Doubles = times_s - newest_s[np.maximum(known, 0)]
-    return ages_s
+    return times_s - newest_s[np.maximum(known, 0)]
 
 
 @contextlib.contextmanager

@@ -29,8 +29,7 @@ def select_lip_faps(faps: Doubles) -> Doubles:
 def lip_measures(lips: NDArray[np.floating]) -> Doubles:
     """Compute opening, width and jaw, (n, 3), from FAPs, (n, 15 or more)."""
     height = -lips[:, _UPPER_LIP] - lips[:, _LOWER_LIP]
-    measures: Doubles = np.stack([height, 2 * lips[:, _CORNER], lips[:, _JAW]], axis=1)
-    return measures
+    return np.stack([height, 2 * lips[:, _CORNER], lips[:, _JAW]], axis=1)
 
 
 def interpolate_track(frame_s: Doubles, values: Doubles, time_s: Doubles) -> Doubles:

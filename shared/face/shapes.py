@@ -96,8 +96,7 @@ class ShapeSet:
 
     def faps(self, weights: Floats) -> Floats:
         """Return the FAPs (68,) of weights (N,), equation (1)."""
-        faps: Floats = np.asarray(weights, dtype=np.float32) @ self.basis
-        return faps
+        return np.asarray(weights, dtype=np.float32) @ self.basis
 
     def weights(self, faps: Floats) -> Floats:
         """Return the weights (N,), 0 to 1, whose face is closest to FAPs (68,); equation (2)."""

@@ -52,5 +52,4 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any
             raise ValueError(f"{entry.filename} is cut off")
     with archive.open(entry) as stream:
         content = io.BytesIO(stream.read(entry.file_size))  # one call lets other threads run
-        array: NDArray[Any] = npy.read_array(content, allow_pickle=False)
-        return array
+        return npy.read_array(content, allow_pickle=False)

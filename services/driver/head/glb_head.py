@@ -186,8 +186,7 @@ def standard_fapu() -> dict[str, float]:
 def head_weight_at(height: Doubles) -> Doubles:
     """Return the fraction (V,) of the head rotation by height above the eyes, in eye distances."""
     x = np.clip((height - _NECK_HEIGHTS[1]) / (_NECK_HEIGHTS[0] - _NECK_HEIGHTS[1]), 0, 1)
-    faded: Doubles = x**2 * (3 - 2 * x)
-    return faded
+    return x**2 * (3 - 2 * x)
 
 
 def _check_single_face(pieces: list[MeshPiece], known: ShapeFaps) -> None:

@@ -324,8 +324,7 @@ class _Skin:
         weight = self.mean(dict.fromkeys(below, 1.0))[:, None]
         if not weight.any():
             return None
-        arm: Doubles = weight * (vertices - self._nodes[jaw][:3, 3])
-        return arm
+        return weight * (vertices - self._nodes[jaw][:3, 3])
 
     def eye_look_shapes(self, vertices: Doubles) -> dict[str, Doubles]:
         """Return ARKit's eye shapes: the displacements (V, 3) by rotations of the eye bones."""

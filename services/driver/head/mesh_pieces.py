@@ -51,8 +51,7 @@ def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> Integers:
     _, kind, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
     doubled = np.zeros(len(first), dtype=bool)
     doubled[inverse[count[kind.ravel()] > 1]] = True
-    welded: Integers = np.where(doubled[inverse], np.arange(len(vertices)), first[inverse])
-    return welded
+    return np.where(doubled[inverse], np.arange(len(vertices)), first[inverse])
 
 
 def part_names(pieces: list[MeshPiece]) -> list[str]:

@@ -49,8 +49,7 @@ class Geodesics:
         fraction = reached.astype(float)
         both = reached & np.isfinite(to_fixed)
         fraction[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
-        weight: Doubles = 0.5 - 0.5 * np.cos(np.pi * fraction)
-        return weight
+        return 0.5 - 0.5 * np.cos(np.pi * fraction)
 
 
 def smoothest_fields(

@@ -114,8 +114,7 @@ def _filter_table(rate_hz: int) -> Floats:
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0, 1 - (time / half) ** 2)))
     table = np.sinc(_CUTOFF * lower * time) * window
     table /= table.sum(axis=1, keepdims=True)  # every phase keeps a constant signal
-    rounded: Floats = table.astype(np.float32)
-    return rounded
+    return table.astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -134,8 +134,7 @@ def _score_recording(
 
 def _best_phone_scores(scores: Floats, topology: Topology) -> Floats:
     """Return the score of each phone's best state, (frames, phones)."""
-    best: Floats = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
-    return best
+    return np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
 
 
 def _fit(

@@ -39,8 +39,7 @@ def log_silence(inside_s: Doubles, log_alpha: Doubles | float, theta: Doubles, c
 
     ``inside_s`` is how far a time is inside the speech: -sigma before it, nu after it.
     """
-    weights: Doubles = log_alpha - np.copysign(theta * np.abs(inside_s) ** c, inside_s)
-    return weights
+    return log_alpha - np.copysign(theta * np.abs(inside_s) ** c, inside_s)
 
 
 def log_pause(log_right: Doubles, log_left: Doubles, pause_s: Doubles) -> Doubles:

@@ -221,8 +221,7 @@ def _typical_durations(syllables: Sequence[Syllable], table: PhoneTable) -> Doub
 
 def _duration_cost(ratio: Doubles) -> Doubles:
     """Return the cost of a duration, given its ratio to the typical duration."""
-    misfit: Doubles = 0.5 * (np.log(ratio) / _DURATION_SD) ** 2
-    return misfit
+    return 0.5 * (np.log(ratio) / _DURATION_SD) ** 2
 
 
 def _trace_back(best: NDArray[np.int16]) -> list[_Assignment]:
