@@ -71,14 +71,14 @@ class ClientCore:
         self._is_diagnosing = False  # searching for the reason why control does not answer
         self._inboxes: dict[SessionCore, list[Inbox]] = {}
         self._events: Connection | None = None
-        self._closed: KouxingError | None = None  # reason why this client is closed
+        self._close_reason: KouxingError | None = None  # None while this client is open
         self._commands = self._connect()
 
     def request(self, kind: str, session: str = "", **fields: object) -> Future[Fields]:
         """Send a request to control; the future gets the answer's fields, or ``Refused``."""
-        if self._closed is not None:
+        if self._close_reason is not None:
             answer = new_future()
-            answer.set_exception(self._closed)
+            answer.set_exception(self._close_reason)
             return answer
         name = secrets.token_hex(8)
         parts = encode(kind, session, {**fields, "request": name})
@@ -130,8 +130,8 @@ class ClientCore:
         """Pass a session's events to an inbox, even after the session has ended."""
         self._inboxes.setdefault(session, []).append(inbox)
         self._watch(session.name, on=True)
-        if self._closed is not None:
-            inbox.end(self._closed)
+        if self._close_reason is not None:
+            inbox.end(self._close_reason)
 
     def remove_inbox(self, session: SessionCore, inbox: Inbox) -> None:
         """Stop passing events to an inbox."""
@@ -148,7 +148,7 @@ class ClientCore:
         now_s = self._sockets.now_s
         has_failed = bool(self.sessions) and self._is_refused()
         for request in self._requests.values():
-            has_failed |= now_s > request.end_s or self._is_late(request)
+            has_failed |= now_s > request.end_s or self._needs_check(request)
             if request.retry_s <= now_s <= request.end_s:
                 self._send(request)
         if has_failed and not self._is_diagnosing:
@@ -163,7 +163,7 @@ class ClientCore:
 
     def close(self, failure: KouxingError) -> None:
         """End all sessions, and answer all requests, also later ones, with a failure."""
-        self._closed, self._events = failure, None
+        self._close_reason, self._events = failure, None
         for request in self._requests.values():
             request.answer.set_exception(failure)
         self._requests.clear()
@@ -192,17 +192,17 @@ class ClientCore:
         """Return whether control has rejected this key for longer than a temporary penalty."""
         return self._sockets.now_s > self._refused_s + self._timeout_s
 
-    def _is_late(self, request: _Request) -> bool:
-        """Return whether control should have started, and its address is not checked yet."""
+    def _needs_check(self, request: _Request) -> bool:
+        """Return whether to check control's address: control should have started, but has not."""
         is_due = self._sockets.now_s > request.start_s
         return is_due and not request.is_checked and not self._has_started
 
     def _fail_requests(self, reason: str) -> None:
         """End requests without an answer, and all sessions if control rejects this key."""
         self._is_diagnosing = False
-        failure = NotConnected(self._failure(reason))
+        failure = NotConnected(self._failure_text(reason))
         for name, request in list(self._requests.items()):
-            is_unanswerable = self._is_late(request) and reason == NO_LISTENER
+            is_unanswerable = self._needs_check(request) and reason == NO_LISTENER
             if self._sockets.now_s > request.end_s or is_unanswerable:
                 self._requests.pop(name).answer.set_exception(failure)
                 if kind_of(request.parts) == "open-session":
@@ -212,8 +212,8 @@ class ClientCore:
             for session in self.sessions:
                 session.end(failure)
 
-    def _failure(self, reason: str) -> str:
-        """Return the text of an error; ``reason``: why control cannot be reached, if known."""
+    def _failure_text(self, reason: str) -> str:
+        """Return an error text. ``reason`` says why control cannot be reached, or is empty."""
         address, _, key = self._control.partition(" ")
         if reason:
             return f"control at {address} does not answer: {reason}"
@@ -258,16 +258,16 @@ class ClientCore:
         def on_status(answer: Future[Status]) -> None:
             try:
                 state = newest_session(answer.result(), session.name)
-                if not session.is_about(state["session"], state["session_id"]):
-                    session.end(None)  # another session has its name now
-                    return
             except Refused as refusal:
                 if refusal.code == "unknown-session":
                     session.end(None)
+                return
             except KouxingError:
                 return  # control may restart
-            else:
+            if session.is_about(state["session"], state["session_id"]):
                 session.set_endpoints({name: state[name] for name in ("phones", "faps")})
+            else:
+                session.end(None)  # another session has its name now
 
         self.status(session.name).add_done_callback(on_status)
 

@@ -124,23 +124,23 @@ class Follower:
         KouxingError
             If an endpoint is missing or malformed.
         """
-        self._stop_waiting()
+        self._accept_all_early()
         names = {cls.published_at for cls in self._classes}
         if missing := sorted(names - endpoints.keys()):
             raise KouxingError(f"session {self.session} has no endpoint {missing[0]!r}")
         addresses = {endpoints[name] for name in names}
-        stays = bool(addresses & self._addresses)
-        has_incomplete = self._old_connection is not None and not self.is_complete
-        replaced, self._live_addresses = self._connection, set()
+        keeps_publisher = bool(addresses & self._addresses)
+        is_joining = self._old_connection is not None and not self.is_complete
+        previous, self._live_addresses = self._connection, set()
         if self._is_paced and "faps" in names:
             self._live_addresses = {endpoints["faps"]}
         self._addresses = addresses
-        if has_incomplete and replaced is not None:
-            self._transport.close_connection(replaced)  # so far, only the old connection works
-            self._keeps_publisher = self._keeps_publisher and stays
+        if is_joining and previous is not None:
+            self._transport.close_connection(previous)  # so far, only the old connection works
+            self._keeps_publisher = self._keeps_publisher and keeps_publisher
         else:
             self._close_old_connection()
-            self._old_connection, self._keeps_publisher = replaced, stays
+            self._old_connection, self._keeps_publisher = previous, keeps_publisher
             self._newest_before, self._seen = dict(self._newest), set()
         self._close_old_due_s = math.inf
         self._first_epoch = self._first_epoch or epoch
@@ -158,7 +158,7 @@ class Follower:
         if now_s >= self._close_old_due_s:
             self._close_old_connection()
         if self._connection is not None and now_s >= self._retry_s:
-            self._stop_waiting()
+            self._accept_all_early()
             self._transport.close_connection(self._connection)
             self._subscribe()
         held_until_s = self._caught_up_at_s if self._held_frames else math.inf
@@ -169,7 +169,7 @@ class Follower:
         self._close_old_connection()
         if self._connection is not None:
             self._transport.drain(self._connection)
-        self._stop_waiting()
+        self._accept_all_early()
         self._deliver_held()
 
     def await_confirmation(self) -> Any:
@@ -229,7 +229,7 @@ class Follower:
         else:
             self._receive(message)
 
-    def _stop_waiting(self) -> None:
+    def _accept_all_early(self) -> None:
         """Accept the messages of publishers that have not confirmed the newest connection."""
         while self._early:
             self._accept_early(self._early.popitem()[1])
@@ -291,12 +291,12 @@ class Follower:
     def _is_repeated(self, message: Message) -> bool:
         """Return whether the message arrived before, on the other connection or in an epoch."""
         kind, number = message.kind, (message.epoch, message.sequence)
-        has_two = self._old_connection is not None
-        known = self._newest_before if has_two else self._newest
+        has_old_connection = self._old_connection is not None
+        known = self._newest_before if has_old_connection else self._newest
         is_numbered = message.sequence > 0
         if is_numbered and (number <= known.get(kind, _NO_NUMBER) or (kind, number) in self._seen):
             return True
-        if has_two:
+        if has_old_connection:
             self._seen.add((kind, number))
         self._epochs[message.published_at] = message.epoch
         self._newest[kind] = max(number, self._newest.get(kind, number))

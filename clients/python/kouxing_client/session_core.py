@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from kouxing_client.audio import AudioStream
@@ -163,6 +164,14 @@ class Subscription:
             self._on_result(phone)
 
 
+@dataclass(frozen=True)
+class _PendingEnd:
+    """An end of the session that takes effect at a deadline."""
+
+    deadline_s: float
+    failure: KouxingError
+
+
 class SessionCore:
     """One session: its audio, if this client opened it, and its subscriptions.
 
@@ -200,8 +209,8 @@ class SessionCore:
         self._audio: Connection | None = None
         self._subscriptions: list[Subscription] = []
         self._resubscribe_end_s = 0.0  # audio waits for subscriptions until this time
-        self._unknown: tuple[float, Refused] | None = None  # unknown to the recognizer
-        self._closing: tuple[float, str] | None = None  # deadline and reason of control
+        self._unknown: _PendingEnd | None = None  # the recognizer does not have the session
+        self._closed: _PendingEnd | None = None  # control has closed the session
 
     def is_about(self, name: str, session_id: str | None) -> bool:
         """Return whether a message with this session name and id is about this session.
@@ -285,10 +294,10 @@ class SessionCore:
         now_s = self.sockets.now_s
         for subscription in self._subscriptions:
             subscription.tick()
-        if self._closing and now_s > self._closing[0]:
-            self.end(KouxingError(f"control has closed the session: {self._closing[1]}"))
-        elif self._unknown and now_s > self._unknown[0] + MOVE_TIMEOUT_S:
-            self.end(self._unknown[1])
+        ends = (self._closed, self._unknown)
+        due = [pending for pending in ends if pending is not None and now_s > pending.deadline_s]
+        if due:
+            self.end(due[0].failure)
         elif self.stream is not None:
             if self.stream.is_stuck(now_s):
                 self._reconnect(self.stream)
@@ -296,7 +305,9 @@ class SessionCore:
 
     def close_after_results(self, reason: str) -> None:
         """End after the last results have arrived: control has closed the session."""
-        self._closing = self._closing or (self.sockets.now_s + LAST_RESULTS_WAIT_S, reason)
+        if self._closed is None:
+            failure = KouxingError(f"control has closed the session: {reason}")
+            self._closed = _PendingEnd(self.sockets.now_s + LAST_RESULTS_WAIT_S, failure)
 
     def end(self, failure: KouxingError | None) -> None:
         """Close all connections; ``failure`` is the reason for an early end."""
@@ -338,7 +349,8 @@ class SessionCore:
         elif kind == "error":
             error = refused(fields)
             if error.code == "unknown-session":  # the recognizer restarted
-                self._unknown = self._unknown or (self.sockets.now_s, error)
+                deadline_s = self.sockets.now_s + MOVE_TIMEOUT_S
+                self._unknown = self._unknown or _PendingEnd(deadline_s, error)
             elif error.code == "bad-message":  # a chunk that is never acknowledged
                 self.end(error)
             else:

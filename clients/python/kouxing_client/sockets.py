@@ -22,7 +22,7 @@ LIVE_BUFFER_BYTES = 65_536  # in the kernel: some seconds of FAP frames, over an
 RECONNECT_MS = (20, 50)  # initial and maximum interval between attempts to connect
 CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
-_REACH_S = 1.0  # limit for finding out why an address does not answer
+_EXPLAIN_TIMEOUT_S = 1.0  # limit for finding out why an address does not answer
 STALL_S = 0.5  # if a wait takes this much longer than requested, the process was stalled
 _MONITORED = zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CONNECT_RETRIED
 
@@ -212,7 +212,9 @@ class Sockets:
 
         def run() -> None:
             reason = (
-                explain_unreachable(host, port, _REACH_S, is_zeromq=True) if port.isdigit() else ""
+                explain_unreachable(host, port, _EXPLAIN_TIMEOUT_S, is_zeromq=True)
+                if port.isdigit()
+                else ""
             )
             self.call(lambda: on_reason(reason))
 
