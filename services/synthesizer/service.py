@@ -143,7 +143,10 @@ class SynthesizerService(SessionService):
         end_s = time.monotonic() + MAX_TURN_S
         for _ in busy:
             self._turn += 1
-            self._make_frames(busy[self._turn % len(busy)])
+            session = busy[self._turn % len(busy)]
+            self._make_frames(session)
+            if not session.events and not self._input.wait(0.0):
+                session.skip_policy.adapt(now_s)
             if time.monotonic() > end_s:
                 break
         return now_s if busy else due_s

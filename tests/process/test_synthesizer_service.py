@@ -143,6 +143,23 @@ def test_a_session_continues_if_its_new_lip_model_cannot_be_loaded(
     assert {tuple(frame.shapes) for frame in service.frames("gap")} == {("vrm",)}
 
 
+def test_frames_of_a_client_with_a_slow_clock_are_made_at_once(
+    service: RecordingSynthesizer,
+) -> None:
+    service.receive_progress("gap", 1, 0.1)
+    skip_policy = service._sessions["gap"].skip_policy
+    skip_policy._due_s = time.monotonic() - 10.0  # it has fallen behind over hours
+    was_at_once = []
+    for sequence in range(2, 52):
+        num_before = len(service.frames("gap"))
+        service.receive_progress("gap", sequence, 0.08 + 0.02 * sequence)
+        was_at_once.append(len(service.frames("gap")) > num_before)
+        service.on_tick(time.monotonic())
+        assert len(service.frames("gap")) > num_before
+    assert not was_at_once[0], "newer events may have arrived"
+    assert was_at_once[-1]
+
+
 def test_a_gap_does_not_delay_other_sessions(service: RecordingSynthesizer) -> None:
     service.receive_progress("gap", 1, 9.9)
     assert len(service.frames("gap")) == round(MAX_BURST_S * RATE_HZ)

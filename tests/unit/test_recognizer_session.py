@@ -307,6 +307,13 @@ def test_does_not_wait_for_audio_from_before_an_interruption() -> None:
     assert take(session, 8, 10, now_s=60.1) == [8], "a later gap is filled again"
 
 
+def test_does_not_wait_before_the_end_of_an_interrupted_stream() -> None:
+    session = make_session()
+    assert take(session, 1, 2) == [1, 2]
+    session.on_flush(6, 5.0)  # 3 to 5 were never sent; 6 ends the audio
+    assert take(session, 6) == [6]
+
+
 def test_after_the_end_a_replacement_needs_no_audio_message(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

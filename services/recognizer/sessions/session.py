@@ -139,7 +139,7 @@ class RecognizerSession:
         acknowledgements resends them. Until then, or for ``RESEND_WAIT_S``, later messages are
         dropped. Returns whether the message was accepted.
         """
-        is_next = message.sequence - 1 in (self.last_sequence, self.flushed_sequence)
+        is_next = message.sequence - 1 <= max(self.last_sequence, self.flushed_sequence)
         if message.acknowledge and self.last_sequence and not is_next:
             self._gap_since_s = now_s if self._gap_since_s is None else self._gap_since_s
             if now_s < self._gap_since_s + RESEND_WAIT_S:
