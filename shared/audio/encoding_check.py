@@ -4,6 +4,7 @@ Such data sounds like loud noise. Real noise may be equally loud. Data is theref
 if the same bytes are plausible sound in another encoding, or contain the frames of a codec.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import av
@@ -19,8 +20,8 @@ from kouxing.shared.errors import UserError
 BLOCK_SAMPLES = 2400  # per channel, checked together; a multiple of all sample sizes
 _MAX_BLOCKS = 60  # non-silent blocks after which the check ends
 _MAX_REJECTED_BLOCKS = 2  # blocks that are not PCM after which the data is rejected
-_MIN_SOUND = 3  # blocks of sound that end the check
-_SEGMENT = 200  # samples of a spectrum
+_MIN_SOUND_BLOCKS = 3  # blocks of sound after which the check ends
+_SEGMENT_SAMPLES = 200  # in a spectrum
 _MAX_SAMPLE = 1.5  # largest plausible sample in another encoding
 _SILENCE, _QUIET, _AUDIBLE = 0.01, 0.003, 0.05  # root mean square, of full scale
 # Ranges of misread data, and of the reading with the right encoding.
@@ -90,50 +91,48 @@ class EncodingCheck:
             self._judge(np.frombuffer(block, np.uint8))
 
     def _judge(self, data: NDArray[np.uint8]) -> None:
-        channels = (data.view("<i2") / FULL_SCALE).reshape(-1, self._num_channels).T
+        """Count a block as sound, or as another encoding; a silent block does not count."""
+        samples = data.view("<i2")
+        channels = (samples / FULL_SCALE).reshape(-1, self._num_channels).T
         if channels.std(axis=1).max() < _SILENCE:
             self._packet_starts.clear()
             return
-        measures = [_measure(channel) for channel in channels]
-        flatness, correlation, rms = max(measures, key=lambda measure: measure.rms)
         self._num_blocks += 1
         self._is_done = self._num_blocks >= _MAX_BLOCKS
+        measures = [_measure(channel) for channel in channels]
+        flatness, correlation, rms = max(measures, key=lambda measure: measure.rms)
         white = [
             measure.flatness
             for measure in measures
             if measure.rms > _MIN_WIDE_RMS and measure.flatness > _MIN_WIDE_FLATNESS
         ]
-        if not white:
+        is_white = bool(white)
+        if is_white:
+            flatness = max(white)
+        else:
             self._packet_starts.clear()
-        flatness = max(white, default=flatness)
         is_narrow = (
             rms > _MIN_NARROW_RMS
             and flatness > _MIN_NARROW_FLATNESS
             and correlation < _MAX_NARROW_CORRELATION
-            and len(np.unique(data.view("<i2"))) > _MIN_DISTINCT
+            and len(np.unique(samples)) > _MIN_DISTINCT
         )
         readings = {
             name: self._measure_loudest(_decode(data, codec)) for name, codec in _CODECS.items()
         }
-        likely = [
-            (reading.flatness, name)
-            for name, reading in readings.items()
-            if (is_narrow if name in _NARROW else white and reading.flatness < _MAX_SOUND_FLATNESS)
-            and flatness > _MIN_GAIN * reading.flatness
-            and reading.correlation > _MIN_READ_CORRELATION
-            and reading.rms > _QUIET
-        ]
+        likely = _likely_encoding(readings, flatness, is_white=is_white, is_narrow=is_narrow)
         if likely:
-            self._reject(min(likely)[1])
-        elif white and self._is_compressed(data[::2]):
-            self._reject("compressed data")
-        elif not white and (
+            self._reject(likely)
+        elif is_white:
+            if self._is_compressed(data[::2]):
+                self._reject("compressed data")
+        elif (
             correlation > _MIN_SOUND_CORRELATION
             and rms > _AUDIBLE
             and flatness < min(reading.flatness for reading in readings.values())
         ):
             self._num_sound += 1
-            self._is_done = self._num_sound == _MIN_SOUND
+            self._is_done = self._num_sound == _MIN_SOUND_BLOCKS
 
     def _reject(self, kind: str) -> None:
         self._rejected_encodings.append(kind)
@@ -162,6 +161,25 @@ class EncodingCheck:
         return _measure(channels[:, channels.std(axis=0).argmax()])
 
 
+def _likely_encoding(
+    readings: Mapping[str, Measure], flatness: float, *, is_white: bool, is_narrow: bool
+) -> str:
+    """Return the encoding in which a block is the most plausible sound; empty if in none.
+
+    ``readings`` are the measures of the block in each encoding, and ``flatness`` is that of its
+    16-bit samples. These are ``is_white`` if they may be misread wide samples, and ``is_narrow`` if
+    they may be misread 8-bit samples.
+    """
+    plausible = []
+    for name, reading in readings.items():
+        may_be_wide = is_white and reading.flatness < _MAX_SOUND_FLATNESS
+        may_be = is_narrow if name in _NARROW else may_be_wide
+        is_sound = reading.correlation > _MIN_READ_CORRELATION and reading.rms > _QUIET
+        if may_be and is_sound and flatness > _MIN_GAIN * reading.flatness:
+            plausible.append((reading.flatness, name))
+    return min(plausible, default=(0.0, ""))[1]
+
+
 def _decode(data: NDArray[np.uint8], codec: str) -> Floats:
     """Decode bytes as samples of one channel."""
     decoder: Any = av.CodecContext.create(codec, "r")
@@ -173,8 +191,10 @@ def _decode(data: NDArray[np.uint8], codec: str) -> Floats:
 
 def _measure(samples: Doubles) -> Measure:
     samples = samples - samples.mean()
-    segments = np.lib.stride_tricks.sliding_window_view(samples, _SEGMENT)[:: _SEGMENT // 2]
-    power = (np.abs(np.fft.rfft(segments * np.hanning(_SEGMENT))) ** 2).mean(axis=0)[1:]
+    segments = np.lib.stride_tricks.sliding_window_view(samples, _SEGMENT_SAMPLES)[
+        :: _SEGMENT_SAMPLES // 2
+    ]
+    power = (np.abs(np.fft.rfft(segments * np.hanning(_SEGMENT_SAMPLES))) ** 2).mean(axis=0)[1:]
     power += 1e-9 * power.mean() + 1e-12
     flatness = np.exp(np.log(power).mean()) / power.mean()
     variance = (samples**2).mean() + 1e-12

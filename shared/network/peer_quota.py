@@ -58,10 +58,10 @@ class PeerQuota:
                 known.append(connection)
         silent.reverse()
         ranks: dict[PeerConnection, int] = {}  # among the connections of the same owner, from 1
-        nums: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
         for connection in (*services, *known, *silent):
-            nums[connection.owner] += 1
-            ranks[connection] = nums[connection.owner]
+            counts[connection.owner] += 1
+            ranks[connection] = counts[connection.owner]
         clients = known + silent
         max_services = 2 * self.max_clients - min(len(clients), self.max_clients)
         for group, limit in ((clients, self.max_clients), (services, max_services)):

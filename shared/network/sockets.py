@@ -271,10 +271,10 @@ class Socket:
                 self._connection.topics.discard(subscription)
             if self._connection.is_disconnected:
                 return
-        may = grant is None or may_subscribe(grant, subscription)  # everyone may without keys
+        is_allowed = grant is None or may_subscribe(grant, subscription)  # None: without keys
         if verb == b"\x00":
             self.raw.setsockopt(zmq.UNSUBSCRIBE, subscription)
-        elif verb == b"\x01" and may:
+        elif verb == b"\x01" and is_allowed:
             self.raw.setsockopt(zmq.SUBSCRIBE, subscription)
             self._add_subscription(subscription)
             self._confirm_subscription(subscription)

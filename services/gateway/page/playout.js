@@ -47,6 +47,34 @@ class Streak {
 }
 
 /**
+ * Detects that a sender sends long chunks: their frames arrive in bursts, which start late and end on time, with
+ * nothing between them. After a pause, the stream stays late. On a busy machine, frames also arrive between the bursts.
+ */
+class LongChunkDetector {
+  isDetected = false;
+  #burst = null; // { sinceMs, offsetMs: the offset before it }, until the frames are on time again
+  #numBursts = 0; // with nothing between them
+  #burstEndMs = 0; // end of the last one
+
+  /** Record the arrival of a frame. offsetMs: of the playout clock; null before the first arrival. */
+  frameArrived(nowMs, latenessMs, offsetMs) {
+    if (this.#burst !== null) {
+      const hasEnded = latenessMs <= this.#burst.offsetMs;
+      if (hasEnded) {
+        this.#numBursts++;
+        this.#burstEndMs = nowMs;
+      }
+      if (this.#numBursts >= NUM_BURSTS) this.isDetected = true;
+      if (hasEnded || nowMs - this.#burst.sinceMs > BURST_MS) this.#burst = null;
+    } else if (offsetMs !== null && latenessMs > offsetMs + RESTART_ERROR_MS) {
+      this.#burst = { sinceMs: nowMs, offsetMs };
+    } else if (nowMs - this.#burstEndMs > BURST_GAP_MS) {
+      this.#numBursts = 0;
+    }
+  }
+}
+
+/**
  * The playout clock.
  *
  * Media time m is shown and audible at m + offset on the page's clock. Sound arrives immediately, its FAP
@@ -79,14 +107,11 @@ export class Playout {
   #lateFrames;
   #lateSound;
   #earlyFrames;
-  #burst = null; // { sinceMs, offsetMs: the offset before it } of frames, until the frames are on time again
-  #numBursts = 0; // with nothing between them
-  #burstEndMs = 0; // end of the last one
-  #hasLongChunks = false;
+  #longChunks;
   #lateSounds = new SlidingWindow(HOLD_MS); // offsets at which late sound is played completely
   #holding = new Streak(); // while there is late sound
   #heldMs = null; // the offset for late sound
-  #usual = null; // { waitMs: of the latest sound until it is played, onTimeMs: maximum lateness of sound on time }
+  #usualSound = null; // { waitMs: of the latest sound until it is played, onTimeMs: maximum lateness of sound on time }
 
   constructor() {
     this.reset();
@@ -94,10 +119,8 @@ export class Playout {
 
   /** Start again with another session. */
   reset() {
-    this.#burst = null;
-    this.#numBursts = 0;
-    this.#hasLongChunks = false;
-    this.#usual = null;
+    this.#longChunks = new LongChunkDetector();
+    this.#usualSound = null;
     this.#release();
     this.#restart();
   }
@@ -147,9 +170,9 @@ export class Playout {
     const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const outputMs = Math.max(this.imageDelayMs, this.outputLatencyMs);
     const isEarly = this.#offsetMs !== null && latenessMs + outputMs < this.#offsetMs - RESTART_ERROR_MS;
-    const maxEarlyMs = this.#hasLongChunks ? RESTART_EARLY_WITH_LONG_CHUNKS_MS : RESTART_EARLY_FOR_MS;
+    const maxEarlyMs = this.#longChunks.isDetected ? RESTART_EARLY_WITH_LONG_CHUNKS_MS : RESTART_EARLY_FOR_MS;
     if (this.#earlyFrames.update(nowMs, isEarly) > maxEarlyMs) this.#restart(); // the others were delayed
-    this.#countBursts(nowMs, latenessMs);
+    this.#longChunks.frameArrived(nowMs, latenessMs, this.#offsetMs);
     if (this.#isLate(nowMs, latenessMs, this.#lateFrames)) return;
     this.#start(nowMs, latenessMs + FIRST_FRAME_DELAY_MS, Infinity);
     this.frames.add(nowMs, latenessMs);
@@ -173,7 +196,7 @@ export class Playout {
     if (this.#offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
     if (this.frames.count < MIN_FRAMES) return;
     this.#adjustedMs = nowMs;
-    const { percentile, marginMs, jumpMs } = this.isAudible || this.#hasLongChunks ? WITH_SOUND : WITHOUT_SOUND;
+    const { percentile, marginMs, jumpMs } = this.isAudible || this.#longChunks.isDetected ? WITH_SOUND : WITHOUT_SOUND;
     let latestMs = this.frames.percentile(percentile) + this.imageDelayMs;
     if (this.isAudible && this.soundStarts.count) {
       // The lateness of a long chunk of sound is the lateness of its first sample.
@@ -185,16 +208,16 @@ export class Playout {
     if (Math.abs(errorMs) > jumpMs) this.#offsetMs += errorMs / 2;
     if (!this.#holding.holds && this.soundStarts.count) {
       const waitMs = Math.max(0, this.#offsetMs - this.soundStarts.percentile(percentile));
-      this.#usual = { waitMs, onTimeMs: this.soundEnds.percentile(0.05) + ON_TIME_MS };
+      this.#usualSound = { waitMs, onTimeMs: this.soundEnds.percentile(0.05) + ON_TIME_MS };
     }
   }
 
   /** Raise the offset for late sound, until sound is on time. */
   #holdLateSound(nowMs, startMs, endMs) {
-    if (this.#usual === null || this.#offsetMs === null || !this.isAudible) return;
-    if (endMs <= this.#usual.onTimeMs) this.#release();
+    if (this.#usualSound === null || this.#offsetMs === null || !this.isAudible) return;
+    if (endMs <= this.#usualSound.onTimeMs) this.#release();
     else if (startMs + this.outputLatencyMs > this.#offsetMs) {
-      this.#lateSounds.add(nowMs, startMs + this.#usual.waitMs);
+      this.#lateSounds.add(nowMs, startMs + this.#usualSound.waitMs);
     }
   }
 
@@ -228,7 +251,7 @@ export class Playout {
   #start(nowMs, frameOffsetMs, soundOffsetMs) {
     if (this.#offsetMs === null) this.#startMs = nowMs;
     else if (nowMs - this.#startMs > START_MS) return;
-    const choose = (first, next) => (this.#hasLongChunks && first < Infinity ? first : Math.min(first, next));
+    const choose = (first, next) => (this.#longChunks.isDetected && first < Infinity ? first : Math.min(first, next));
     const frameMs = choose(this.#firstFrameMs, frameOffsetMs);
     const soundMs = choose(this.#firstSoundMs, soundOffsetMs);
     if (frameMs === this.#firstFrameMs && soundMs === this.#firstSoundMs) return;
@@ -241,26 +264,6 @@ export class Playout {
   }
 
   /**
-   * Count the bursts of frames: they start late and end on time. After a pause, the stream stays late. On a
-   * busy machine, frames also arrive between the bursts.
-   */
-  #countBursts(nowMs, latenessMs) {
-    if (this.#burst !== null) {
-      const hasEnded = latenessMs <= this.#burst.offsetMs;
-      if (hasEnded) {
-        this.#numBursts++;
-        this.#burstEndMs = nowMs;
-      }
-      if (this.#numBursts >= NUM_BURSTS) this.#hasLongChunks = true;
-      if (hasEnded || nowMs - this.#burst.sinceMs > BURST_MS) this.#burst = null;
-    } else if (this.#offsetMs !== null && latenessMs > this.#offsetMs + RESTART_ERROR_MS) {
-      this.#burst = { sinceMs: nowMs, offsetMs: this.#offsetMs };
-    } else if (nowMs - this.#burstEndMs > BURST_GAP_MS) {
-      this.#numBursts = 0;
-    }
-  }
-
-  /**
    * Return whether data is too late to measure the usual delay. Data that was delayed by the network
    * or by a busy page arrives in one burst whose end is on time. If later data is also late, the
    * sender paused. Start again after a pause, or if media time jumped ahead.
@@ -269,7 +272,7 @@ export class Playout {
     if (this.#offsetMs === null) return false;
     const lateMs = latenessMs - this.#offsetMs;
     const lateForMs = streak.update(nowMs, lateMs > (streak.holds ? 0 : RESTART_ERROR_MS));
-    const isPaused = lateForMs > RESTART_LATE_FOR_MS || (streak.holds && this.#hasLongChunks);
+    const isPaused = lateForMs > RESTART_LATE_FOR_MS || (streak.holds && this.#longChunks.isDetected);
     if (isPaused || lateMs < -MAX_BEHIND_MS) this.#restart();
     return this.#offsetMs !== null && streak.holds;
   }
