@@ -97,13 +97,18 @@ def read_fap(path: Path) -> FapAnimation:
             f"{path}, line {number}: {error}; use a .fap file of version {_VERSION}"
         ) from error
     faps[:, 0], faps[:, 1] = visemes[:, 0], expressions[:, 0]
+    _complete_lips(faps, used)
+    used_visemes, used_expressions = visemes if used[0] else None, expressions if used[1] else None
+    return FapAnimation(name, frame_rate_hz, faps, used_visemes, used_expressions)
+
+
+def _complete_lips(faps: Floats, used: Mask) -> None:
+    """Copy the FAPs of the inner lips to the outer lips, or vice versa, if a file lacks one."""
     for inner, outer in _LIP_PAIRS.items():
         if used[inner - 1] and not used[outer - 1]:
             faps[:, outer - 1] = faps[:, inner - 1]
         elif used[outer - 1] and not used[inner - 1]:
             faps[:, inner - 1] = faps[:, outer - 1]
-    used_visemes, used_expressions = visemes if used[0] else None, expressions if used[1] else None
-    return FapAnimation(name, frame_rate_hz, faps, used_visemes, used_expressions)
 
 
 def write_fap(path: Path, animation: FapAnimation) -> None:

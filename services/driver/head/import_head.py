@@ -286,36 +286,21 @@ class _HeadImport:
             fields[fap][skin] = field
         roles = np.zeros(len(self._welded), np.int8)
         tree = cKDTree(self._welded[skin])
-        chin, lips = (self._welded[self._points[name]] for name in ("2.1", "2.2"))
         for component in range(int(self._component.max()) + 1):
             rows = np.flatnonzero(self._component == component)
             if component == self._component[skin[0]] or len(rows) < 3:
                 continue
             low, high = self._welded[rows].min(axis=0), self._welded[rows].max(axis=0)
-            middle, size = (low + high) / 2, high - low
-            eye = self._eye_of(middle, size)
-            if eye:
+            middle = (low + high) / 2
+            if eye := self._eye_of(middle, high - low):
                 roles[rows] = eye
                 self._eyes[eye - 1] = middle
                 thrust = np.tile([0.0, 0.0, fapu["ES"] / FAP_UNITS_PER_FAPU], (len(rows), 1))
                 fields.setdefault(26 + eye, np.zeros_like(self._welded))[rows] = thrust
-            elif (
-                np.abs(middle[0] - lips[0]) < 0.6 * fapu["MW"]
-                and high[2] < lips[2] + 0.1 * fapu["ES"]
-                and low[2] > lips[2] - 1.8 * fapu["ES"]
-                and size[0] < 1.5 * fapu["MW"]
-                and low[1] > chin[1]
-                and high[1] < lips[1] + 1.5 * fapu["MNS"]
-            ):
-                moved: FapFields = {}
-                tip, body = (self._points.get(name) for name in ("6.1", "6.2"))
-                if tip is not None and self._component[tip] == component:
-                    moved = face.tongue_fields(self._welded, rows, tip, body)
-                if moved or middle[1] < lips[1]:
-                    moved |= face.jaw_fields(self._welded[rows])
-                for fap, field in moved.items():
+            elif self._is_in_mouth(low, high, fapu):
+                for fap, field in self._mouth_fields(face, component, rows, middle).items():
                     fields.setdefault(fap, np.zeros_like(self._welded))[rows] = field
-            else:
+            else:  # such as hair and lashes: they follow the nearest skin
                 distance, nearest = tree.query(self._welded[rows])
                 weight = np.clip(1 - distance / (0.25 * fapu["ES"]), 0, 1)[:, None]
                 for fap, field in face.fields.items():
@@ -324,11 +309,32 @@ class _HeadImport:
             self._warnings.append("no eyeballs separate from the skin: the eyes do not rotate")
         return {fap: field[self._weld_of] for fap, field in fields.items()}, roles[self._weld_of]
 
+    def _is_in_mouth(self, low: Doubles, high: Doubles, fapu: dict[str, float]) -> bool:
+        """Return whether an object with these corners is behind the lips: teeth or a tongue."""
+        chin, lips = (self._welded[self._points[name]] for name in ("2.1", "2.2"))
+        is_in_middle = np.abs((low[0] + high[0]) / 2 - lips[0]) < 0.6 * fapu["MW"]
+        is_narrow = high[0] - low[0] < 1.5 * fapu["MW"]
+        is_at_height = low[1] > chin[1] and high[1] < lips[1] + 1.5 * fapu["MNS"]
+        is_behind = low[2] > lips[2] - 1.8 * fapu["ES"] and high[2] < lips[2] + 0.1 * fapu["ES"]
+        return bool(is_in_middle and is_narrow and is_at_height and is_behind)
+
+    def _mouth_fields(
+        self, face: SkinFields, component: int, rows: Integers, middle: Doubles
+    ) -> FapFields:
+        """Return the fields of an object in the mouth; the upper teeth have none."""
+        tip, body = (self._points.get(name) for name in ("6.1", "6.2"))
+        fields: FapFields = {}
+        if tip is not None and self._component[tip] == component:
+            fields = face.tongue_fields(self._welded, rows, tip, body)
+        if fields or middle[1] < self._welded[self._points["2.2"]][1]:
+            fields |= face.jaw_fields(self._welded[rows])
+        return fields
+
     def _eye_of(self, middle: Doubles, size: Doubles) -> int:
         """Return 1 for the left eyeball, 2 for the right eyeball, 0 for other objects."""
-        round_enough = size.min() > 0.4 * size.max() and 0.1 < size.max() / EYE_DISTANCE_M < 0.9
+        is_round = size.min() > 0.4 * size.max() and 0.1 < size.max() / EYE_DISTANCE_M < 0.9
         for number, eye in enumerate(self._eyes, start=1):
-            if round_enough and np.linalg.norm(middle - eye) < 0.35 * EYE_DISTANCE_M:
+            if is_round and np.linalg.norm(middle - eye) < 0.35 * EYE_DISTANCE_M:
                 return number
         return 0
 
