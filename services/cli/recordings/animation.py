@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from rich.progress import Progress
 
@@ -21,10 +21,12 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.languages import load_model_for_language
 from kouxing.services.recognizer.lips.lip_predictor import GruLipPredictor, load_lip_predictor
 from kouxing.services.recognizer.lips.mouth_profile import read_mouth_profile
-from kouxing.services.recognizer.offline.alignment import align_syllables
+from kouxing.services.recognizer.offline.alignment import Alignment, align_syllables
 from kouxing.services.recognizer.offline.offline_recognition import recognize_recording
 from kouxing.services.recording_pipeline import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import Frame
+from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.arrays import Floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -34,9 +36,10 @@ from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.fast_record import replace
 from kouxing.shared.phones.events import Phone, SoundEvent
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from kouxing.shared.phones.transcript import TimedSyllable
+from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 
 T = TypeVar("T", Phone, TimedSyllable)
+_Lips: TypeAlias = tuple[LipModel, SynthesizerConfig]  # of one face
 _IMAGE_RATE_HZ = 25.0  # rate of a video that is made from audio
 _MAX_IMAGE_RATE_HZ = 240.0
 
@@ -116,11 +119,10 @@ def animate(
     """Animate a face from an audio file.
 
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
-    equal the live services' frames with default settings. Otherwise the whole
-    recording is known, and its phones are aligned with ``text``, a text or the name of a file with
-    it, if given. ``language`` is the language of the speech. With ``text_may_differ``, a text that
-    cannot be read or does not fit the audio is reported and ignored. ``captions`` is what the
-    captions will show.
+    equal the live services' frames with default settings. Otherwise, the whole recording is known,
+    and its phones are aligned with ``text``, if given: a text, or the name of a file with it.
+    ``language`` is the language of the speech. With ``text_may_differ``, a text that cannot be read
+    or does not fit the audio is reported and ignored. ``captions`` is what the captions will show.
 
     Raises ``UserError`` if a file cannot be read, the text has nothing to say, or the captions
     cannot show its characters.
@@ -132,54 +134,20 @@ def animate(
         (load_lip_model(model.inventory.language, name), SynthesizerConfig(lips=name, **changes))
         for name in lip_models
     ]
-    transcript = None
-    try:
-        transcript = None if text is None else read_transcript(text, load_inventory(language))
-    except UserError as error:
-        if not text_may_differ:
-            raise
-        print_message(f"the text is ignored: {error}")
+    transcript = _read_transcript(text, language, may_differ=text_may_differ)
     if transcript is not None and captions is CaptionKind.CHARACTERS:
         check_characters(transcript, model.inventory)
     progress.remove_task(loading)
     samples = read_mono_16k(source, track, progress)
-    events: Sequence[SoundEvent]
-    is_text_mismatched = False
+    alignment = None
     if live:
-        pipelines = [
-            LivePipeline(model, lip_model, synthesizer=config, lip_predictor=predictor)
-            for lip_model, config in lips
-        ]
-        with_progress = partial(progress.track, description="recognizing")
-        faces = [pipeline.animate(samples, with_progress) for pipeline in pipelines]
-        events = pipelines[-1].events
+        faces, events = _animate_live(samples, model, predictor, lips, progress)
     else:
-        phones = None
         if transcript is not None:
-            with_progress = partial(progress.track, description="aligning")
-            alignment = align_syllables(model, samples, transcript.phones, with_progress)
-            report_mismatch(source, alignment)
-            if alignment.fits or not text_may_differ:
-                phones, is_text_mismatched = alignment.phones, not alignment.fits
-            else:
-                transcript = None
-        if phones is None:
-            with_progress = partial(progress.track, description="recognizing")
-            phones = recognize_recording(model, samples, with_progress)
-        with_progress = partial(progress.track, description="finding the lips")
-        recording = analyze_recording(
-            samples,
-            phones,
-            predictor,
-            is_text_known=transcript is not None,
-            with_progress=with_progress,
-        )
-        with_progress = partial(progress.track, description="animating")
-        faces = [
-            animate_recording(recording, lip_model, config, with_progress)
-            for lip_model, config in lips
-        ]
-        events = recording.events
+            alignment = _align(source, samples, model, transcript, progress)
+            if text_may_differ and not alignment.fits:
+                transcript = alignment = None
+        faces, events = _animate_recording(samples, alignment, model, predictor, lips, progress)
     spoken = [event for event in events if isinstance(event, Phone) and event.is_spoken]
     return FaceMotion(
         frames=faces[0] if len(faces) == 1 else film.stack_faces(faces),
@@ -190,8 +158,75 @@ def animate(
         syllables=spell_syllables(spoken, transcript, model.inventory),
         source=source,
         language=language,
-        is_text_mismatched=is_text_mismatched,
+        is_text_mismatched=alignment is not None and not alignment.fits,
     )
+
+
+def _read_transcript(text: str | None, language: str, *, may_differ: bool) -> Transcript | None:
+    """Read a text. If it ``may_differ`` from the audio and cannot be read, report and ignore it."""
+    try:
+        return None if text is None else read_transcript(text, load_inventory(language))
+    except UserError as error:
+        if not may_differ:
+            raise
+        print_message(f"the text is ignored: {error}")
+        return None
+
+
+def _align(
+    source: Path, samples: Floats, model: AcousticModel, transcript: Transcript, progress: Progress
+) -> Alignment:
+    """Align a text with a recording; report a text that does not fit."""
+    with_progress = partial(progress.track, description="aligning")
+    alignment = align_syllables(model, samples, transcript.phones, with_progress)
+    report_mismatch(source, alignment)
+    return alignment
+
+
+def _animate_live(
+    samples: Floats,
+    model: AcousticModel,
+    predictor: GruLipPredictor,
+    lips: Sequence[_Lips],
+    progress: Progress,
+) -> tuple[list[list[Frame]], Sequence[SoundEvent]]:
+    """Return the frames of each face and the events, as the live services make them."""
+    pipelines = [
+        LivePipeline(model, lip_model, synthesizer=config, lip_predictor=predictor)
+        for lip_model, config in lips
+    ]
+    with_progress = partial(progress.track, description="recognizing")
+    faces = [pipeline.animate(samples, with_progress) for pipeline in pipelines]
+    return faces, pipelines[-1].events
+
+
+def _animate_recording(
+    samples: Floats,
+    alignment: Alignment | None,
+    model: AcousticModel,
+    predictor: GruLipPredictor,
+    lips: Sequence[_Lips],
+    progress: Progress,
+) -> tuple[list[list[Frame]], Sequence[SoundEvent]]:
+    """Return the frames of each face and the events. Without a text, recognize the phones."""
+    if alignment is None:
+        with_progress = partial(progress.track, description="recognizing")
+        phones = recognize_recording(model, samples, with_progress)
+    else:
+        phones = alignment.phones
+    with_progress = partial(progress.track, description="finding the lips")
+    recording = analyze_recording(
+        samples,
+        phones,
+        predictor,
+        is_text_known=alignment is not None,
+        with_progress=with_progress,
+    )
+    with_progress = partial(progress.track, description="animating")
+    faces = [
+        animate_recording(recording, lip_model, config, with_progress) for lip_model, config in lips
+    ]
+    return faces, recording.events
 
 
 @lru_cache(maxsize=1)
