@@ -310,7 +310,7 @@ def test_an_error_keeps_its_status_if_its_log_is_full() -> None:
         assert subprocess.run(command, cwd=ROOT, stderr=full, check=False).returncode == 2
 
 
-def test_an_empty_argument_is_refused() -> None:
+def test_an_empty_argument_is_rejected() -> None:
     refused = kouxing("render", VOWELS_FILE, "")
     assert (refused.returncode, "an argument is empty" in refused.stderr) == (2, True)
 
@@ -332,7 +332,7 @@ def test_an_output_that_cannot_be_written_gives_one_line(
     assert done.returncode == 2
 
 
-def test_a_refused_overwrite_gives_one_line(tmp_path: Path) -> None:
+def test_declining_an_overwrite_gives_one_line(tmp_path: Path) -> None:
     output = tmp_path / "my.glb"
     output.write_text("mine")
     terminal, other_end = os.openpty()

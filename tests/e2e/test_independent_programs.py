@@ -116,7 +116,7 @@ def test_one_program_streams_audio_and_another_receives_the_faps(system: System)
     watcher.close()
 
 
-def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(system: System) -> None:
+def test_an_observer_of_an_unknown_kind_takes_part(system: System) -> None:
     program = IndependentProgram()
     lamp = program.socket(zmq.DEALER, system.control, load_key("lamp", ("service:lamp",)))
     heartbeat: dict[str, Any] = {

@@ -120,7 +120,7 @@ def test_drops_audio_that_arrives_after_its_flush(service: Recognizer) -> None:
     assert session.audio.media_time == 3 * 640
 
 
-def test_hears_a_repeated_message_once_and_acknowledges_it_again(service: Recognizer) -> None:
+def test_delivers_a_repeated_message_once_and_acknowledges_it_again(service: Recognizer) -> None:
     service.start_session(UNPACED)
     session = service._sessions["s"]
     for number in range(2):

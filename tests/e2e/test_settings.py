@@ -70,7 +70,7 @@ def test_lips_are_switched_while_a_session_runs(client: Client) -> None:
     np.testing.assert_allclose(streamed.faps, frames_of_the_pipeline("learned"), atol=0.5)
 
 
-def test_refuses_one_session_too_many_and_the_others_continue(
+def test_rejects_one_session_too_many_and_the_others_continue(
     system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])

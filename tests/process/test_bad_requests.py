@@ -98,7 +98,7 @@ async def test_an_invalid_message_closes_the_connection(
 
 
 @pytest.mark.parametrize("length", [b"Content-Length: 99999999", b"Transfer-Encoding: chunked"])
-def test_a_refused_body_is_not_read(gateway: Gateway, length: bytes) -> None:
+def test_a_rejected_body_is_not_read(gateway: Gateway, length: bytes) -> None:
     request = b"POST /sound HTTP/1.1\r\nHost: 127.0.0.1\r\n" + length + b"\r\n\r\n"
     with socket.create_connection(("127.0.0.1", port_of(gateway.page)), LIMIT_S) as client:
         client.sendall(request)

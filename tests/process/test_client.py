@@ -174,7 +174,7 @@ def test_the_results_report_rejected_audio_that_no_push_has_reported(
     assert list(frames) == []
 
 
-def test_audio_after_its_end_is_refused(client: Client) -> None:
+def test_audio_after_its_end_is_rejected(client: Client) -> None:
     session = client.open_session("s")
     session.finish()
     session.finish()
@@ -206,7 +206,7 @@ def test_refuses_an_address_that_cannot_work(address: str, *, insecure: bool, te
         Client(address, insecure=insecure)
 
 
-def test_unknown_keywords_and_names_are_refused(client: Client) -> None:
+def test_unknown_keywords_and_names_are_rejected(client: Client) -> None:
     options: dict[str, Any] = {"sample_rate": 48000}
     with pytest.raises(TypeError, match="did you mean 'sample_rate_hz'"):
         client.open_session(**options)

@@ -223,7 +223,7 @@ LISTEN = SetFace(session="listener", face=FaceSettings(listen_to="speaker"), req
 
 
 @pytest.mark.parametrize("harness", [True], indirect=True)
-def test_a_face_learns_when_the_session_that_it_listens_to_speaks(
+def test_a_face_is_notified_when_the_session_that_it_listens_to_speaks(
     harness: ControlHarness, listening_to: zmq.Socket[bytes]
 ) -> None:
     request(harness, listening_to, LISTEN)
@@ -250,7 +250,7 @@ def test_a_face_stops_listening_during_speech(
 
 
 @pytest.mark.parametrize("harness", [True], indirect=True)
-def test_a_face_learns_about_speech_that_started_before(
+def test_a_face_is_notified_of_speech_that_started_before(
     harness: ControlHarness, listening_to: zmq.Socket[bytes]
 ) -> None:
     send_speech(harness, active=True)

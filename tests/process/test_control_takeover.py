@@ -228,7 +228,7 @@ def test_a_session_leaves_a_worker_that_rejects_its_move(
 
 
 @pytest.mark.parametrize("missed", ["move", "move of a restored session", "end"])
-def test_an_observer_that_was_lost_learns_what_it_missed(
+def test_an_observer_that_was_lost_receives_what_it_missed(
     harness: ControlHarness, client: Socket, missed: str
 ) -> None:
     observer = harness.buses[0].connect_dealer(harness.control.endpoints["commands"])

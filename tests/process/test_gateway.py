@@ -236,7 +236,7 @@ async def test_a_slow_viewer_gets_the_newest_frames(control: FakeControl, gatewa
 
 
 @async_test
-async def test_bad_audio_is_refused_with_a_reason(control: FakeControl, gateway: Gateway) -> None:
+async def test_bad_audio_is_rejected_with_a_reason(control: FakeControl, gateway: Gateway) -> None:
     hello = json.dumps({"sample_rate_hz": 16000})
     for messages, reason in (
         (['{"sample_rate_hz": 4000}'], "sample_rate_hz"),

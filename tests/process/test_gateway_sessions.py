@@ -130,7 +130,7 @@ async def test_after_the_sample_sentence_the_requested_session_is_shown(
 
 
 @async_test
-async def test_without_control_browsers_are_told_to_start_it() -> None:
+async def test_without_control_browsers_show_how_to_start_it() -> None:
     gateway = Gateway("tcp://127.0.0.1:9")
     async with open_websockets(gateway.page, "viewer", "microphone") as (viewer, microphone):
         await receive_json(viewer, "status", missing=["control"])

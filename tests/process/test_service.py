@@ -301,7 +301,7 @@ def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
     assert worker.happened[after : after + 3] == ["input", "stop s0", "tick"]
 
 
-def test_a_restarted_control_learns_the_sessions(
+def test_a_restarted_control_receives_the_sessions(
     monkeypatch: pytest.MonkeyPatch, control: FakeControl, worker: Worker, clock: Clock
 ) -> None:
     start = replace(START, session="s0", epoch=3)

@@ -65,7 +65,7 @@ def service() -> Iterator[RecordingSynthesizer]:
     service.bus.close()
 
 
-def test_states_the_settings_of_faces_that_have_none(service: RecordingSynthesizer) -> None:
+def test_reports_the_default_settings_of_faces(service: RecordingSynthesizer) -> None:
     assert (service.facts.expressiveness, service.facts.feeling) == (1.4, 0.5)
 
 

@@ -148,7 +148,7 @@ def test_reads_a_wav_file_whose_header_states_no_length(
         ("WAV", 32, 31, 1.0),
     ],
 )
-def test_every_channel_is_heard_in_the_mix(
+def test_every_channel_is_audible_in_the_mix(
     tmp_path: Path, file_format: str, num_channels: int, channel: int, gain: float
 ) -> None:
     channels = np.zeros((8000, num_channels))

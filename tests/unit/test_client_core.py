@@ -272,7 +272,7 @@ def test_asks_where_a_silent_session_of_another_program_is(cause: str) -> None:
         assert inbox.failure is None
 
 
-def test_a_session_ends_when_control_refuses_its_key_for_long() -> None:
+def test_a_session_ends_when_control_rejects_its_key_for_long() -> None:
     harness = CoreHarness()
     inbox = harness.subscribe()
     for is_refused in (True, False, True, True):  # the first refusal is short

@@ -92,7 +92,7 @@ def test_lips_lag_by_their_delays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("babble_only_prob", [0.0, 1.0])
-def test_voices_in_the_background_only_are_no_voice(
+def test_background_voices_alone_are_not_a_voice(
     babble_only_prob: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 1)

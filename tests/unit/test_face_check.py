@@ -37,7 +37,7 @@ def test_a_face_cannot_listen_to_itself() -> None:
         ({"expressions": {"joy": 2}}, "expression joy: strength 2.0 is not between 0 and 1"),
     ],
 )
-def test_a_refused_setting_is_named(settings: dict[str, Any], text: str) -> None:
+def test_a_rejected_setting_is_named(settings: dict[str, Any], text: str) -> None:
     with pytest.raises(Rejected, match=text) as caught:
         check_face(msgspec.convert(settings, FaceSettings), LIP_MODELS)
     assert caught.value.code == "bad-face"

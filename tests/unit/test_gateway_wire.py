@@ -224,7 +224,7 @@ def texts(viewer: Viewer) -> list[dict[str, Any]]:
     return [message for message in messages if message["type"] != "status"]
 
 
-def test_a_viewer_of_a_session_that_does_not_exist_is_told_so() -> None:
+def test_a_viewer_of_a_missing_session_gets_an_error() -> None:
     viewers = make_viewers()
     with viewers.connect_viewer("", None) as viewer:
         assert texts(viewer) == []

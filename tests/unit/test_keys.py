@@ -93,7 +93,7 @@ def test_a_key_is_z85_in_every_program(text: str) -> None:
         load_user_key()
 
 
-def test_a_folder_and_a_pipe_are_no_keys_and_are_closed(tmp_path: Path) -> None:
+def test_a_folder_and_a_pipe_are_not_keys_and_are_closed(tmp_path: Path) -> None:
     def next_descriptor() -> int:
         with tmp_path.joinpath("file").open("w") as file:
             return file.fileno()

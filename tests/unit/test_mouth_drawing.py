@@ -110,6 +110,6 @@ def test_errors_name_the_mistake(
     assert not list(tmp_path.iterdir())
 
 
-def test_words_without_quotes_are_refused(tmp_path: Path) -> None:
+def test_words_without_quotes_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="in quotes"):
         lips(SOUND, ["si4", "shi4", str(tmp_path / "mouth.svg")])

@@ -151,7 +151,7 @@ def test_many_files_go_next_to_their_sources_or_into_a_folder(tmp_path: Path) ->
     assert not (tmp_path / "unused").exists()
 
 
-def test_the_output_of_standard_input_has_a_name_that_is_no_option() -> None:
+def test_the_output_of_standard_input_has_a_name_that_is_not_an_option() -> None:
     assert pair_outputs([Path("-")], None, ".mp4") == [(Path("-"), Path("stdin.mp4"))]
 
 
@@ -241,7 +241,7 @@ def test_a_file_without_permission_has_a_remedy() -> None:
     assert str(write_error(Path("out/a.csv"), denied)) == text
 
 
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
+def test_a_file_is_not_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "file" / "new"):
         error = CliRunner().invoke(app, ["export", "web", str(folder)]).exception

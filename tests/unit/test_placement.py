@@ -94,7 +94,7 @@ def test_prefers_the_worker_with_the_least_load(cluster: Cluster) -> None:
     assert open_at(cluster, 5.0) == "recognizer-2"
 
 
-def test_refuses_a_session_without_room_and_says_when_to_try_again(cluster: Cluster) -> None:
+def test_rejects_a_session_without_room_and_says_when_to_try_again(cluster: Cluster) -> None:
     for _ in range(4):
         open_at(cluster, 0.0)
     for instance in WORKERS:
@@ -119,7 +119,7 @@ def test_unpaced_sessions_of_one_key_leave_room_for_another_client(cluster: Clus
     assert cluster.sessions.open(opening, Peer(b"b", "other"), 0.0)
 
 
-def test_never_refuses_the_first_sessions_nor_one_that_moves(cluster: Cluster) -> None:
+def test_never_rejects_the_first_sessions_or_a_session_that_moves(cluster: Cluster) -> None:
     for _ in range(2 * MIN_SESSIONS):
         for instance in WORKERS:
             measure(cluster, instance, 1.0, 5.0)

@@ -63,7 +63,7 @@ def test_a_session_of_a_chosen_language_moves_only_to_a_worker_that_has_it(
     assert record.facts.language == "universal"
 
 
-def test_control_knows_the_lip_models_of_all_synthesizers(cluster: Cluster) -> None:
+def test_control_collects_the_lip_models_of_all_synthesizers(cluster: Cluster) -> None:
     for instance, lip_models in (("one", ["learned"]), ("two", ["ferguson", "learned"])):
         cluster.add(replace(worker("synthesizer", instance), lip_models=lip_models))
     assert cluster.registry.lip_models() == []  # synthesizer-1, of an older version, sends none

@@ -143,7 +143,7 @@ def test_chooses_a_set_or_names_what_is_missing(names: str, expected: str) -> No
         assert expected in str(error)  # noqa: PT017
 
 
-def test_knows_all_shapes_and_every_program_has_the_same_table() -> None:
+def test_has_all_shapes_and_every_program_has_the_same_table() -> None:
     for set_name, shapes in SHAPE_SETS.items():
         assert find_shapes(set_name, shapes.names) == dict(
             zip(shapes.names, shapes.names, strict=True)
