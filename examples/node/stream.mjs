@@ -51,8 +51,10 @@ const { session, token } = opened;
 const faps = subscribe(opened.faps, session, ["fap-frame", "end-of-faps", "joined"]); // joined last
 await faps.receive(); // joined: no later frame is missed
 
+// A global: zeromq closes a socket that no variable holds, although it is still receiving.
+const audio = connectDealer(opened.audio);
+
 async function speak() {
-  const audio = connectDealer(opened.audio);
   audio.receive().then((answer) => fail(read(answer)[1].text)); // only rejected audio is answered
   const rate = format.sample_rate_hz;
   const numFrames = Math.floor(pcm.length / frameBytes);

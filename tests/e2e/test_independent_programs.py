@@ -215,13 +215,14 @@ def client(tmp_path: Path, programs: list[list[str]]) -> list[str]:
     return [str(NODE), str(tmp_path / "stream.mjs")]
 
 
-@pytest.mark.parametrize("wav", ["stereo 24", "float 48k"])
+@pytest.mark.parametrize("wav", ["stereo 24", "float 48k", "long"])
 def test_the_client_streams_wav_files(
     system: System, tmp_path: Path, client: list[str], wav: str
 ) -> None:
     samples, rate_hz, form = {
         "stereo 24": (np.stack([SAMPLES, SAMPLES], axis=1), 16000, "PCM_24"),
         "float 48k": (np.repeat(SAMPLES, 3), 48000, "FLOAT"),
+        "long": (np.tile(SAMPLES, 8), 16000, "PCM_16"),  # memory is freed while it is spoken
     }[wav]
     soundfile.write(tmp_path / "said.wav", samples, rate_hz, form, format="WAVEX")
     arguments = [*client, str(tmp_path / "said.wav"), system.control.partition(" ")[0]]
