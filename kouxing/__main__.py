@@ -1,4 +1,4 @@
-"""Runs the command line, as ``kouxing`` or ``python -m kouxing``.
+"""Runs the command line, as ``kouxing`` or ``python -m kouxing``, and ``kouxing-rhubarb``.
 
 Ctrl-C during slow imports ends the command without a traceback.
 """
@@ -23,6 +23,15 @@ def main() -> None:
     gc.enable()
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
     run_command_line()
+
+
+def rhubarb() -> None:
+    """Run ``kouxing-rhubarb``. Ctrl-C ends it at once, because it writes its output at the end."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not in a shell's background
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from kouxing.services.cli.rhubarb import main as run_rhubarb
+
+    run_rhubarb()
 
 
 if __name__ == "__main__":

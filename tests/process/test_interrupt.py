@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -169,6 +170,13 @@ def test_a_library_cannot_turn_ctrl_c_into_a_result(tmp_path: Path, place: str) 
     printed, log = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, printed) == (130, "")
     assert "Traceback" not in log
+
+
+def test_ctrl_c_ends_rhubarb_without_a_traceback() -> None:
+    command = CTRL_C_COMMAND.replace("import main\nmain()", "import rhubarb\nrhubarb()")
+    process = start_python("-c", INTERRUPT_IN_FFMPEG + command, "-q", str(VOWELS_FILE))
+    assert process.communicate(timeout=LIMIT_S) == ("", "")
+    assert process.returncode == -signal.SIGINT
 
 
 @pytest.mark.slow
