@@ -8,7 +8,8 @@ praatio would replace only the line templates, because it does not cut overlaps.
 import csv
 import io
 import json
-from collections.abc import Callable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -24,8 +25,8 @@ def format_phones(
 ) -> str:
     """Write the spoken phones, in order, as ``table``, ``csv``, ``json`` or ``textgrid``.
 
-    ``total_s`` is the length of the recording. A TextGrid and JSON also contain the syllables of a
-    known text.
+    ``total_s`` is the length of the recording. ``syllables`` are those of a known text, which all
+    formats contain.
     """
     spoken = (phone for phone in phones if phone.is_spoken)
     numbered = [replace(phone, index=number) for number, phone in enumerate(spoken)]
@@ -42,20 +43,43 @@ def _cells(phone: Phone) -> tuple[int, str, float, float, float]:
     )
 
 
-def _format_table(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
+def _format_table(
+    phones: Sequence[Phone], _total_s: float, syllables: Sequence[TimedSyllable]
+) -> str:
     lines = ["  onset_s  duration_s  phone  confidence"]
-    for phone in phones:
+    lines[0] += "  syllable  text" if syllables else ""
+    named: TimedSyllable | None = None
+    for phone, syllable in zip(phones, _syllables_of(phones, syllables), strict=True):
         times = f"{phone.onset_s:9.3f}  {phone.duration_s:10.3f}"
-        lines.append(f"{times}  {phone.symbol:<5}  {phone.confidence:10.2f}")
+        line = f"{times}  {phone.symbol:<5}  {phone.confidence:10.2f}"
+        if syllable is not None and syllable is not named:  # its first phone
+            line += f"  {syllable.spelling:<8}  {syllable.text}"
+        named = syllable
+        lines.append(line)
     return "\n".join(lines) + "\n"
 
 
-def _format_csv(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
+def _format_csv(
+    phones: Sequence[Phone], _total_s: float, syllables: Sequence[TimedSyllable]
+) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    writer.writerows(_cells(phone) for phone in phones)
+    writer.writerow((*_COLUMNS, *(("syllable", "text") if syllables else ())))
+    for phone, syllable in zip(phones, _syllables_of(phones, syllables), strict=True):
+        words = ("", "") if syllable is None else (syllable.spelling, syllable.text)
+        writer.writerow((*_cells(phone), *(words if syllables else ())))
     return text.getvalue()
+
+
+def _syllables_of(
+    phones: Sequence[Phone], syllables: Sequence[TimedSyllable]
+) -> Iterator[TimedSyllable | None]:
+    """Yield the syllable of each phone; both are in order."""
+    for phone in phones:
+        middle_s = phone.onset_s + phone.duration_s / 2
+        index = bisect_right(syllables, middle_s, key=lambda syllable: syllable.onset_s) - 1
+        is_inside = index >= 0 and middle_s < syllables[index].end_s
+        yield syllables[index] if is_inside else None
 
 
 def _format_json(

@@ -121,6 +121,16 @@ def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:
     assert texts == [
         "", "你", "", "好", "", "", "ni3", "", "hao3", "", "", "n", "i", "", "h", "ao", "",
     ]  # fmt: skip
+    table = [
+        line.split()[2:] for line in format_phones(aligned, "table", 0.7, syllables).split("\n")
+    ]
+    assert table[:3] == [
+        ["phone", "confidence", "syllable", "text"],
+        ["n", "1.00", "ni3", "你"],
+        ["i", "1.00"],
+    ]
+    rows = csv.DictReader(io.StringIO(format_phones(aligned, "csv", 0.7, syllables)))
+    assert [row["syllable"] + row["text"] for row in rows] == ["ni3你"] * 2 + ["hao3好"] * 2
     read = json.loads(format_phones(aligned, "json", 0.7, syllables))
     assert read["syllables"][1] == {
         "text": "好", "spelling": "hao3", "onset_s": 0.4, "duration_s": 0.2,

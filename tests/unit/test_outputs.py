@@ -183,6 +183,7 @@ def test_a_bad_file_does_not_stop_the_others(capsys: pytest.CaptureFixture[str])
         ("render a.wav me.avi", "me.avi: unknown format; use a name that ends in .mp4"),
         ("render a.wav me.csv --lips lerned", "unknown lip model 'lerned'; use one of"),
         ("align a.wav 啊 -o said.xml", "ends in .txt, .csv, .json, .textgrid"),
+        ("render a.wav -o -", "-: cannot write to standard output; name a file"),
         ("render a.wav -o labels", "cannot write labels: labels is not a folder"),
         ("phones a.wav -o labels --format csv", "cannot write labels: labels is not a folder"),
         ("align a.wav 啊 -o labels", "cannot write labels: labels is not a folder"),

@@ -48,7 +48,7 @@ def pair_outputs(
 
 def is_folder(output: Path) -> bool:
     """Return whether the output of a command is a folder: it exists, or its name has no suffix."""
-    return output.is_dir() or not output.suffix
+    return output.is_dir() or not (output.suffix or str(output) == "-")
 
 
 def process_all(pairs: Sequence[tuple[Path, T]], process: Callable[[Path, T], None]) -> None:
