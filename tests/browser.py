@@ -51,7 +51,7 @@ class Browser(Chromium):
         self.wait_for("location.href === 'about:blank'")
 
     @contextlib.contextmanager
-    def drawing_seldom(self, module: str = "/draw-rate.js") -> Iterator[None]:
+    def infrequent_drawing(self, module: str = "/draw-rate.js") -> Iterator[None]:
         """Let pages draw one image in two seconds: without a GPU, an image needs 0.2 s.
 
         This applies to the shown page, and to pages that are opened in the meantime. ``module`` is

@@ -15,7 +15,7 @@ def _light_model(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+def _longer_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait longer for the first and the last frame on a busy machine."""
     for limit in (
         "kouxing_client.session_core.END_TIMEOUT_S",

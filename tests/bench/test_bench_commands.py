@@ -34,7 +34,7 @@ def _same_services(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page, "LocalSystem", run)
 
 
-def speak_patiently(sessions: Sequence[Session], sound: NDArray[np.float32]) -> Any:
+def speak_without_deadline(sessions: Sequence[Session], sound: NDArray[np.float32]) -> Any:
     """Stream audio, and also count the frames that arrive after its end, as on a busy machine."""
     all_received = live.speak(sessions, sound)
     for received in all_received:
@@ -45,7 +45,7 @@ def speak_patiently(sessions: Sequence[Session], sound: NDArray[np.float32]) -> 
 @pytest.mark.usefixtures("_same_services")
 def test_latency(speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(latency, "NUM_REPEATS", 1)
-    monkeypatch.setattr(latency, "speak", speak_patiently)
+    monkeypatch.setattr(latency, "speak", speak_without_deadline)
     monkeypatch.setattr(costs, "NUM_IMAGES", 3)
     monkeypatch.setattr(costs, "NUM_SESSIONS", (1,))
     small = [(name, detail, (64, 48), *rest) for name, detail, _, *rest in costs.CASES]

@@ -104,9 +104,9 @@ def page(browser: Browser, gateway: Gateway) -> Browser:
 
 
 @pytest.fixture
-def drawing_seldom(page: Browser) -> Iterator[None]:
+def infrequent_drawing(page: Browser) -> Iterator[None]:
     """Save processor time in a test that looks at no image."""
-    with page.drawing_seldom():
+    with page.infrequent_drawing():
         yield
 
 

@@ -441,7 +441,7 @@ def test_the_web_component_shows_and_plays_a_session(
     )
     faces.click("own")  # sound starts with a gesture
     module = "/node_modules/kouxing-client/page/draw-rate.js"
-    with faces.drawing_seldom(module):
+    with faces.infrequent_drawing(module):
         faces.wait_for("own.shown?.[2] > 100 && window.isHeard")
         faces.evaluate("sessions.length = 0; own.setAttribute('token', 'another')")
         faces.wait_for("sessions.includes('seen')")  # it has reconnected

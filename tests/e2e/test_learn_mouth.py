@@ -55,7 +55,7 @@ def browser(control: FakeControl, tmp_path_factory: pytest.TempPathFactory) -> I
     write_speaking_head(folder / "head.mjpeg")
     gateway = Gateway(control.address)
     browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg", (640, 480))
-    with browser.drawing_seldom():  # no test looks at our own face
+    with browser.infrequent_drawing():  # no test looks at our own face
         browser.open(gateway.page)
         yield browser
     browser.close()

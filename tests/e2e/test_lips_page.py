@@ -33,7 +33,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     browser = Browser(
         tmp_path_factory.mktemp("browser"), DEMO / "hello-female.wav", size_px=SIZE_PX
     )
-    with browser.drawing_seldom("/modules/kouxing-client/page/draw-rate.js"):
+    with browser.infrequent_drawing("/modules/kouxing-client/page/draw-rate.js"):
         yield browser
     browser.close()
 

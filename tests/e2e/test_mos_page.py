@@ -161,7 +161,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
 
 
 def test_judges_score_every_video_in_a_browser(browser: Chromium, server: MosServer) -> None:
-    Page(browser, server).judge_everything({"reference": 5, "anchor": 2})
+    Page(browser, server).score_all_clips({"reference": 5, "anchor": 2})
     assert browser.page_errors == []
     study = load_study(server.folder)
     answers = [answer for answer in read_answers(server.folder) if answer.place >= 0]
@@ -193,7 +193,7 @@ class Page:
         self._browser.evaluate(f"{button}.scrollIntoView({{block: 'center'}})")
         self._browser.click(name)
 
-    def judge_everything(self, scores: dict[str, int]) -> None:
+    def score_all_clips(self, scores: dict[str, int]) -> None:
         """Score sync by condition, realism one less; the judge is interrupted."""
         browser = self._browser
         self.open()

@@ -61,7 +61,7 @@ def expected(client: Client) -> ReceivedResults:
 
 
 @pytest.fixture(autouse=True)
-def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+def _longer_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kouxing.evaluation.system.live.END_TIMEOUT_S", 60.0)
 
 

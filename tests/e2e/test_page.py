@@ -127,7 +127,7 @@ def test_controls_do_not_cover_the_mouth_on_a_phone(
     assert np.percentile(rows if edge == "top" else columns, 90) < limit
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 @pytest.mark.parametrize(("width", "is_phone"), [(1280, False), (390, True)])
 def test_every_control_can_be_clicked(page: Browser, width: int, is_phone: bool) -> None:
     page.resize(width, 844, mobile=is_phone)
@@ -148,7 +148,7 @@ def test_every_control_can_be_clicked(page: Browser, width: int, is_phone: bool)
     page.resize(*SIZE_PX)
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 @pytest.mark.parametrize("size", [(375, 667), (667, 375)])
 def test_panels_on_a_phone_have_buttons_without_scrolling(
     page: Browser, size: tuple[int, int]
@@ -171,7 +171,7 @@ def test_panels_on_a_phone_have_buttons_without_scrolling(
     page.resize(*SIZE_PX)
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_the_caption_shows_syllables_or_phones(
     control: PageControl, session: Session, page: Browser
 ) -> None:
@@ -244,7 +244,7 @@ def test_reports_a_face_that_is_behind_and_draws_fewer_pictures(
     control.look_ahead_ms = LOOK_AHEAD_MS
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_the_microphone_reaches_the_recognizer(
     control: PageControl, session: Session, page: Browser
 ) -> None:
@@ -261,7 +261,7 @@ def test_the_microphone_reaches_the_recognizer(
     assert is_loud(control.samples(name))
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_a_microphone_can_be_turned_off_while_it_starts(
     control: PageControl, session: Session, page: Browser
 ) -> None:
@@ -273,7 +273,7 @@ def test_a_microphone_can_be_turned_off_while_it_starts(
     assert not [text for text in page.page_errors if "exceptionDetails" in text]
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_after_the_microphone_the_session_of_the_address_is_shown(
     control: PageControl, session: Session, gateway: Gateway, page: Browser
 ) -> None:
@@ -296,7 +296,7 @@ def slider_amounts(control: PageControl) -> list[tuple[str, float]]:
     ]
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_settings_apply_at_once_and_to_later_sessions(
     control: PageControl, session: Session, page: Browser, gateway: Gateway
 ) -> None:
@@ -349,7 +349,7 @@ def test_another_head_is_shown(control: PageControl, session: Session, page: Bro
     assert_changed_and_back(woman, man, woman_again)
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_a_head_that_is_no_longer_chosen_is_not_loaded(page: Browser) -> None:
     loaded = "performance.getEntriesByType('resource').map(({ name }) => name.split('/').pop())"
     page.evaluate("performance.clearResourceTimings()")
@@ -360,7 +360,7 @@ def test_a_head_that_is_no_longer_chosen_is_not_loaded(page: Browser) -> None:
     assert "head-woman.glb" not in page.evaluate(loaded)
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_a_head_that_cannot_be_loaded_leaves_the_other_one_visible(page: Browser) -> None:
     page.evaluate(
         "window.realFetch = fetch; void (window.fetch = () => Promise.reject(Error('off')))"
@@ -414,7 +414,7 @@ def test_reports_a_browser_without_webgl(browser: Browser, gateway: Gateway, vie
     browser.command("Page.disable")
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_reports_missing_services(control: PageControl, page: Browser, gateway: Gateway) -> None:
     page.open(gateway.page)
     page.wait_for(f"{NOTICE} === ''")
@@ -436,7 +436,7 @@ def test_reports_missing_services(control: PageControl, page: Browser, gateway: 
     choose(page, "language", "en")
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_reconnects_when_the_gateway_restarts(
     control: PageControl, gateway: Gateway, page: Browser
 ) -> None:

@@ -79,7 +79,7 @@ def test_a_file_is_streamed_and_the_face_recorded_as_a_video(
     assert images[-1][2, 2].min() > 200  # the page's background, not black
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 @pytest.mark.parametrize(
     ("name", "content", "english", "chinese"),
     [
@@ -112,7 +112,7 @@ def test_a_file_without_sound_is_explained_in_both_languages(
         assert page.evaluate(f"{notice}.scrollWidth <= {notice}.clientWidth")  # long names wrap
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_reading_of_a_file_is_shown_and_can_be_stopped(page: Browser, tmp_path: Path) -> None:
     write_tone(tmp_path / "tone.wav")
     (tmp_path / "empty.wav").touch()
@@ -128,7 +128,7 @@ def test_reading_of_a_file_is_shown_and_can_be_stopped(page: Browser, tmp_path: 
     page.evaluate("void (window.fetch = window.realFetch)")
 
 
-@pytest.mark.usefixtures("drawing_seldom")
+@pytest.mark.usefixtures("infrequent_drawing")
 def test_a_dropped_file_is_streamed(
     control: PageControl, session: Session, page: Browser, tmp_path: Path
 ) -> None:

@@ -33,7 +33,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
 def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     browser = Browser(tmp_path_factory.mktemp("browser"), DEMO / "hello-female.wav")
     browser.command("Security.setIgnoreCertificateErrors", ignore=True)
-    with browser.drawing_seldom():
+    with browser.infrequent_drawing():
         yield browser
     browser.close()
 

@@ -82,7 +82,7 @@ IS_LIVE = f"/live|behind/.test({STATUS}) && window.kouxing.state.voiceToImageMs 
 def browser(system: System, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     folder = tmp_path_factory.mktemp("browser")
     browser = Browser(folder, DEMO / "hello-female.wav", size_px=(320, 240))
-    with browser.drawing_seldom():
+    with browser.infrequent_drawing():
         browser.open(system.page)
         # Records all notices, including short ones.
         browser.evaluate(

@@ -32,7 +32,7 @@ ELSEWHERE = {**PLACED, "audio": "tcp://127.0.0.1:2"}
 
 
 @pytest.fixture(autouse=True)
-def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+def _longer_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Extend the time limits of control for slow machines."""
     monkeypatch.setattr(restart_recovery, "RECOVERY_S", 60.0)
     monkeypatch.setattr(session_lifecycle, "START_TIMEOUT_S", 60.0)

@@ -27,7 +27,7 @@ SMALL_READOUT = ReadoutShape(inner=48, gru=24, dropout=0.2, noise=0.15)
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_training(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "BATCH_S", 2)
     monkeypatch.setattr(batches, "_LENGTHS", (30, 40))
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 2)

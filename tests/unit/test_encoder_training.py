@@ -46,7 +46,7 @@ def whisper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_training(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "NUM_EXCERPTS", 2)
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)
 

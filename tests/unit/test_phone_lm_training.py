@@ -31,7 +31,7 @@ SENTENCE = [
 ]
 
 
-def wandering(num_sentences: int = 400, seed: int = 0) -> PhoneStream:
+def trigram_sentences(num_sentences: int = 400, seed: int = 0) -> PhoneStream:
     """Sentences in which two phones tell much about the next."""
     rng = np.random.default_rng(seed)
     likely = rng.dirichlet(np.full(8, 0.2), (8, 8))
@@ -49,7 +49,7 @@ def wandering(num_sentences: int = 400, seed: int = 0) -> PhoneStream:
 
 @pytest.mark.parametrize("max_ngrams", [60, 300, 1_000_000])
 def test_probabilities_after_every_context_sum_to_one(max_ngrams: int) -> None:
-    graph = estimate_phone_lm([wandering()], MANDARIN, order=4, max_ngrams=max_ngrams).graph
+    graph = estimate_phone_lm([trigram_sentences()], MANDARIN, order=4, max_ngrams=max_ngrams).graph
     for context in range(0, len(graph.last_phone), max(1, len(graph.last_phone) // 60)):
         probs = [np.exp(step(graph, context, phone)[0]) for phone in range(NUM_PHONES)]
         assert sum(probs) == pytest.approx(1, abs=1e-3)

@@ -65,20 +65,20 @@ def test_a_step_runs_only_if_its_code_has_changed(
     monkeypatch.setattr("subprocess.run", measure)
     options = {"is_quick": False, "is_fresh": False}
 
-    def run_mine(**changed: Any) -> int:
+    def run_step(**changed: Any) -> int:
         commands.clear()
         assert run_steps(["mine"], {"corpus": Path("/d")}, tmp_path, **options | changed) == []
         return sum(sys.executable in command for command in commands)
 
-    assert run_mine() == 1
+    assert run_step() == 1
     assert ["kouxing", "bench", "/d"] in [command[2:5] for command in commands]
     stored = json.loads((tmp_path / "mine.json").read_text())
     assert stored["result"] == {"r": 0.12346}
     assert stored["commands"] == ["kouxing bench corpus"]
     assert stored["commit"] == "abc"
-    assert run_mine() == 0
-    assert run_mine(is_fresh=True) == 1
-    assert run_mine() == 1  # the code has changed
+    assert run_step() == 0
+    assert run_step(is_fresh=True) == 1
+    assert run_step() == 1  # the code has changed
     assert run_steps(["mine"], {"corpus": None}, tmp_path, **options) == []  # left out without data
 
 

@@ -21,7 +21,7 @@ COLUMNS = "utt_id path language speaker license split seconds text ipa phones_pa
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_training(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alignment, "_STEPS", 20)
     monkeypatch.setattr(alignment, "_MIN_LABELED", 1)
     monkeypatch.setattr(optimizer, "SAVE_EVERY", 1)

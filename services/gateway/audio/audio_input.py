@@ -35,7 +35,7 @@ class AudioInput:
         self._is_synthesized = is_synthesized
         self._is_first = True
         is_pcm16 = pcm_format.encoding == "s16le"
-        self._encoding = EncodingCheck(pcm_format.num_channels) if is_pcm16 else None
+        self._encoding_check = EncodingCheck(pcm_format.num_channels) if is_pcm16 else None
         self._incomplete = b""  # part of a sample, or of a file's header
         self._drain_task: asyncio.Task[None] | None = None  # done when all audio is forwarded
         self._audio_limit = RealTimeLimit()
@@ -69,8 +69,8 @@ class AudioInput:
         end = num_samples * self.pcm_format.frame_bytes
         pcm, self._incomplete = pcm[:end], pcm[end:]
         self.pcm_format.check_samples(pcm, is_first=self._is_first)
-        if self._encoding is not None:
-            self._encoding.check(message)
+        if self._encoding_check is not None:
+            self._encoding_check.check(message)
         self._is_first = False
         duration_s = num_samples / self.pcm_format.sample_rate_hz
         if self._is_synthesized or duration_s > MAX_LIVE_S or not self._queue.is_empty:

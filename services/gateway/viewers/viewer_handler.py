@@ -41,6 +41,9 @@ class _ShownSession:
     acoustic: str = AcousticModelName.FULL
 
 
+_NO_SESSION = _ShownSession(epoch=0, face=FaceSettings(), language="", acoustic="")
+
+
 @dataclass(slots=True, eq=False)
 class Viewer:
     """One browser that shows a session."""
@@ -59,6 +62,11 @@ class Viewer:
     def chosen_session(self) -> str:
         """The session to show; empty: the newest."""
         return self.sample_session or self.requested_session
+
+    @property
+    def shown_name(self) -> str:
+        """Name of the shown session; empty if no session is shown."""
+        return self.shown_session[0] if self.shown_session is not None else ""
 
 
 class ViewerHandler:
@@ -174,7 +182,7 @@ class ViewerHandler:
     @property
     def shown_sessions(self) -> Iterator[str]:
         """The sessions that viewers see."""
-        return (viewer.shown_session[0] for viewer in self._viewers if viewer.shown_session)
+        return (viewer.shown_name for viewer in self._viewers if viewer.shown_name)
 
     # --- viewers -------------------------------------------------------------------------------
 
@@ -243,7 +251,7 @@ class ViewerHandler:
         elif command.face is not None:
             if viewer.shown_session is None and command.face.expressions is None:
                 raise UserError("no session is shown; start a microphone or the sample first")
-            self._set_face(viewer.shown_session[0] if viewer.shown_session else "", command.face)
+            self._set_face(viewer.shown_name, command.face)
         elif command.follow is not None:
             viewer.requested_session, viewer.sample_session = command.follow, ""
         elif command.avatar is not None:
@@ -269,29 +277,28 @@ class ViewerHandler:
     def _notify_viewer(self, viewer: Viewer) -> None:
         """Announce the session that the viewer sees, or that none exists, if it has changed."""
         name = viewer.chosen_session or self.newest_session
-        session = self._sessions.get(name)
-        shown_session = (name, session.epoch) if session else None
-        viewer.shown_session = shown_session
-        announced = shown_session or viewer.chosen_session
-        if announced != viewer.last_announced:
-            viewer.last_announced = announced
-            face = session.face if session else FaceSettings()
-            message = browser_messages.encode_json(
-                "session",
-                session=name if session else None,
-                chosen=viewer.chosen_session,
-                epoch=session.epoch if session else 0,
-                **_shown_settings(face),
-                language=session.language if session else "",
-                acoustic=session.acoustic if session else "",
-                sample=session is not None
-                and name == viewer.chosen_session
-                and name in self._sample.open_sessions,
-            )
-            self._put(viewer, MessageKind.SESSION, message)
+        exists = name in self._sessions
+        session = self._sessions.get(name, _NO_SESSION)
+        viewer.shown_session = (name, session.epoch) if exists else None
+        announced = viewer.shown_session or viewer.chosen_session
+        if announced == viewer.last_announced:
+            return
+        viewer.last_announced = announced
+        is_sample = exists and name in self._sample.open_sessions
+        message = browser_messages.encode_json(
+            "session",
+            session=name if exists else None,
+            chosen=viewer.chosen_session,
+            epoch=session.epoch,
+            **_shown_settings(session.face),
+            language=session.language,
+            acoustic=session.acoustic,
+            sample=is_sample and name == viewer.chosen_session,
+        )
+        self._put(viewer, MessageKind.SESSION, message)
 
     def _viewers_of(self, session: str) -> list[Viewer]:
-        return [v for v in self._viewers if v.shown_session and v.shown_session[0] == session]
+        return [viewer for viewer in self._viewers if viewer.shown_name == session]
 
     def _put_shapes(
         self,

@@ -109,7 +109,7 @@ class RecognizerSession:
         self._published_acoustic = AcousticModelName.FULL if start.epoch <= 1 else None
         self._sound_messages = SoundMessages(face_delay_s)
         is_checked = opening.encoding == "s16le" and start.epoch <= 1
-        self._encoding = EncodingCheck(opening.num_channels) if is_checked else None
+        self._encoding_check = EncodingCheck(opening.num_channels) if is_checked else None
         self.output_sequence = 0
         self.num_gaps_counted = 0
         # After a loss, the client sends the audio that it kept in the meantime.
@@ -186,8 +186,8 @@ class RecognizerSession:
         rate_hz = opening.sample_rate_hz
         try:
             samples = decode_pcm(chunk.pcm, opening.encoding, opening.num_channels)
-            if self._encoding is not None:
-                self._encoding.check(chunk.pcm)
+            if self._encoding_check is not None:
+                self._encoding_check.check(chunk.pcm)
         except UserError as error:
             raise Rejected(ErrorCode.BAD_AUDIO, str(error)) from None
         duration_s = len(samples) / rate_hz
