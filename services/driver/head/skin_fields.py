@@ -8,6 +8,8 @@ that is 1 at its point and 0 at the other points.
 A field is the displacement by one FAP unit, m. FAPs of missing points have no effect.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from kouxing.services.driver.head.mesh_pieces import FapFields
@@ -39,11 +41,93 @@ _FACE_POINTS = (
 )  # fmt: skip
 
 
-class SkinFields:
-    """The displacement fields of a skin with vertices (V, 3), m, and triangles (F, 3).
+def axis_field(fap: int, weight: Doubles) -> Doubles:
+    """Return a field (V, 3) along the axis of a FAP, in FAPUs."""
+    axis, sign = DIRECTION_AXES[FAPS[fap - 1].direction]
+    field = np.zeros((len(weight), 3))
+    field[:, axis] = sign * weight
+    return field
+
+
+class MouthFields:
+    """Makes the displacement fields of a skin's mouth, and stores all fields of the skin.
 
     ``points`` are the vertices of feature points, at least those in ``INNER_LIPS`` and
-    ``OUTER_LIPS``, 2.1 and 2.10; ``eyes`` are the centers of the left and right eye (2, 3), m.
+    ``OUTER_LIPS``, 2.1 and 2.10. Distances are along the edges of ``faces`` (F, 3 or 4).
+    """
+
+    def __init__(
+        self, vertices: Doubles, triangles: Integers, faces: Integers, points: Mapping[str, int]
+    ) -> None:
+        self.fields: FapFields = {}
+        self._vertices, self._triangles, self._points = vertices, triangles, points
+        self._geodesics = Geodesics(vertices, faces)
+
+    def _scaled(self, field: Doubles, _fap: int) -> Doubles:
+        """Scale a field of a FAP from FAPUs to the unit of the fields, here the FAPU itself."""
+        return field
+
+    def _add_field(self, fap: int, weight: Doubles) -> None:
+        self.fields[fap] = self._scaled(axis_field(fap, weight), fap)
+
+    def _points_named(self, *names: str) -> Integers:
+        return np.array([self._points[name] for name in names if name in self._points], np.int64)
+
+    def _distance(self, *names: str) -> Doubles:
+        return self._geodesics.distance(self._points_named(*names))
+
+    def _smoothest_fields(self, points: Integers | list[Integers], fixed: Mask) -> Doubles:
+        return smoothest_fields(self._vertices, self._triangles, points, fixed)
+
+    def _add_lip_fields(self, fixed: Mask) -> None:
+        """Add the FAPs of the lips, which do not move the ``fixed`` vertices (V,)."""
+        names = INNER_LIPS + OUTER_LIPS
+        raised = self._smoothest_fields(self._points_named(*names), fixed)
+        self._lip_y = dict(zip(names, raised.T, strict=True))
+        for fap in FAPS[2:]:
+            if fap.direction in ("up", "down") and set(fap.feature_points) & set(names):
+                self._add_field(fap.number, self._lip_y[fap.feature_points[0]])
+        # points halfway to a corner move half as far, so that a narrow mouth keeps its shape
+        corners = ("2.4", "2.5", "8.3", "8.4")
+        between = ("2.6", "2.8", "2.7", "2.9", "8.5", "8.7", "8.6", "8.8")
+        middles = ("2.2", "2.3", "8.1", "8.2")
+        single = self._smoothest_fields(self._points_named(*corners, *between, *middles), fixed)
+        self._lip_x = {}
+        for row, (fap_x, name) in enumerate(zip(MOUTH_WIDTH_FAPS, corners, strict=True)):
+            half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
+            self._lip_x[name] = single[:, row] + 0.45 * half
+            self._add_field(fap_x, self._lip_x[name])
+            # a corner slides along the curve of the lips: outward motion is also backward
+            self.fields[fap_x][:, 2] = self._scaled(-CORNER_SLOPE * self._lip_x[name], fap_x)
+        pushed = self._smoothest_fields(self._points_named("2.3", "2.2", *corners), fixed)[:, :2]
+        self._lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
+        self._add_field(16, self._lip_z["2.3"])
+        self._add_field(17, self._lip_z["2.2"])
+
+    def _add_jaw_fields(self, weight: Doubles, lever: Doubles, lip_share: float = 0.0) -> None:
+        """Add the FAPs of the jaw without its motion at the lips' feature points.
+
+        ``weight`` (V,) is how far a vertex follows the jaw, and ``lever`` (V,) how far a depth
+        follows the jaw's rotation. The lower lip's height follows FAP 15 less by ``lip_share``.
+        """
+        for fap, motion, taken_out in (
+            (3, weight * lever, self._lip_y),
+            (14, weight, self._lip_z),
+            (15, weight * lever, self._lip_x),
+        ):
+            left = motion / motion[self._points["2.1"]]
+            for name, field in taken_out.items():
+                left = left - left[self._points[name]] * field
+            if fap == 15 and lip_share:
+                for name in LOWER_LIP:
+                    left = left - lip_share * left[self._points[name]] * self._lip_y[name]
+            self._add_field(fap, left)
+
+
+class SkinFields(MouthFields):
+    """The displacement fields of a skin with vertices (V, 3), m, and triangles (F, 3).
+
+    ``eyes`` are the centers of the left and right eye (2, 3), m.
     """
 
     def __init__(
@@ -54,13 +138,10 @@ class SkinFields:
         eyes: Doubles,
         fapu: dict[str, float],
     ) -> None:
-        self.fields: FapFields = {}
-        self._vertices, self._triangles = vertices, triangles
-        self._points, self._eyes, self._fapu = points, eyes, fapu
+        super().__init__(vertices, triangles, triangles, points)
+        self._eyes, self._fapu = eyes, fapu
         self._unit = fapu["ES"]
-        self._geodesics = Geodesics(vertices, triangles)
         self._add_mouth_fields()
-        self._add_jaw_fields()
         self._add_lid_fields()
         self._add_brow_fields()
         self._add_zone_fields()
@@ -70,7 +151,7 @@ class SkinFields:
         lever = self._jaw_share(vertices[:, 2])
         full_weight = np.ones(len(vertices))
         moved = {3: lever, 14: full_weight, 15: lever}
-        return {fap: self._axis_field(fap, weight) for fap, weight in moved.items()}
+        return {fap: self._scaled(axis_field(fap, weight), fap) for fap, weight in moved.items()}
 
     def tongue_fields(
         self, vertices: Doubles, rows: Integers, tip: int, body: int | None
@@ -86,34 +167,15 @@ class SkinFields:
         beyond = np.clip((along - middle) / max(1 - middle, 1e-9), 0, 1)
         at_tip = 0.5 - 0.5 * np.cos(np.pi * beyond)
         hump = 0.5 + 0.5 * np.cos(np.pi * np.clip((along - middle) / max(middle, 1e-9), -1, 0))
-        fields = {fap: self._axis_field(fap, at_tip) for fap in (43, 44, 45)}
-        fields[46] = self._axis_field(46, hump * (1 - at_tip))
-        return fields
+        moved = dict.fromkeys((43, 44, 45), at_tip) | {46: hump * (1 - at_tip)}
+        return {fap: self._scaled(axis_field(fap, weight), fap) for fap, weight in moved.items()}
 
     def _point(self, name: str) -> Doubles:
         point: Doubles = self._vertices[self._points[name]]
         return point
 
-    def _points_named(self, *names: str) -> Integers:
-        return np.array([self._points[name] for name in names if name in self._points], np.int64)
-
-    def _distance(self, *names: str) -> Doubles:
-        return self._geodesics.distance(self._points_named(*names))
-
-    def _axis_field(self, fap: int, weight: Doubles) -> Doubles:
-        """Return a field (V, 3) along the axis of a FAP."""
-        entry = FAPS[fap - 1]
-        axis, sign = DIRECTION_AXES[entry.direction]
-        field = np.zeros((len(weight), 3))
-        field[:, axis] = sign * weight * self._fapu[entry.fapu] / FAP_UNITS_PER_FAPU
-        return field
-
-    def _add_field(self, fap: int, weight: Doubles) -> None:
-        self.fields[fap] = self._axis_field(fap, weight)
-
-    def _smoothest_fields(self, points: Integers, fixed: Mask) -> Doubles:
-        held = np.setdiff1d(np.flatnonzero(fixed), points)
-        return smoothest_fields(self._vertices, self._triangles, points, held)
+    def _scaled(self, field: Doubles, fap: int) -> Doubles:
+        return field * self._fapu[FAPS[fap - 1].fapu] / FAP_UNITS_PER_FAPU
 
     def _add_mouth_fields(self) -> None:
         x, y, z = self._vertices.T
@@ -126,33 +188,11 @@ class SkinFields:
         ) & (np.abs(x - lips[0]) < 0.6 * width)
         far = self._distance(*INNER_LIPS, *OUTER_LIPS) > 0.72 * width
         fixed = far | nose | (y < self._point("2.10")[1]) | self._behind
-        names = INNER_LIPS + OUTER_LIPS
-        self._lip_y = dict(
-            zip(names, self._smoothest_fields(self._points_named(*names), fixed).T, strict=True)
-        )
-        for fap in FAPS[2:]:
-            if fap.direction in ("up", "down") and set(fap.feature_points) & set(names):
-                self._add_field(fap.number, self._lip_y[fap.feature_points[0]])
-        # points halfway to a corner move half as far, so that a narrow mouth keeps its shape
-        corners = ("2.4", "2.5", "8.3", "8.4")
-        between = ("2.6", "2.8", "2.7", "2.9", "8.5", "8.7", "8.6", "8.8")
-        middles = ("2.2", "2.3", "8.1", "8.2")
-        single = self._smoothest_fields(self._points_named(*corners, *between, *middles), fixed)
-        self._lip_x = {}
-        for row, (fap_x, name) in enumerate(zip(MOUTH_WIDTH_FAPS, corners, strict=True)):
-            half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
-            self._lip_x[name] = single[:, row] + 0.45 * half
-            self._add_field(fap_x, self._lip_x[name])
-            # a corner slides along the curve of the lips: outward motion is also backward
-            self.fields[fap_x][:, 2] = (
-                -CORNER_SLOPE * self._lip_x[name] * width / FAP_UNITS_PER_FAPU
-            )
-        pushed = self._smoothest_fields(self._points_named("2.3", "2.2", *corners), fixed)[:, :2]
-        self._lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
-        self._add_field(16, self._lip_z["2.3"])
-        self._add_field(17, self._lip_z["2.2"])
+        self._add_lip_fields(fixed)
+        self._add_jaw_fields(*self._jaw_motion())
 
-    def _add_jaw_fields(self) -> None:
+    def _jaw_motion(self) -> tuple[Doubles, Doubles]:
+        """Return how far each vertex follows the jaw, and how far depths follow its rotation."""
         _, y, z = self._vertices.T
         unit, lips, chin = self._unit, self._point("2.2"), self._point("2.1")
         inside = self._behind & (y > chin[1] + 0.1 * unit)
@@ -167,16 +207,7 @@ class SkinFields:
         away &= ~inside
         moving = np.flatnonzero((below | lower | floor) & ~away & ~upper)
         weight = self._geodesics.zone(moving, np.flatnonzero((upper | roof | away) & ~lower))
-        lever = self._jaw_share(z)
-        for fap, motion, taken_out in (
-            (3, weight * lever, self._lip_y),
-            (14, weight, self._lip_z),
-            (15, weight * lever, self._lip_x),
-        ):
-            left = motion / motion[self._points["2.1"]]
-            for name, field in taken_out.items():
-                left = left - left[self._points[name]] * field
-            self._add_field(fap, left)
+        return weight, self._jaw_share(z)
 
     def _jaw_share(self, z: Doubles) -> Doubles:
         """Return how far a depth follows the jaw rotation, 1 at the chin."""

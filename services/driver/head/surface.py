@@ -4,7 +4,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
 
-from kouxing.shared.arrays import Doubles, Integers
+from kouxing.shared.arrays import Doubles, Integers, Mask
 
 
 def find_edges(quads: Integers) -> tuple[Integers, Integers]:
@@ -53,13 +53,13 @@ class Geodesics:
 
 
 def smoothest_fields(
-    vertices: Doubles, triangles: Integers, points: Integers | list[Integers], fixed: Integers
+    vertices: Doubles, triangles: Integers, points: Integers | list[Integers], fixed: Mask
 ) -> Doubles:
     """Return the smoothest fields (V, P) with value 1 at ``points[p]`` and 0 at the other points.
 
     They minimize the squared Laplacian (cotangent weights) integrated over the surface. ``points``
-    are vertices or groups of vertices that move together. Fields are also 0 at ``fixed`` vertices
-    that are not among the points.
+    are vertices or groups of vertices that move together. Fields are also 0 at vertices that are
+    ``fixed`` (V,) and not among the points.
     """
     num_vertices = len(vertices)
     laplacian, area = _laplacian(vertices, triangles)
