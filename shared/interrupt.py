@@ -52,16 +52,19 @@ def catch_interrupt() -> Iterator[None]:
 def delay_interrupt() -> Iterator[None]:
     """Delay ``KeyboardInterrupt`` by 0.5 s, so that the block can end between two items of work.
 
-    The block calls ``is_interrupted`` after each item, and raises the exception itself.
+    SIGTERM has the same effect as Ctrl-C. The block calls ``is_interrupted`` after each item, and
+    raises the exception itself.
     """
     if not _is_installed():
         yield
         return
-    earlier = signal.signal(signal.SIGINT, _start_timer)
+    signals = (signal.SIGINT, signal.SIGTERM)
+    earlier = [signal.signal(number, _start_timer) for number in signals]
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, earlier)
+        for number, handler in zip(signals, earlier, strict=True):
+            signal.signal(number, handler)
 
 
 def _print_error(kind: type[BaseException], *rest: Any) -> None:

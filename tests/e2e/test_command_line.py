@@ -101,6 +101,20 @@ def test_listen_follows_a_session_from_its_start_to_its_end(
     assert {*spoken} & {"a", "e", "yi", "wu", "yu"}
 
 
+def test_listen_keeps_the_frames_if_it_is_stopped(system: System, tmp_path: Path) -> None:
+    recorded = tmp_path / "face.fap"
+    with Client(system.control) as client, client.open_session("stopped") as session:
+        frames = session.frames()
+        listener = start_listening(
+            system.control, "--output", recorded, first_message="following session stopped"
+        )
+        for _ in range(10):
+            frames.get(LIMIT_S)
+        listener.send_signal(signal.SIGTERM)
+        assert "wrote" in output_of(listener)[1]
+    assert len(read_fap(recorded).faps) > 0
+
+
 def test_listen_without_a_name_follows_the_newest_session(system: System, client: Client) -> None:
     with client.open_session("older"):
         newer = client.open_session("newer")

@@ -54,7 +54,7 @@ frames = []
 for frame in _iter_until_interrupt(Frames(), "s"):
     frames.append(frame)
     if len(frames) == 3:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGNAL)
 print(*frames, signal.getitimer(signal.ITIMER_REAL))
 try:
     signal.raise_signal(signal.SIGINT)
@@ -153,8 +153,10 @@ def test_an_interrupt_is_raised_until_it_is_handled(program: str, printed: str) 
     assert process.communicate(timeout=LIMIT_S) == (printed, "")
 
 
-def test_ctrl_c_while_a_frame_is_exported_keeps_all_frames() -> None:
-    process = start_python("-c", INSTALL + INTERRUPT_IN_EXPORTER)
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_ctrl_c_while_a_frame_is_exported_keeps_all_frames(number: str) -> None:
+    program = INTERRUPT_IN_EXPORTER.replace("signal.SIGNAL", f"signal.{number}")
+    process = start_python("-c", INSTALL + program)
     printed, log = process.communicate(timeout=LIMIT_S)
     assert printed == "frame frame frame (0.0, 0.0)\nraised while the file is written\n"
     assert log == "following session s\n"

@@ -23,7 +23,12 @@ from kouxing.shared.command.terminal import CONSOLE, plural, print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS
 from kouxing.shared.face.mouth_shapes import mouth_cues
-from kouxing.shared.interrupt import catch_interrupt, delay_interrupt, is_interrupted
+from kouxing.shared.interrupt import (
+    catch_interrupt,
+    delay_interrupt,
+    install_interrupt_handler,
+    is_interrupted,
+)
 from kouxing.shared.phones import events
 from kouxing.shared.phones.alphabets import Alphabet, respell
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
@@ -54,6 +59,7 @@ def follow(
     is_speech = as_format in SPEECH_FORMATS
     curve_format = None if as_format is None or is_speech else CurveFormat(as_format)
     exporter = None if output is None else _open_exporter(output, curve_format)
+    install_interrupt_handler()  # a background shell ignores SIGINT
     with control as endpoint, connect_client(endpoint) as client:
         followed = _wait_for_session(session, client)
         results = followed.results(Phone if is_speech else FapFrame, keep_all=True)
@@ -109,7 +115,7 @@ def _wait_for_session(name: str, client: Client) -> Session:
 
 
 def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
-    """Yield results until the session ends or the user interrupts.
+    """Yield results until the session ends, or until Ctrl-C or SIGTERM.
 
     An interrupt takes effect between two results, so the caller can write what it has received.
     """
