@@ -72,7 +72,7 @@ export class KouxingFace extends HTMLElement {
     }
     const gl = this.#renderer.getContext();
     const ratio = Math.min(2, devicePixelRatio);
-    this.#drawRate = new DrawRate(ratio, ratio, drawsInSoftware(gl));
+    this.#drawRate = new DrawRate({ ratio, pauses: drawsInSoftware(gl) });
     this.#images = new ImageQueue(gl, this.#drawRate);
     this.#resizeObserver.observe(this);
     if (this.#sound.isWanted) this.turnSoundOn().catch((error) => this.#showError(error, error.message));

@@ -18,7 +18,7 @@ function draw(drawRate, { fullMs, minMs = 0, fromMs = 0 }) {
 }
 
 test("a slow processor draws fewer pixels until it draws 20 images a second", () => {
-  const drawRate = new DrawRate(0.5, 1, true);
+  const drawRate = new DrawRate({ ratio: 0.5, maxRatio: 1, pauses: true });
   draw(drawRate, { fullMs: 100, minMs: 12 });
   assert.ok(draw(drawRate, { fullMs: 100, minMs: 12, fromMs: 10000 }) > 19.5);
   assert.ok(drawRate.ratio < 0.5 && drawRate.ratio > 0.3, `${drawRate.ratio}`);
@@ -27,19 +27,19 @@ test("a slow processor draws fewer pixels until it draws 20 images a second", ()
 });
 
 test("very slow images get far fewer pixels at once, but not because of one stall", () => {
-  const drawRate = new DrawRate(1, 1, true);
+  const drawRate = new DrawRate({ ratio: 1, pauses: true });
   const record = (tookMs) => drawRate.recordDrawn(0, tookMs);
   for (const tookMs of [900, 20, 900]) record(tookMs); // such as the first image of a page
   assert.equal(drawRate.ratio, 1);
   for (let number = 0; number < 7; number++) record(20);
   assert.ok(drawRate.ratio >= 0.85, `${drawRate.ratio}`);
-  const verySlow = new DrawRate(1, 1, true);
+  const verySlow = new DrawRate({ ratio: 1, pauses: true });
   for (let number = 0; number < 3; number++) verySlow.recordDrawn(0, 400);
   assert.equal(verySlow.ratio, 0.35);
 });
 
 test("a processor pauses as long as it drew, or less to draw 20 images a second", () => {
-  const drawRate = new DrawRate(0.35, 1, true);
+  const drawRate = new DrawRate({ ratio: 0.35, maxRatio: 1, pauses: true });
   for (const [tookMs, restMs] of [[10, 10], [24, 24], [35, 15], [100, 10]]) {
     drawRate.recordDrawn(1000, 1000 + tookMs);
     const dueMs = 1000 + tookMs + restMs;
@@ -49,7 +49,7 @@ test("a processor pauses as long as it drew, or less to draw 20 images a second"
 });
 
 test("the delay of an image includes half of the time for which it is visible", () => {
-  const drawRate = new DrawRate(2, 2, false);
+  const drawRate = new DrawRate({ ratio: 2, pauses: false });
   for (let nowMs = 0; nowMs < 5000; nowMs += 40) drawRate.recordVisible(nowMs, nowMs + 30);
   assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, `${drawRate.visibleDelayMs}`);
   drawRate.recordVisible(5000, 5400); // a slow image
@@ -72,7 +72,7 @@ test("images of a page that was hidden in the meantime do not count", (t) => {
   Object.assign(globalThis, doubles);
   t.after(() => Object.assign(globalThis, before));
   const gl = { fenceSync: () => ({}), flush() {}, clientWaitSync: () => 0, deleteSync() {} };
-  const drawRate = new DrawRate(1, 1, false);
+  const drawRate = new DrawRate({ ratio: 1, pauses: false });
   const queue = new ImageQueue({ ...gl, TIMEOUT_EXPIRED: 1 }, drawRate);
   let numVisible = 0;
   const show = (seenAfterMs, isHidden) => {
@@ -94,8 +94,8 @@ test("images of a page that was hidden in the meantime do not count", (t) => {
 
 test("the user can halve the number of images, down to about 4 a second", () => {
   for (const [drawRate, rates] of [
-    [new DrawRate(2, 2, false), [60, 30, 15, 7.5, 3.75]],
-    [new DrawRate(0.35, 0.35, true), [20, 10, 5]],
+    [new DrawRate({ ratio: 2, pauses: false }), [60, 30, 15, 7.5, 3.75]],
+    [new DrawRate({ ratio: 0.35, pauses: true }), [20, 10, 5]],
   ]) {
     let fromMs = 0;
     for (const rate of rates) {

@@ -119,8 +119,8 @@ test("a hint names the problem and the remedy", () => {
   assert.match(hintText({ ...well, isConnected: false }), /does not answer.*network.*kouxing run/);
   const starting = { ...well, isConnected: false, wasConnected: false };
   assert.equal(hintText(starting), "");
-  assert.match(hintText({ ...starting, isRefused: true }), /#token/);
-  assert.match(hintText({ ...well, isConnected: false, isRefused: true }), /#token/);
+  assert.match(hintText({ ...starting, isRejected: true }), /#token/);
+  assert.match(hintText({ ...well, isConnected: false, isRejected: true }), /#token/);
   assert.match(hintText({ ...well, missing: ["control"] }), /Control is not running.*kouxing run/);
   assert.match(
     hintText({ ...well, missing: ["recognizer", "synthesizer"] }),
@@ -165,12 +165,12 @@ test("a rejected connection stays rejected until the page connects", () => {
   const state = new GatewayState();
   state.setConnected(true);
   state.setConnected(false);
-  assert.equal(state.isRefused, false);
-  state.isRefused = true;
+  assert.equal(state.isRejected, false);
+  state.isRejected = true;
   state.setConnected(false);
-  assert.equal(state.isRefused, true);
+  assert.equal(state.isRejected, true);
   state.setConnected(true);
-  assert.equal(state.isRefused, false);
+  assert.equal(state.isRejected, false);
 });
 
 test("a fault is shown after a second, and its end only if it was shown", () => {
@@ -228,7 +228,7 @@ test("reduced quality and the head's rotation are described", () => {
 test("sessions restart, end and lose their connection", () => {
   const [session, state] = [{ session: "one", epoch: 1, sample: false, lip_model: "learned" }, new GatewayState()];
   state.setConnected(false);
-  assert.deepEqual([state.isRefused, state.wasConnected], [true, false], "the first connection failed");
+  assert.deepEqual([state.isRejected, state.wasConnected], [true, false], "the first connection failed");
   state.setConnected(true);
   assert.deepEqual(state.setSession(session), { isOther: true, isRestart: false });
   assert.deepEqual(state.setSession({ ...session, epoch: 2 }), { isOther: false, isRestart: true });
@@ -237,7 +237,7 @@ test("sessions restart, end and lose their connection", () => {
   assert.deepEqual([state.session, state.lipModel], [null, "learned"]);
   state.setSession(session);
   state.setConnected(false);
-  assert.deepEqual([state.isRefused, state.wasConnected, state.session], [false, true, null]);
+  assert.deepEqual([state.isRejected, state.wasConnected, state.session], [false, true, null]);
 });
 
 test("a sender shows its contents and rate, or its problem", () => {

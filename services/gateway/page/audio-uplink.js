@@ -14,7 +14,7 @@ const OPEN = 1; // WebSocket.OPEN
 export class AudioUplink {
   #socket;
   #rateHz;
-  #numFrames = 0; // sent or dropped
+  #numSamples = 0; // sent or dropped
   #numSkipped = 0; // dropped and not yet reported to the gateway
   #recordedMs = -Infinity; // when the last chunk was recorded
   #blockedSinceMs = null; // since when the network has accepted nothing; null if it does
@@ -28,10 +28,10 @@ export class AudioUplink {
   /** Send a chunk (int16); both times are on the page's clock. */
   send(nowMs, recordedMs, chunk) {
     if (this.#socket.readyState !== OPEN) return;
-    this.#numFrames += chunk.length;
+    this.#numSamples += chunk.length;
     if (recordedMs - this.#recordedMs > MAX_GAP_MS) this.#starts.reset();
     this.#recordedMs = recordedMs;
-    this.#starts.add(recordedMs, recordedMs - (1000 * this.#numFrames) / this.#rateHz);
+    this.#starts.add(recordedMs, recordedMs - (1000 * this.#numSamples) / this.#rateHz);
     const isTooLate = nowMs - recordedMs > MAX_AGE_MS;
     const isBlocked = this.#socket.bufferedAmount > MAX_BUFFERED_BYTES;
     this.#blockedSinceMs = isBlocked ? (this.#blockedSinceMs ?? nowMs) : null;

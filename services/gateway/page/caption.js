@@ -4,8 +4,8 @@ import { element } from "./elements.js";
 
 const MAX_PHONES = 100;
 const MAX_PAST = 8; // shown before the current phone
-const SHOWN_AFTER_END = 16000; // samples for which the last phone stays after its end
-const FADE = 16000; // samples in which it then fades
+const SHOWN_AFTER_END_SAMPLES = 16000; // how long the last phone stays after its end
+const FADE_SAMPLES = 16000; // how long it then fades
 const SILENCE = "sil";
 const SILENCE_SIGN = "·";
 
@@ -41,12 +41,12 @@ export class PhoneTrack {
   at(mediaTime) {
     const started = this.#phones.filter(({ begin }) => begin <= mediaTime);
     const last = started.findLastIndex(({ symbol }) => symbol !== SILENCE);
-    const remaining = last === -1 ? 0 : started[last].end + SHOWN_AFTER_END + FADE - mediaTime;
+    const remaining = last === -1 ? 0 : started[last].end + SHOWN_AFTER_END_SAMPLES + FADE_SAMPLES - mediaTime;
     const past = remaining > 0 ? started.slice(0, last) : started;
     return {
       current: remaining > 0 ? started[last].text : "",
       past: past.slice(-MAX_PAST).map(({ symbol, text }) => (symbol === SILENCE ? SILENCE_SIGN : text)),
-      opacity: Math.max(0, Math.min(1, remaining / FADE)),
+      opacity: Math.max(0, Math.min(1, remaining / FADE_SAMPLES)),
     };
   }
 }

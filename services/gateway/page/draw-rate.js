@@ -36,12 +36,12 @@ export class DrawRate {
   #delays = new SlidingWindow(WINDOW_MS); // delays until images were visible, ms
 
   /**
-   * @param ratio pixels drawn per pixel of the page, at first
-   * @param maxRatio maximum ratio
-   * @param pauses whether to pause after an image for as long as it took, but at most until the next
+   * @param options.ratio pixels drawn per pixel of the page, at first
+   * @param options.maxRatio maximum ratio
+   * @param options.pauses whether to pause after an image for as long as it took, but at most until the next
    *   of 20 per second. Use it when the processor draws: it also has to play sound.
    */
-  constructor(ratio, maxRatio, pauses) {
+  constructor({ ratio, maxRatio = ratio, pauses }) {
     this.#pauses = pauses;
     this.#maxRatio = maxRatio;
     this.ratio = ratio;

@@ -12,18 +12,18 @@ export class GatewayState {
   missing = []; // services that are not running
 
   /** Whether the gateway rejected the connection, although it runs: the first one, or because of the token. */
-  isRefused = false;
+  isRejected = false;
 
   /** Whether the page is connecting for the first time. */
   get isStarting() {
-    return !this.wasConnected && !this.isRefused;
+    return !this.wasConnected && !this.isRejected;
   }
 
   setConnected(isConnected) {
     this.isConnected = isConnected;
     this.wasConnected ||= isConnected;
-    if (isConnected) this.isRefused = false;
-    else this.isRefused ||= !this.wasConnected;
+    if (isConnected) this.isRejected = false;
+    else this.isRejected ||= !this.wasConnected;
     if (!isConnected) this.session = null;
   }
 

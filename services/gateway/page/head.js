@@ -52,7 +52,9 @@ export class Head {
     const gl = this.#renderer.getContext();
     this.#isSoftware = drawsInSoftware(gl);
     const fullRatio = Math.min(2, Math.max(1.5, devicePixelRatio));
-    this.drawRate = this.#isSoftware ? new DrawRate(0.5, 1, true) : new DrawRate(fullRatio, fullRatio, false);
+    this.drawRate = this.#isSoftware
+      ? new DrawRate({ ratio: 0.5, maxRatio: 1, pauses: true })
+      : new DrawRate({ ratio: fullRatio, pauses: false });
     this.#images = new ImageQueue(gl, this.drawRate);
     if (!this.#isSoftware) this.#addLights();
     this.#controls = new OrbitControls(this.#camera, canvas);

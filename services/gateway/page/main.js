@@ -89,7 +89,7 @@ const socket = new ViewerSocket(
       statusBar.show();
       if (!isConnected && gateway.wasConnected) {
         const isWrong = await isTokenWrong();
-        if (!gateway.isConnected) gateway.isRefused = isWrong;
+        if (!gateway.isConnected) gateway.isRejected = isWrong;
       }
     },
     fap: (mediaTime, values) => player.addFrame(mediaTime, values),

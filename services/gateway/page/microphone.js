@@ -129,7 +129,7 @@ export class Microphone {
 
   #connect() {
     const socket = new WebSocket(socketUrl("/microphone"));
-    let refusal = null;
+    let rejection = null;
     this.#socket = socket;
     socket.onopen = () => {
       const format = { sample_rate_hz: captureRateHz(this.#context), num_channels: 1, encoding: "s16le" };
@@ -141,10 +141,10 @@ export class Microphone {
       const message = JSON.parse(event.data);
       if (message.type === "opened") this.#onOpened(message.session);
       else if (this.#uplink !== null && message.type === "error") this.#handlers.error(message);
-      else refusal = message;
+      else rejection = message;
     };
     socket.onclose = () => {
-      if (this.#socket === socket) this.#onClosed(refusal);
+      if (this.#socket === socket) this.#onClosed(rejection);
     };
   }
 
@@ -172,7 +172,7 @@ export class Microphone {
   }
 
   /** Reconnect if it has streamed: a service or the gateway is being restarted. */
-  #onClosed(refusal) {
+  #onClosed(rejection) {
     if (this.#uplink !== null) {
       this.#uplink = null;
       this.#giveUpMs = performance.now() + GIVE_UP_MS;
@@ -180,8 +180,8 @@ export class Microphone {
     }
     if (this.#giveUpMs !== null && performance.now() < this.#giveUpMs) {
       this.#retryTimer = setTimeout(() => this.#connect(), RETRY_MS);
-    } else if (refusal?.code) {
-      this.#handlers.error(refusal);
+    } else if (rejection?.code) {
+      this.#handlers.error(rejection);
       this.stop();
     } else {
       this.#fail(translate(this.isFile ? "fileStopped" : "microphoneStopped"));

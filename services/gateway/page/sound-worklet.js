@@ -2,11 +2,11 @@
 // context frame + anchor. The target of the anchor moves all the time, because clocks drift. A small
 // distance is corrected by resampling, which is inaudible, and a large one by a jump.
 
-const CAPACITY = 1 << 17; // samples, 8 s
-const MASK = CAPACITY - 1; // maps a media time to its index
+const CAPACITY_SAMPLES = 1 << 17; // 8 s
+const MASK = CAPACITY_SAMPLES - 1; // maps a media time to its index
 const FADE = 1 / 64; // change of the gain per sample; a fade takes 4 ms and avoids clicks
-const MIN_JUMP = 160; // samples, 10 ms; smaller distances are corrected by resampling
-const GLIDE_LENGTH = 1600; // samples in which a small distance shrinks to a third
+const MIN_JUMP_SAMPLES = 160; // 10 ms; smaller distances are corrected by resampling
+const GLIDE_SAMPLES = 1600; // after which a small distance has shrunk to a third
 const MAX_GLIDE = 0.01; // change of speed; a sixth of a semitone
 const TAPS = 16; // length of the interpolation filter
 const PHASES = 512; // positions between two samples
@@ -24,8 +24,8 @@ function makeFilter() {
 }
 
 class SoundPlayer extends AudioWorkletProcessor {
-  #samples = new Float32Array(CAPACITY);
-  #mediaTimes = new Float64Array(CAPACITY).fill(-1); // media times of the samples
+  #samples = new Float32Array(CAPACITY_SAMPLES);
+  #mediaTimes = new Float64Array(CAPACITY_SAMPLES).fill(-1); // media times of the samples
   #anchor = null;
   #target = null; // target of the anchor
   #gain = 0;
@@ -68,8 +68,8 @@ class SoundPlayer extends AudioWorkletProcessor {
   process(_inputs, [[output]]) {
     if (this.#target === null) return true;
     const distance = this.#anchor === null ? Infinity : this.#target - this.#anchor;
-    let isJumping = Math.abs(distance) > MIN_JUMP;
-    const glide = isJumping ? 0 : Math.max(-MAX_GLIDE, Math.min(MAX_GLIDE, distance / GLIDE_LENGTH));
+    let isJumping = Math.abs(distance) > MIN_JUMP_SAMPLES;
+    const glide = isJumping ? 0 : Math.max(-MAX_GLIDE, Math.min(MAX_GLIDE, distance / GLIDE_SAMPLES));
     for (let i = 0; i < output.length; i++) {
       if (isJumping && this.#gain === 0) {
         this.#anchor = this.#target;

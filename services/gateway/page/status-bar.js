@@ -33,16 +33,22 @@ export class StatusBar {
   }
 
   show() {
-    const { gateway, player, speech, sound, notice, senders } = this.#parts;
-    const { isConnected, isStarting, session } = gateway;
+    const { gateway, player } = this.#parts;
     const nowMs = performance.now();
-    const isLive = isConnected && player.activity.isLive(nowMs);
+    const isLive = gateway.isConnected && player.activity.isLive(nowMs);
     this.#wasLive ||= isLive;
-    const isSourceInterrupted = speech.state === "interrupted";
-    const isStalled = this.#wasLive && session !== null && session === speech.session;
-    const isInterrupted = isSourceInterrupted || isStalled;
-    player.lateness.update(nowMs, isLive && session !== null);
+    player.lateness.update(nowMs, isLive && gateway.session !== null);
     const isBehind = isLive && player.lateness.isBehind;
+    this.#showState(isLive, isBehind);
+    this.#showDelays(isLive, isBehind);
+    this.#showHints(nowMs);
+  }
+
+  #showState(isLive, isBehind) {
+    const { gateway, speech } = this.#parts;
+    const { isConnected, isStarting, session } = gateway;
+    const isStalled = this.#wasLive && session !== null && session === speech.session;
+    const isInterrupted = isStalled || speech.state === "interrupted";
     const state = stateKey({ isConnected, isStarting, isLive, isBehind, isInterrupted });
     element("status").dataset.state = state;
     element("status").title = session === null ? "" : translate("sessionName", { name: session });
@@ -51,19 +57,27 @@ export class StatusBar {
     const isLight = gateway.acoustic === "light";
     for (const name of ["light", "acoustic"]) element(name).hidden = !isLight;
     element("light-model").hidden = isLight;
+  }
 
-    const { playout, voiceToImageMs } = player;
+  #showDelays(isLive, isBehind) {
+    const { player, sound, senders } = this.#parts;
+    const { playout, lateness, voiceToImageMs } = player;
     const isAudible = isLive && sound.state === "on";
     const soundMs = isAudible ? playout.delayMs : null;
     const frameMs = isAudible ? playout.frameWaitMs : null;
-    const delay = isBehind ? secondsText(player.lateness.recentMs) : delayText(voiceToImageMs, soundMs);
+    const delay = isBehind ? secondsText(lateness.recentMs) : delayText(voiceToImageMs, soundMs);
     setText(element("delay"), isLive ? delay : "");
     setText(element("playout-delays"), playoutDelaysText(soundMs, frameMs));
     senders.frameWaitMs = frameMs;
-    const fault = this.#fault.update(nowMs, hintText(gateway));
+  }
+
+  /** Show a hint about a fault of the system or of the microphone, and a toast when it is over. */
+  #showHints(nowMs) {
+    const { gateway, speech, notice } = this.#parts;
     const { isFile } = speech.microphone;
-    const pause = translate(isFile ? "fileInterrupted" : "microphoneInterrupted");
-    const source = this.#sourceFault.update(nowMs, isSourceInterrupted ? pause : "");
+    const fault = this.#fault.update(nowMs, hintText(gateway));
+    const interruption = translate(isFile ? "fileInterrupted" : "microphoneInterrupted");
+    const source = this.#sourceFault.update(nowMs, speech.state === "interrupted" ? interruption : "");
     if (fault.isOver) notice.showToast(translate("recovered"), "hint");
     if (source.isOver && speech.state === "on") {
       notice.showToast(translate(isFile ? "fileResumed" : "microphoneResumed"), "hint");

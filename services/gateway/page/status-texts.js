@@ -49,8 +49,8 @@ export function turnText(turned) {
 }
 
 /** Return what does not work and what to do; "" if all is well. */
-export function hintText({ isConnected, wasConnected, isRefused, missing }) {
-  if (isRefused) return translate("connectionRefused");
+export function hintText({ isConnected, wasConnected, isRejected, missing }) {
+  if (isRejected) return translate("connectionRejected");
   if (!isConnected && wasConnected) return translate("gatewayLost");
   if (isConnected && missing.includes("control")) return translate("controlMissing");
   if (isConnected && missing.length > 0) {

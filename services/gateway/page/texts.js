@@ -59,7 +59,7 @@ export const TEXTS = {
     en: "The gateway does not answer. Check the network, or start the gateway with “kouxing run”; this page will reconnect automatically.",
     zh: "网关没有应答。请检查网络，或运行 kouxing run；本页会自动重新连接。",
   },
-  connectionRefused: {
+  connectionRejected: {
     en: "The gateway rejected the connection. Open the full URL that “kouxing run” printed, including #token=… if it has one.",
     zh: "网关拒绝了连接。请打开 kouxing run 显示的完整地址（包括其中的 #token=…）。",
   },
