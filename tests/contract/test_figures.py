@@ -66,7 +66,8 @@ def test_the_errors_by_language_are_those_of_the_report(file: str, text: str, to
 
 LIPS_ENGLISH = (
     "is only {opening:.2f}. - In Mandarin, the learned lips reproduce {recall:.0f} % of the real "
-    "lip closures, at {precision:.0f} % precision. For the newsreader, precision is only {new:.0f} %."
+    "lip closures, at {precision:.0f} % precision. For the newsreader, precision is only"
+    " {new:.0f} %."
 )
 LIPS_CHINESE = (
     "只有 {opening:.2f}。 - 普通话中真实的闭唇，学习式唇形重现了 {recall:.0f} %，"

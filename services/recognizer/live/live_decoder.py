@@ -170,23 +170,20 @@ class LiveDecoder:
         is_first = self._final_end_frame == 0 and len(segments) > max(0, num_before)
         if is_first and segments[0].phone == self._silence:
             segments = segments[1:]  # silence before the first phone is not emitted
-        emitted: list[Phone] = []
-        while len(segments) < num_before:  # an extra phone was emitted and is withdrawn
-            silence = self._inventory.silence
-            emitted.append(replace(self._open.pop(0), symbol=silence, duration_s=0.0, final=True))
-            self._num_final, num_before = self._num_final + 1, num_before - 1
+        emitted = self._withdraw(max(0, num_before - len(segments)))
         final_until = self._settled.shared_end if num_following else self._settled.num_frames
         known = dict(enumerate(self._open))
         self._open = []
         first_index, first_frame = self._num_final, self._final_end_frame
         for number, segment in enumerate(segments):
+            known_phone = known.get(number)
             onset_s = self._time_s(segment.start)
             is_final = segment.end <= final_until
             if is_final:
                 span = slice(segment.start - first_frame, segment.end - first_frame)
                 confidence = float(self._confidence[span].mean())
             else:
-                confidence = known[number].confidence if number in known else _DEFAULT_CONFIDENCE
+                confidence = known_phone.confidence if known_phone else _DEFAULT_CONFIDENCE
             phone = Phone(
                 index=first_index + number,
                 symbol=self._inventory.phones[segment.phone],
@@ -195,9 +192,9 @@ class LiveDecoder:
                 confidence=confidence,
                 final=is_final,
             )
-            if phone != known.get(number):
+            if phone != known_phone:
                 emitted.append(phone)
-            if phone.final:
+            if is_final:
                 self._num_final += 1
                 self._last_final = segment.phone
                 self._final_end_frame = segment.end
@@ -205,6 +202,17 @@ class LiveDecoder:
                 self._open.append(phone)
         self._confidence = self._confidence[self._final_end_frame - first_frame :]
         return emitted
+
+    def _withdraw(self, num_phones: int) -> list[Phone]:
+        """Return the first open phones as withdrawn: the best string has fewer phones."""
+        silence = self._inventory.silence
+        withdrawn = [
+            replace(phone, symbol=silence, duration_s=0.0, final=True)
+            for phone in self._open[:num_phones]
+        ]
+        del self._open[:num_phones]
+        self._num_final += num_phones
+        return withdrawn
 
     def _index_of(self, phone: Phone) -> int:
         return self._inventory.index[phone.symbol]
