@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from pathlib import Path
 
-WINDOW = 1000  # number of newest values that percentiles are computed from
+NUM_NEWEST = 1000  # values that percentiles are computed from
 PERCENTS = (50, 95, 99)
 BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # upper limits
 _STATM = Path("/proc/self/statm")
@@ -25,7 +25,7 @@ class Distribution:
     """Values of a latency in ms: the newest values, and a histogram of all values."""
 
     def __init__(self) -> None:
-        self.newest: deque[float] = deque(maxlen=WINDOW)
+        self.newest: deque[float] = deque(maxlen=NUM_NEWEST)
         self.bucket_counts = [0] * (len(BUCKETS_MS) + 1)  # the last bucket has no upper limit
         self.total = 0.0
 

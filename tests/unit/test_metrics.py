@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kouxing.shared.fast_record import replace
-from kouxing.shared.monitoring.metrics import WINDOW, LoadMeter, Metrics, percentile
+from kouxing.shared.monitoring.metrics import NUM_NEWEST, LoadMeter, Metrics, percentile
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import EventName
 from kouxing.shared.wire.kinds import MESSAGES
@@ -18,7 +18,7 @@ def test_a_snapshot_has_counts_percentiles_and_rates() -> None:
     metrics = Metrics()
     metrics.count("in_audio")
     metrics.count("in_audio", 2)
-    for value_ms in [1e9] * 10 + [*range(101)] * (WINDOW // 100):  # the first ones are too old
+    for value_ms in [1e9] * 10 + [*range(101)] * (NUM_NEWEST // 100):  # the first ones are too old
         metrics.observe("chunk_ms", float(value_ms))
     snapshot = metrics.snapshot(0.0)
     assert snapshot["in_audio"] == 3

@@ -177,16 +177,16 @@ def _cheapest_assignment(
     total_cost[0, 0] = 0.0
     best = np.zeros((num_segments + 1, num_syllables + 1, 2), dtype=np.int16)
 
-    def consider(row: int, merged: int, num: int, cost: Doubles | float) -> None:
-        """Consider ending any ``num`` syllables with segment ``row``, the last of ``merged``."""
-        total = total_cost[row - merged, : num_syllables + 1 - num] + cost
-        is_better = total < total_cost[row, num:]
-        total_cost[row, num:][is_better] = total[is_better]
-        best[row, num:][is_better] = merged, num
+    def consider(row: int, num_merged: int, num_grouped: int, cost: Doubles | float) -> None:
+        """Consider groups of ``num_merged`` segments up to ``row``, and ``num_grouped`` syllables."""
+        total = total_cost[row - num_merged, : num_syllables + 1 - num_grouped] + cost
+        is_better = total < total_cost[row, num_grouped:]
+        total_cost[row, num_grouped:][is_better] = total[is_better]
+        best[row, num_grouped:][is_better] = num_merged, num_grouped
 
-    def hiss_cost(times_s: Doubles, first: int, num: int) -> Doubles:
-        """Return the cost of onsets of the ``first``-th of ``num`` syllables at some times."""
-        typical = text.crossings[first : num_syllables + 1 - num + first]
+    def hiss_cost(times_s: Doubles, place: int, num_grouped: int) -> Doubles:
+        """Return the cost of the onsets at which the syllable ``place`` of each group starts."""
+        typical = text.crossings[place : num_syllables + 1 - num_grouped + place]
         misfit = 0.5 * ((onset_crossings.at(times_s) - typical) / _HISS_SD) ** 2
         return np.minimum(misfit, _MAX_HISS_COST)
 
@@ -194,20 +194,24 @@ def _cheapest_assignment(
         start_s = segments[row - 1].start_s
         length_s = segments[row - 1].end_s - start_s
         consider(row, 1, 0, _NOISE_COST + length_s / _NOISE_COST_S)
-        for num in range(1, max_split + 1):
-            typical_s = until_s[num:] - until_s[:-num]
-            cost = num * _duration_cost(length_s / (rate * typical_s)) + _SPLIT_COST * (num - 1)
-            for first in range(num):
-                before_s = until_s[first : first + len(typical_s)] - until_s[: len(typical_s)]
-                cost += hiss_cost(start_s + length_s * before_s / typical_s, first, num)
-            consider(row, 1, num, cost)
-        for merged in range(2, min(_MAX_MERGED, row) + 1):
-            group = segments[row - merged : row]
+        for num_grouped in range(1, max_split + 1):
+            typical_s = until_s[num_grouped:] - until_s[:-num_grouped]
+            cost = num_grouped * _duration_cost(length_s / (rate * typical_s)) + _SPLIT_COST * (
+                num_grouped - 1
+            )
+            for place in range(num_grouped):
+                before_s = until_s[place : place + len(typical_s)] - until_s[: len(typical_s)]
+                cost += hiss_cost(start_s + length_s * before_s / typical_s, place, num_grouped)
+            consider(row, 1, num_grouped, cost)
+        for num_merged in range(2, min(_MAX_MERGED, row) + 1):
+            group = segments[row - num_merged : row]
             pause_s = sum(after.start_s - before.end_s for before, after in pairwise(group))
             group_s = group[-1].end_s - group[0].start_s
-            cost = _duration_cost(group_s / (rate * text.duration_s)) + _MERGE_COST * (merged - 1)
+            cost = _duration_cost(group_s / (rate * text.duration_s)) + _MERGE_COST * (
+                num_merged - 1
+            )
             cost += hiss_cost(np.full(num_syllables, group[0].start_s), 0, 1)
-            consider(row, merged, 1, cost + pause_s / _PAUSE_COST_S)
+            consider(row, num_merged, 1, cost + pause_s / _PAUSE_COST_S)
     return _trace_back(best)
 
 
@@ -228,8 +232,10 @@ def _trace_back(best: NDArray[np.int16]) -> list[_Assignment]:
     row, column = best.shape[0] - 1, best.shape[1] - 1
     groups = []
     while row:
-        merged, num = (int(value) for value in best[row, column])
-        if num:
-            groups.append(_Assignment(row - merged, row - 1, slice(column - num, column)))
-        row, column = row - merged, column - num
+        num_merged, num_grouped = (int(value) for value in best[row, column])
+        if num_grouped:
+            groups.append(
+                _Assignment(row - num_merged, row - 1, slice(column - num_grouped, column))
+            )
+        row, column = row - num_merged, column - num_grouped
     return groups[::-1]
