@@ -178,7 +178,7 @@ def _cheapest_assignment(
     best = np.zeros((num_segments + 1, num_syllables + 1, 2), dtype=np.int16)
 
     def consider(row: int, num_merged: int, num_grouped: int, cost: Doubles | float) -> None:
-        """Consider groups of ``num_merged`` segments up to ``row``, and ``num_grouped`` syllables."""
+        """Consider a group of ``num_merged`` segments to ``row`` and ``num_grouped`` syllables."""
         total = total_cost[row - num_merged, : num_syllables + 1 - num_grouped] + cost
         is_better = total < total_cost[row, num_grouped:]
         total_cost[row, num_grouped:][is_better] = total[is_better]
