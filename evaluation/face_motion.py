@@ -231,7 +231,6 @@ def _match_rate(times: Sequence[Times], sessions: Sequence[_Session]) -> float |
 
 
 def _blink_durations_s(faps: Floats, rate_hz: float) -> Times:
-    """Return the durations of the blinks, seconds."""
     closed = np.pad((faps[:, _LID] > _CLOSED_LID).astype(int), 1)
     changes = np.diff(closed)
     return (np.flatnonzero(changes < 0) - np.flatnonzero(changes > 0)) / rate_hz

@@ -44,6 +44,7 @@ def lag_ms(pairs: Sequence[MouthPair]) -> float | None:
 
     Viewers notice sound that is 45 ms early or 125 ms late (ITU-R BT.1359-1).
 
+    >>> import numpy as np
     >>> time_s = np.arange(0.0, 4.0, 0.02)
     >>> real, late = (
     ...     Mouth(time_s, {"opening": np.sin(6.0 * (time_s - delay_s))}, time_s < 0.0)

@@ -12,11 +12,12 @@ from pathlib import Path
 from rich.progress import track
 
 from kouxing.corpora.lip_clips import LipClip, aligned_phones
+from kouxing.corpora.scoring import final_hypothesis
 from kouxing.evaluation.lips.lip_measures import MEASURES, REAL_MEASURES, ScoredClip
 from kouxing.evaluation.lips.live_faces import Samples, live_events, live_frames
-from kouxing.evaluation.lips.mouths import Mouth, predicted_mouth
+from kouxing.evaluation.lips.mouths import Mouth, clip_mouth, predicted_mouth
 from kouxing.evaluation.lips.other_programs import MouthFunction, load_programs
-from kouxing.evaluation.lips.references import read_parts, reference_of
+from kouxing.evaluation.lips.references import Reference, read_parts
 from kouxing.evaluation.recognizer.disturbances import (
     BABBLE,
     CLEAN,
@@ -35,7 +36,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_pa
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.events import SoundEvent
+from kouxing.shared.phones.events import SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import PhoneInventory
 
 REAL = "real"
@@ -146,9 +147,14 @@ def scored_clips_of(
             for key, lips in (predictors or {0: None}).items()
         }
         if reference is None:
-            aligned = aligned_phones(model, clip)
             first_events = next(iter(events.values()))[delays_s[0]]
-            reference = reference_of(clip, first_events, model.inventory, aligned)
+            reference = Reference(
+                clip=clip,
+                mouth=clip_mouth(clip),
+                phones=aligned_phones(model, clip) or final_hypothesis(first_events),
+                voice=[event for event in first_events if isinstance(event, SpeechChange)],
+                visemes=model.inventory.visemes,
+            )
             yield REAL, condition, ScoredClip(reference, reference.mouth)
             for title, mouth_of in programs.items():
                 yield title, condition, ScoredClip(reference, mouth_of(clip))

@@ -10,17 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from kouxing.corpora.lip_clips import LipClip, read_clips, training_clips
-from kouxing.corpora.scoring import final_hypothesis
 from kouxing.evaluation.lips.curves import is_near
-from kouxing.evaluation.lips.mouths import CURVES, Mouth, clip_mouth, real_faps
+from kouxing.evaluation.lips.mouths import CURVES, Mouth, real_faps
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, measure_levels
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import training_clip_names
 from kouxing.shared.arrays import Doubles, Mask
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.command.terminal import plural, print_message
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
-from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.events import Phone, SpeechChange
 
 PAUSE = "pause"
 _SPEECH_RANGE_DB, _SPEECH_MARGIN_S = 30.0, 0.1
@@ -100,22 +98,6 @@ class Reference:
             if first < len(level):
                 moments.append((first + int(np.argmin(level[first:last])) + 0.5) * _POWER_STEP_S)
         return np.array(moments)
-
-
-def reference_of(
-    clip: LipClip,
-    events: Sequence[SoundEvent],
-    inventory: PhoneInventory,
-    aligned: Sequence[Phone] | None,
-) -> Reference:
-    """Return the reference of a clip, with a live recognizer's output for its audio."""
-    return Reference(
-        clip=clip,
-        mouth=clip_mouth(clip),
-        phones=aligned or final_hypothesis(events),
-        voice=[event for event in events if isinstance(event, SpeechChange)],
-        visemes=inventory.visemes,
-    )
 
 
 def clips_to_score(folder: Path, *, language: str | None = None) -> list[LipClip]:

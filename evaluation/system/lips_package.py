@@ -36,6 +36,7 @@ from kouxing.shared.arrays import Floats
 from kouxing.shared.command.terminal import CONSOLE
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SoundEvent
+from kouxing.shared.phones.inventory import SILENCE
 
 Samples = Floats
 Faps = Floats
@@ -81,18 +82,11 @@ def package_faps(output: dict[str, Any]) -> Faps:
 
 def package_phones(output: dict[str, Any]) -> list[str]:
     """Return the final phones of the output, without silence."""
-    phones = (
-        Phone(
-            index=phone["index"],
-            symbol=phone["symbol"],
-            onset_s=phone["onsetS"],
-            duration_s=phone["durationS"],
-            confidence=phone["confidence"],
-            final=phone["isFinal"],
-        )
+    return [
+        phone["symbol"]
         for phone in output["phones"]
-    )
-    return [phone.symbol for phone in phones if phone.is_spoken]
+        if phone["isFinal"] and phone["durationS"] > 0.0 and phone["symbol"] != SILENCE
+    ]
 
 
 def server_events(samples: Samples, acoustic: str = "light") -> list[SoundEvent]:

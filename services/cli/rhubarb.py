@@ -112,7 +112,6 @@ def _animate(options: argparse.Namespace) -> FaceMotion:
 
 
 def _format_mouths(motion: FaceMotion, options: argparse.Namespace) -> str:
-    """Return the mouths of a recording in the format of the options."""
     substitutes = {
         letter: _BASIC_MOUTHS[letter]
         for letter in _BASIC_MOUTHS

@@ -128,8 +128,7 @@ def web_model() -> dict[str, bytes]:
         **{f"expressions.{name}": faps for name, faps in expression_motion.EXPRESSION_FAPS.items()},
     }
     for name, shape_set in shapes.SHAPE_SETS.items():
-        gram, right = shape_set.equation
-        arrays |= {f"shapes.{name}.gram": gram, f"shapes.{name}.right": right}
+        arrays |= {f"shapes.{name}.gram": shape_set.gram, f"shapes.{name}.right": shape_set.right}
     block_archive = read_archive(model_path("blocks"))
     light = parse_light_model(block_archive)
     topology = light.topology

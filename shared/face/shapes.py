@@ -85,14 +85,9 @@ class ShapeSet:
         self.basis = basis
         self._finish = finish
         matrix = (basis if solved is None else solved).astype(np.float64) @ effect_mm.T
-        self._gram = matrix @ matrix.T + _RIDGE_MM**2 * np.eye(len(names))  # (N, N)
-        self._right = matrix @ effect_mm  # (N, 68): times f, the right-hand side
-        self._unbounded = np.linalg.solve(self._gram, self._right)
-
-    @property
-    def equation(self) -> tuple[Doubles, Doubles]:
-        """Matrices of equation (2): (N, N), and (N, 68), which times the FAPs is its right side."""
-        return self._gram, self._right
+        self.gram = matrix @ matrix.T + _RIDGE_MM**2 * np.eye(len(names))  # (N, N)
+        self.right = matrix @ effect_mm  # (N, 68): times f, the right side of equation (2)
+        self._unbounded = np.linalg.solve(self.gram, self.right)
 
     def faps(self, weights: Floats) -> Floats:
         """Return the FAPs (68,) of weights (N,), equation (1)."""
@@ -107,7 +102,7 @@ class ShapeSet:
         return weights
 
     def _solve(self, faps: Doubles) -> Doubles:
-        right = self._right @ faps
+        right = self.right @ faps
         guess = self._unbounded @ faps
         at_one = guess >= 1.0
         free = (guess > 0.0) & ~at_one
@@ -115,9 +110,9 @@ class ShapeSet:
         while True:
             weights = at_one.astype(np.float64)
             inner = np.flatnonzero(free)
-            rows = self._gram[inner]
+            rows = self.gram[inner]
             weights[inner] = np.linalg.solve(rows[:, inner], right[inner] - rows @ weights)
-            negative_gradient = right - self._gram @ weights
+            negative_gradient = right - self.gram @ weights
             below, above = free & (weights < -_ROUNDING), free & (weights > 1.0 + _ROUNDING)
             released = ~free & (np.where(at_one, -negative_gradient, negative_gradient) > _ROUNDING)
             wrong = np.flatnonzero(below | above | released)

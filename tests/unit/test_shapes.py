@@ -28,11 +28,11 @@ def test_recovers_single_shapes() -> None:
 @pytest.mark.parametrize("name", SHAPE_SETS)
 def test_solution_is_optimal(name: str) -> None:
     shapes = SHAPE_SETS[name]
-    root = np.linalg.cholesky(shapes._gram)
+    root = np.linalg.cholesky(shapes.gram)
     random = np.random.default_rng(1)
     faces = [random.uniform(0, 1, len(shapes.names)) ** 4 @ shapes.basis for _ in range(20)]
     for faps in [*VISEMES, *(3 * EXPRESSIONS), *faces, random.normal(0, 300, NUM_FAPS)]:
-        right = np.linalg.solve(root, shapes._right @ faps.astype(float))
+        right = np.linalg.solve(root, shapes.right @ faps.astype(float))
         best = lsq_linear(root.T, right, (0, 1), method="bvls").x
         np.testing.assert_allclose(shapes._solve(faps.astype(float)), best, atol=1e-3)
 

@@ -20,7 +20,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import (
     Topology,
     score_segment,
 )
-from kouxing.services.recognizer.acoustic.network import NetworkModel
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.search.decoder import PathSegment
 from kouxing.services.recognizer.search.forced_path import (
     build_utterance_graph,
@@ -139,7 +139,7 @@ def _align_examples(
     place = np.arange(len(phone)) - topology.first_state[phone]
     # the middle of a phone's n-th state, among STATES_PER_PHONE
     new_place = (2 * place + 1) * STATES_PER_PHONE // (2 * num_states[phone])
-    if isinstance(aligner, NetworkModel):
+    if isinstance(aligner, BlockModel):
         aligner = replace(aligner, acoustic_scale=1.0)
 
     def align(number: int) -> Alignment | None:

@@ -113,7 +113,6 @@ def _check_key(name: str, key: Key | None, address: str) -> CheckResult:
 
 
 def _default_roles(name: str) -> Collection[str]:
-    """Return the default roles for a key name."""
     return KINDS[name].key_roles if name in KINDS else CLIENT_ROLES
 
 

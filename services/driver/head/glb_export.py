@@ -145,7 +145,6 @@ def _add_skeleton(document: GlbDocument, nodes: dict[str, int]) -> None:
 
 
 def _vrm(document: GlbDocument, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
-    """Return the VRM extension."""
     bindings: dict[str, list[tuple[int, int]]] = {morph.name: [] for morph in AVATAR_MORPHS}
     for number, node in enumerate(document.json["nodes"]):
         if "mesh" in node:

@@ -229,7 +229,6 @@ class LearnMouthHandler(UploadHandler):
 
 
 def _upload_error(status: int, text: str) -> web.Response:
-    """Return the answer to an upload that failed."""
     return web.json_response({"error": text}, status=status)
 
 

@@ -330,7 +330,6 @@ class ViewerHandler:
 
 
 def _shown_settings(face: FaceSettings) -> dict[str, object]:
-    """Return the settings of a face that viewers show."""
     return {
         "lip_model": face.lip_model or "",
         "expressiveness": face.expressiveness,

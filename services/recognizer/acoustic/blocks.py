@@ -52,20 +52,23 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticStream, ScoreRequest
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    AcousticModel,
+    AcousticStream,
+    ScoreRequest,
+)
 from kouxing.services.recognizer.acoustic.light import LightModel, build_light_model
 from kouxing.services.recognizer.acoustic.model_file import Archive, parse_topology
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_ENCODER_FRAME,
     MAX_POSITIONS,
-    NetworkModel,
     check_outputs,
     encode_integer_inputs,
     open_onnx_session,
     position_table,
     run_onnx_session,
 )
-from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
 from kouxing.shared.arrays import Floats
 from kouxing.shared.fast_record import Record
 
@@ -86,8 +89,12 @@ _MAX_CACHE_BYTES = 3_000_000  # per session
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlockModel(NetworkModel):
+class BlockModel(AcousticModel):
     """The block model: a network that scores speech in blocks."""
+
+    network: NDArray[np.uint8]  # an ONNX file
+    log_prior: Floats  # (states,)
+    acoustic_scale: float
 
     @cached_property
     def runner(self) -> BlockRunner:
@@ -98,6 +105,10 @@ class BlockModel(NetworkModel):
     def light_model(self) -> LightModel | None:
         """The model for a busy machine, or None if the encoder has other phones."""
         return build_light_model(self.topology, self.log_prior)
+
+    def create_front_end(self) -> WhisperMel:
+        """Create the front end of one session."""
+        return WhisperMel()
 
     def create_stream(self) -> BlockStream:
         """Create the stream of one speaker."""
@@ -116,7 +127,8 @@ class BlockModel(NetworkModel):
 
     def _run(self, blocks: Sequence[tuple[BlockStream, Block]]) -> None:
         log_posteriors, states, new_cache = self.runner.run([block for _, block in blocks])
-        scores = self.compute_scores(log_posteriors)
+        # posteriors divided by priors (Bourlard and Morgan 1994), weighted
+        scores = (log_posteriors - self.log_prior) * np.float32(self.acoustic_scale)
         # copies: a view would keep the whole batch
         for row, (stream, block) in enumerate(blocks):
             stream.append_outputs(block, scores[row].copy(), states[row].copy(), new_cache[row])
@@ -265,28 +277,21 @@ class BlockStream(AcousticStream):
     @property
     def is_due(self) -> bool:
         """Whether the network must run."""
-        num_encoder_frames = self._num_encoder_frames
+        num_encoder_frames = self._num_encoder_frames()
         return num_encoder_frames >= self._num_due or (self._has_ended and num_encoder_frames > 0)
 
     def is_due_after(self, num_frames: int) -> bool:
         """Return whether the network must run after this number of additional frames."""
-        return self._num_encoder_frames_after(num_frames) >= self._num_due
+        return self._num_encoder_frames(num_frames) >= self._num_due
 
-    @property
-    def _num_encoder_frames(self) -> int:
-        """Number of complete encoder frames, from the next block's first on."""
-        return self._num_encoder_frames_after(0)
-
-    def _num_encoder_frames_after(self, num_frames: int) -> int:
-        return max(
-            0,
-            (len(self._frames) + num_frames - 1 - _RIGHT_CONTEXT_FRAMES)
-            // FRAMES_PER_ENCODER_FRAME,
-        )
+    def _num_encoder_frames(self, num_more: int = 0) -> int:
+        """Return the number of complete encoder frames, from the next block's first on."""
+        num_frames = len(self._frames) + num_more - 1 - _RIGHT_CONTEXT_FRAMES
+        return max(0, num_frames // FRAMES_PER_ENCODER_FRAME)
 
     def block(self) -> Block:
         """Return the block that the network must compute next."""
-        sizes, num_complete = self._sizes, self._num_encoder_frames
+        sizes, num_complete = self._sizes, self._num_encoder_frames()
         num_encoder_frames = min(num_complete, self._num_due)
         max_encoder_frames = min(sizes.length, MAX_POSITIONS - self._row)
         if num_encoder_frames < max_encoder_frames:

@@ -2,15 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
-from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.arrays import Floats
 
 MAX_POSITIONS = 1500  # rows of the table of positions
@@ -24,25 +21,6 @@ def position_table(width: int) -> Floats:
     step = math.log(_LONGEST_WAVE) / (width // 2 - 1)
     phase = np.arange(MAX_POSITIONS)[:, None] * np.exp(-step * np.arange(width // 2))
     return np.concatenate([np.sin(phase), np.cos(phase)], axis=1).astype(np.float32)
-
-
-@dataclass(frozen=True, kw_only=True)
-class NetworkModel(AcousticModel):
-    """A model whose scores come from the log posteriors of a network."""
-
-    network: NDArray[np.uint8]  # an ONNX file
-    log_prior: Floats  # (states,)
-    acoustic_scale: float
-
-    def create_front_end(self) -> WhisperMel:
-        """Create the front end of one session."""
-        return WhisperMel()
-
-    def compute_scores(self, log_posteriors: Floats) -> Floats:
-        """Divide posteriors by priors (Bourlard and Morgan 1994), and weight the log scores."""
-        scores: Floats = log_posteriors - self.log_prior
-        scores *= np.float32(self.acoustic_scale)
-        return scores
 
 
 def encode_integer_inputs(num_axes: Mapping[str, int]) -> bytes:

@@ -136,7 +136,6 @@ class ClosingPhones:
         )
 
     def _closing_phone_log_odds(self, phone: Phone, time_s: float) -> float:
-        """Return the log odds that a closing phone adds."""
         maximum = min(log_odds_of(max(phone.confidence, 0.5)), self._rule.phone)
         end_s = phone.onset_s + min(phone.duration_s, _HOLD_S)
         outside_s = max(phone.onset_s - time_s, time_s - end_s, 0.0)

@@ -215,6 +215,5 @@ class RestingLips:
 
 
 def _transition_to(goal: float, amount: float, velocity: float, duration_s: float) -> Transition:
-    """Return the transition from an amount and its velocity to a goal."""
     difference = FapState(np.array([amount - goal]), np.array([velocity]))
     return Transition(difference, np.array([duration_s]))
