@@ -6,7 +6,7 @@ The syllables are matched with a known text.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TypeAlias
+from typing import NamedTuple
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
@@ -63,9 +63,6 @@ def split_characters(text: str, inventory: PhoneInventory) -> Characters:
     return list(zip(characters, syllables, strict=True))
 
 
-# phones, index of the character, first phone of the next syllable
-_Source: TypeAlias = tuple[list[Phone], int | None, list[Phone]]
-
 MAX_PHONES = 40  # phones that may still be revised; older ones are dropped
 
 
@@ -80,6 +77,14 @@ class CaptionSyllable:
     final: bool
 
 
+class _Source(NamedTuple):
+    """Everything that determines a syllable's caption."""
+
+    phones: list[Phone]
+    place: int | None  # index of its character; None: it has no character
+    next_phone: Phone | None  # first phone of the next syllable
+
+
 class SyllableCaptions:
     """Combines phones into syllables: first only the initial, then the initial with its vowel.
 
@@ -91,12 +96,14 @@ class SyllableCaptions:
         self._characters = characters
         self._num_dropped = 0  # characters before the first kept phone
         self._phones: dict[int, Phone] = {}
-        # by index, with their phones
-        self._syllables: dict[int, tuple[_Source, CaptionSyllable]] = {}
+        # both by index of the first phone
+        self._sources: dict[int, _Source] = {}
+        self._syllables: dict[int, CaptionSyllable] = {}
 
     def reset(self) -> None:
         """Drop all phones when a session restarts."""
         self._phones.clear()
+        self._sources.clear()
         self._syllables.clear()
         self._num_dropped = 0
 
@@ -113,23 +120,31 @@ class SyllableCaptions:
         if len(self._phones) > MAX_PHONES:
             oldest, place = groups.pop(0), places.pop(0)
             self._num_dropped = self._num_dropped if place is None else place + 1
+            self._sources.pop(oldest[0].index, None)
             self._syllables.pop(oldest[0].index, None)
             for dropped in oldest:
                 del self._phones[dropped.index]
-        syllables, changed = {}, []
-        for place, (group, following) in zip(places, pairwise([*groups, []]), strict=True):
-            phones = (group, place, following[:1])
-            known_phones, known = self._syllables.get(group[0].index, (None, None))
-            syllable = known if known and phones == known_phones else self._syllable(*phones)
-            if syllable != known:
-                changed.append(syllable)
-            syllables[syllable.index] = phones, syllable
+        sources = {
+            group[0].index: _Source(group, place, following[0] if following else None)
+            for place, (group, following) in zip(places, pairwise([*groups, []]), strict=True)
+        }
+        syllables = {
+            index: self._syllables[index]
+            if source == self._sources.get(index)
+            else self._syllable(source)
+            for index, source in sources.items()
+        }
         withdrawn = [
             replace(old, duration_s=0.0, final=True)
-            for index, (_, old) in self._syllables.items()
+            for index, old in self._syllables.items()
             if index not in syllables
         ]
-        self._syllables = syllables
+        changed = [
+            syllable
+            for index, syllable in syllables.items()
+            if syllable != self._syllables.get(index)
+        ]
+        self._sources, self._syllables = sources, syllables
         return withdrawn + changed
 
     def _places(self, groups: list[list[Phone]]) -> list[int | None]:
@@ -144,13 +159,12 @@ class SyllableCaptions:
         places = (None if syllable == silence else next(indices) for syllable in symbols)
         return [None if place is None else place + self._num_dropped for place in places]
 
-    def _syllable(
-        self, phones: list[Phone], place: int | None, following: list[Phone]
-    ) -> CaptionSyllable:
+    def _syllable(self, source: _Source) -> CaptionSyllable:
+        phones, place, next_phone = source
         first, last = phones[0], phones[-1]
         # The vowel of an initial may still follow.
-        is_complete = last.symbol not in self.inventory.initials or any(
-            phone.final for phone in following
+        is_complete = last.symbol not in self.inventory.initials or (
+            next_phone is not None and next_phone.final
         )
         spelling = self.inventory.spell(tuple(phone.symbol for phone in phones))
         return CaptionSyllable(

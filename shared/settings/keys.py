@@ -243,8 +243,8 @@ def save_grants(grants: Grants) -> None:
     ``UserError`` if the list cannot be written.
     """
     with _locked_folder() as folder:
-        is_controls = (folder / "control.key").exists()
-        if not is_controls and _read_grants(folder / _ALLOWED) != grants:
+        is_control_machine = (folder / "control.key").exists()
+        if not is_control_machine and _read_grants(folder / _ALLOWED) != grants:
             _write(folder / _ALLOWED, _format_grants(grants))
 
 
