@@ -11,9 +11,9 @@ from kouxing.services.recognizer.sessions.pending_sessions import PendingSession
 from kouxing.shared.errors import StartFailure, UserError
 from kouxing.shared.fast_record import replace
 from tests.samples import START
+from tests.system import LIMIT_S
 
 GERMAN = replace(START, session="first", facts=SessionFacts(language="german"))
-LIMIT_S = 60.0
 
 
 @pytest.mark.parametrize(

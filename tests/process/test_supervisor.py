@@ -151,26 +151,21 @@ def test_a_wrong_configuration_at_a_restart_is_reported_and_tried_again(
 
 
 @pytest.mark.parametrize(
-    ("entry", "text"),
+    ("line", "text"),
     [
-        ({"level": "info", "message": "opened", "session": "s1"}, ""),
-        ({"level": "warning", "message": "slow"}, "slow\n"),
-        ({"level": "warning", "message": "slow", "session": "s1"}, "session 's1': slow\n"),
-        ({"level": "warning", "message": "'s1' is slow", "session": "s1"}, "'s1' is slow\n"),
+        (b'{"level": "info", "message": "opened", "session": "s1"}', ""),
+        (b'{"level": "warning", "message": "slow"}', "slow\n"),
+        (b'{"level": "warning", "message": "slow", "session": "s1"}', "session 's1': slow\n"),
+        (b'{"level": "warning", "message": "\'s1\' is slow", "session": "s1"}', "'s1' is slow\n"),
+        (b"Segmentation fault\n", "Segmentation fault\n"),
     ],
 )
-def test_a_warning_names_its_session(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, entry: dict[str, str], text: str
+def test_warnings_with_their_session_and_other_text_are_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: bytes, text: str
 ) -> None:
     console = ConsoleOfSupervisor(tmp_path, monkeypatch)
-    console.error_after(json.dumps(entry).encode())
+    console.error_after(line)
     assert console.output.getvalue() == (text and f"gateway: {text}")
-
-
-def test_other_text_is_shown_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    console = ConsoleOfSupervisor(tmp_path, monkeypatch)
-    console.error_after(b"Segmentation fault\n")
-    assert console.output.getvalue() == "gateway: Segmentation fault\n"
 
 
 def test_a_long_warning_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,45 +4,41 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.mandarin.pinyin import phones_of_syllable, spell, transcribe, write
 from tests.languages import MANDARIN
 
-# The syllables of Mandarin by initial (Xinhua Zidian's table), ü written v after n and l.
-SYLLABLES = {
+# The syllables of Mandarin (Xinhua Zidian's table): the finals of each initial, ü written v after
+# n and l.
+FINALS = {
     "": "a o e ai ei ao ou an en ang eng er",
-    "y": "yi ya yo ye yao you yan yin yang ying yong yu yue yuan yun",
-    "w": "wu wa wo wai wei wan wen wang weng",
-    "b": "ba bo bai bei bao ban ben bang beng bi bie biao bian bin bing bu",
-    "p": "pa po pai pei pao pou pan pen pang peng pi pie piao pian pin ping pu",
-    "m": "ma mo me mai mei mao mou man men mang meng mi mie miao miu mian min ming mu",
-    "f": "fa fo fei fou fan fen fang feng fu",
-    "d": "da de dai dei dao dou dan den dang deng di dia die diao diu dian ding du duo dui duan "
-    "dun dong",
-    "t": "ta te tai tao tou tan tang teng ti tie tiao tian ting tu tuo tui tuan tun tong",
-    "n": "na ne nai nei nao nou nan nen nang neng ni nie niao niu nian nin niang ning nu nuo nuan "
-    "nong nv nve",
-    "l": "la le lai lei lao lou lan lang leng li lia lie liao liu lian lin liang ling lu luo luan "
-    "lun long lv lve",
-    "g": "ga ge gai gei gao gou gan gen gang geng gu gua guo guai gui guan gun guang gong",
-    "k": "ka ke kai kei kao kou kan ken kang keng ku kua kuo kuai kui kuan kun kuang kong",
-    "h": "ha he hai hei hao hou han hen hang heng hu hua huo huai hui huan hun huang hong",
-    "j": "ji jia jie jiao jiu jian jin jiang jing jiong ju jue juan jun",
-    "q": "qi qia qie qiao qiu qian qin qiang qing qiong qu que quan qun",
-    "x": "xi xia xie xiao xiu xian xin xiang xing xiong xu xue xuan xun",
-    "zh": "zhi zha zhe zhai zhei zhao zhou zhan zhen zhang zheng zhu zhua zhuo zhuai zhui zhuan "
-    "zhun zhuang zhong",
-    "ch": "chi cha che chai chao chou chan chen chang cheng chu chua chuo chuai chui chuan chun "
-    "chuang chong",
-    "sh": "shi sha she shai shei shao shou shan shen shang sheng shu shua shuo shuai shui shuan "
-    "shun shuang",
-    "r": "ri re rao rou ran ren rang reng ru rua ruo rui ruan run rong",
-    "z": "zi za ze zai zei zao zou zan zen zang zeng zu zuo zui zuan zun zong",
-    "c": "ci ca ce cai cei cao cou can cen cang ceng cu cuo cui cuan cun cong",
-    "s": "si sa se sai sao sou san sen sang seng su suo sui suan sun song",
+    "y": "i a o e ao ou an in ang ing ong u ue uan un",
+    "w": "u a o ai ei an en ang eng",
+    "b": "a o ai ei ao an en ang eng i ie iao ian in ing u",
+    "p": "a o ai ei ao ou an en ang eng i ie iao ian in ing u",
+    "m": "a o e ai ei ao ou an en ang eng i ie iao iu ian in ing u",
+    "f": "a o ei ou an en ang eng u",
+    "d": "a e ai ei ao ou an en ang eng i ia ie iao iu ian ing u uo ui uan un ong",
+    "t": "a e ai ao ou an ang eng i ie iao ian ing u uo ui uan un ong",
+    "n": "a e ai ei ao ou an en ang eng i ie iao iu ian in iang ing u uo uan ong v ve",
+    "l": "a e ai ei ao ou an ang eng i ia ie iao iu ian in iang ing u uo uan un ong v ve",
+    "g": "a e ai ei ao ou an en ang eng u ua uo uai ui uan un uang ong",
+    "k": "a e ai ei ao ou an en ang eng u ua uo uai ui uan un uang ong",
+    "h": "a e ai ei ao ou an en ang eng u ua uo uai ui uan un uang ong",
+    "j": "i ia ie iao iu ian in iang ing iong u ue uan un",
+    "q": "i ia ie iao iu ian in iang ing iong u ue uan un",
+    "x": "i ia ie iao iu ian in iang ing iong u ue uan un",
+    "zh": "i a e ai ei ao ou an en ang eng u ua uo uai ui uan un uang ong",
+    "ch": "i a e ai ao ou an en ang eng u ua uo uai ui uan un uang ong",
+    "sh": "i a e ai ei ao ou an en ang eng u ua uo uai ui uan un uang",
+    "r": "i e ao ou an en ang eng u ua uo ui uan un ong",
+    "z": "i a e ai ei ao ou an en ang eng u uo ui uan un ong",
+    "c": "i a e ai ei ao ou an en ang eng u uo ui uan un ong",
+    "s": "i a e ai ao ou an en ang eng u uo ui uan un ong",
 }
-LEGAL = [syllable for row in SYLLABLES.values() for syllable in row.split()]
+LEGAL = [initial + final for initial, row in FINALS.items() for final in row.split()]
 
 
 def test_every_valid_syllable_has_distinct_phones() -> None:
-    for initial, row in SYLLABLES.items():
-        for syllable in row.split():
+    for initial, row in FINALS.items():
+        for final in row.split():
+            syllable = initial + final
             phones = phones_of_syllable(syllable)
             if initial in MANDARIN.initials:
                 assert phones[0] == initial, syllable
