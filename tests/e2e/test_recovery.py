@@ -45,17 +45,8 @@ def test_a_session_continues_after_its_only_worker_hangs_or_crashes(
         streamed.finish()
         assert system.process(service) is not failed
     assert text in system.console.getvalue()
+    wait_until(lambda: f"{service} is running again" in system.console.getvalue())
     assert {*undisturbed.times} <= {*streamed.times}
-
-
-def test_the_driver_is_restarted(system: System) -> None:
-    def drivers() -> set[str]:
-        return {state.instance for state in system.status().services if state.service == "driver"}
-
-    before = drivers()
-    system.process("driver").kill()
-    wait_until(lambda: drivers() - before)
-    wait_until(lambda: "driver is running again" in system.console.getvalue())
 
 
 def test_a_wrong_configuration_ends_the_wait(tmp_path: Path) -> None:

@@ -29,19 +29,6 @@ from tests.system import (
     wait_until,
 )
 
-CTRL_C_AT_FIRST_IMAGE = """
-import signal
-from kouxing.services.driver.video.video_writer import VideoWriter
-write_image = VideoWriter.write_image
-
-def interrupt(*arguments):
-    write_image(*arguments)
-    print("an image was written")
-    signal.raise_signal(signal.SIGINT)
-
-VideoWriter.write_image = interrupt
-"""
-
 
 @pytest.fixture(scope="module")
 def speech(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -139,20 +126,3 @@ def test_ctrl_c_stops_run_while_it_starts(tmp_path: Path) -> None:
     assert process.returncode == 0
     assert "stopping" in log
     assert "Traceback" not in log
-
-
-def test_an_interrupted_render_leaves_no_file(tmp_path: Path, speech: Path) -> None:
-    program = CTRL_C_AT_FIRST_IMAGE + CTRL_C_COMMAND
-    result = subprocess.run(
-        [sys.executable, "-c", program, "render", speech, "face.mp4", "--size", "64x48"],
-        env=child_environment(),
-        cwd=tmp_path,
-        capture_output=True,
-        check=False,
-        text=True,
-        timeout=LIMIT_S,
-    )
-    assert "an image was written" in result.stdout
-    assert result.returncode == 130, result.stderr
-    assert "Traceback" not in result.stderr
-    assert not list(tmp_path.iterdir())

@@ -6,6 +6,7 @@ import shutil
 import signal
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import av
 import numpy as np
@@ -15,6 +16,7 @@ from PIL import Image, ImageSequence
 
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video.film import render_video
 from kouxing.services.driver.video.video_renderer import VideoRenderer
 from kouxing.services.driver.video.video_writer import VideoWriter, open_writer
 from kouxing.shared.errors import UserError
@@ -218,6 +220,17 @@ def test_a_video_without_frames_is_not_written(renderer: Renderer, tmp_path: Pat
     with pytest.raises(UserError, match="no frame arrived"):
         recording.close()
     recording.discard()
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_interrupted_video_leaves_no_file(renderer: Renderer, tmp_path: Path) -> None:
+    frames = [(number / 25, frame(0)) for number in range(9)]
+    interrupt = Mock(side_effect=KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        render_video(
+            frames, tmp_path / "a.mp4", renderer,
+            frame_rate_hz=25.0, samples=None, on_progress=interrupt,
+        )  # fmt: skip
     assert not any(tmp_path.iterdir())
 
 
