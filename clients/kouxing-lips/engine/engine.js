@@ -14,6 +14,7 @@ const MODELS = new URL("../models/", import.meta.url);
 const DEFAULT_SHAPES = ["arkit"];
 const DEFAULT_HOLD_S = 3;
 const MAX_DELAY_MS = 300;
+const MAX_PLAUSIBLE_SAMPLE = 100; // larger samples are integers; as in kouxing/shared/audio/audio_file.py
 const OPTIONS = ["sampleRateHz", "shapes", "expressiveness", "feeling", "delayMs", "phones", "models"];
 
 export class LipEngine {
@@ -145,12 +146,14 @@ function recognizerFor(model) {
   return model.blocks ? new PhoneRecognizer(model, new BlockScorer(model), blocks) : new PhoneRecognizer(model, new LightScorer(model), light);
 }
 
-/** Return samples in [-1, 1]; throws a RangeError if some are not finite. */
+/** Return samples in [-1, 1]; throws a RangeError if one is NaN or an integer. */
 function clip(samples) {
   const clipped = new Float32Array(samples.length);
   for (let i = 0; i < samples.length; i++) {
     const sample = samples[i];
-    if (!(Math.abs(sample) < Infinity)) throw new RangeError("some samples are not finite; they must be in [-1, 1]");
+    if (!(Math.abs(sample) <= MAX_PLAUSIBLE_SAMPLE)) {
+      throw new RangeError(`a sample is ${sample}; samples must be in [-1, 1]; divide integers by 32768`);
+    }
     clipped[i] = sample > 1 ? 1 : sample < -1 ? -1 : sample;
   }
   return clipped;

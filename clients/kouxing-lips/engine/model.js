@@ -31,7 +31,7 @@ export async function loadModel(base, { phones = false } = {}) {
   if (![true, false, FINAL].includes(phones)) throw new RangeError(`phones is ${phones}; it must be true, false or "${FINAL}"`);
   const files = [...FILES, ...(phones ? [PHONES_FILE] : []), ...(phones === FINAL ? [BLOCKS_FILE] : [])];
   const folder = String(base).replace(/\/?$/, "/");
-  const [encoder, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(new URL(name, folder))));
+  const [encoder, blob, header, phonesBlob, blocks] = await Promise.all(files.map((name) => readBytes(toUrl(name, folder))));
   const model = parseHeader(header, folder);
   if (model.format !== FORMAT) {
     throw new Error(`the models have the format ${model.format}, and this package needs ${FORMAT}; run kouxing export web again`);
@@ -65,6 +65,14 @@ function unpack(blob, entries) {
       return [name, { shape, values: type === "float16" ? floats(stored, halfToFloat) : stored }];
     }),
   );
+}
+
+function toUrl(name, folder) {
+  try {
+    return new URL(name, folder);
+  } catch (error) {
+    throw new TypeError(`models is ${folder}, which is not a URL; in Node, use pathToFileURL() of node:url`, { cause: error });
+  }
 }
 
 async function readBytes(url) {

@@ -16,11 +16,13 @@ for (const [options, message] of [
   test(`rejects ${JSON.stringify(options)}`, () => assert.rejects(LipEngine.load({ phones: false, ...options }), { message }));
 }
 
-test("rejects samples that are not finite", async () => {
-  const engine = await LipEngine.load();
-  const message = "some samples are not finite; they must be in [-1, 1]";
-  assert.throws(() => engine.push(new Float32Array(320).fill(NaN)), { message });
-});
+for (const sample of [NaN, Infinity, 1000]) {
+  test(`rejects the sample ${sample}`, async () => {
+    const engine = await LipEngine.load({ phones: false });
+    const message = `a sample is ${sample}; samples must be in [-1, 1]; divide integers by 32768`;
+    assert.throws(() => engine.push(new Float32Array(320).fill(sample)), { message });
+  });
+}
 
 for (const [strengths, holdS, message] of [
   [{ joy: NaN }, 3, "expression joy is NaN; it must be a number from 0 to 1"],
@@ -42,6 +44,9 @@ test("finish() ends the audio", async () => {
   assert.throws(() => engine.push(new Float32Array(320)), { message });
   assert.throws(() => engine.finish(), { message });
 });
+
+test("rejects a path of the models that is not a URL", () =>
+  assert.rejects(LipEngine.load({ models: "/models" }), { message: /^models is \/models\/, which is not a URL; in Node, use pathToFileURL/ }));
 
 test("reports missing models", async () => {
   const message = /^cannot load file:.* or create the file with: kouxing export web$/;

@@ -220,7 +220,7 @@ test("the worker reports broken sound once, and still finishes", async (t) => {
   await send({ type: "open", session: 3, options: {}, input });
   input.onmessage({ data: { samples: new Float32Array(320).fill(NaN), endS: 0 } });
   assert.equal(input.close.mock.callCount(), 1);
-  const text = "some samples are not finite; they must be in [-1, 1]";
+  const text = "a sample is NaN; samples must be in [-1, 1]; divide integers by 32768";
   assert.deepEqual(messages.at(-1), { type: "error", request: "sound", session: 3, text });
   await send({ type: "finish", session: 3 });
   assert.equal(messages.at(-1).type, "finished");
