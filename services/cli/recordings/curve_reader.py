@@ -14,7 +14,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,19 @@ _OTHER_COLUMNS |= {angle.lower() for angle in ANGLES}
 _HEAD_FAPS = dict(zip(ANGLES, ("head_yaw", "head_pitch", "head_roll"), strict=False))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Columns:
+    """The columns of a table that are read, by index."""
+
+    num_columns: int
+    time: int
+    is_time_code: bool  # whether the times are time codes, not seconds
+    face_count: int | None  # a count of 0 means that a frame has no face
+    values: list[int]  # FAPs or shapes
+    basis: Doubles  # FAPs (columns, 68) of each column in ``values`` at a value of 1
+    are_shapes: bool  # whether ``values`` are the weights of shapes, 0 to 1
+
+
 def read_table(path: Path) -> FapAnimation:
     """Read a table of FAPs or shapes and resample it at its median frame rate.
 
@@ -51,49 +64,76 @@ def read_table(path: Path) -> FapAnimation:
     lines = _read_lines(path)
     is_json = path.suffix.lower() == ".jsonl"
     rows = _json_rows(path, lines) if is_json else _csv_rows(path, lines)
-    written = [str(name).strip() for name in next(rows, [])]
-    names = [name.lower() for name in written]
-    time_name = next((name for name in ("time_s", "timecode") if name in names), None)
-    if not written:
+    columns = _find_columns(path, [str(name).strip() for name in next(rows, [])])
+    times, values = _read_frames(path, rows, columns)
+    times_s = _parse_times_s(path, times, is_time_code=columns.is_time_code)
+    animation = _resample(path, times_s, values @ columns.basis)
+    return animation if columns.is_time_code else replace(animation, start_s=float(times_s[0]))
+
+
+def _find_columns(path: Path, header: list[str]) -> _Columns:
+    """Find the columns to read, and print the names of unknown columns."""
+    if not header:
         raise UserError(f"{path}: the file is empty; export the curves again")
+    names = [name.lower() for name in header]
+    time_name = next((name for name in ("time_s", "timecode") if name in names), None)
     if time_name is None:
         raise UserError(
             f"{path}: no column is named time_s or Timecode; the columns are"
-            f" {', '.join(written)}; rename the time column"
+            f" {', '.join(header)}; rename the time column"
         )
-    columns, basis = _known_columns(path, written)
-    is_shapes = names[columns[0]] not in FAP_NUMBER
+    columns, basis = _known_columns(path, header)
     expected = {*_OTHER_COLUMNS, *(names[column] for column in columns)}
-    if ignored := [name for name in written if name.lower() not in expected]:
+    if ignored := [name for name in header if name.lower() not in expected]:
         print_message(f"{path}: ignored unknown columns: {', '.join(map(_hint, ignored))}")
-    count = names.index("blendshapecount") if "blendshapecount" in names else None
+    return _Columns(
+        num_columns=len(names),
+        time=names.index(time_name),
+        is_time_code=time_name == "timecode",
+        face_count=names.index("blendshapecount") if "blendshapecount" in names else None,
+        values=columns,
+        basis=basis,
+        are_shapes=names[columns[0]] not in FAP_NUMBER,
+    )
+
+
+def _read_frames(
+    path: Path, rows: Iterable[list[str]], columns: _Columns
+) -> tuple[list[str], Doubles]:
+    """Return the times (n,), still as text, and the values (n, columns) of frames with a face."""
     times: list[str] = []
     values: list[Doubles] = []
     for number, row in enumerate(rows, start=1):
+        count = columns.face_count
         if count is not None and row[count : count + 1] == ["0"]:
             continue
-        try:
-            times.append(row[names.index(time_name)])
-            values.append(np.array([row[column] for column in columns], np.float64))
-            is_whole = len(row) == len(names) and values[-1].ndim == 1
-            is_valid = is_whole and (np.abs(values[-1]) <= _MAX_FAP).all()
-        except (ValueError, TypeError, IndexError, OverflowError):
-            is_valid = False
-        if not is_valid:
+        frame = _parse_values(row, columns)
+        if frame is None:
             raise UserError(f"{path}, frame {number}: a value is missing or not a number")
-        if is_shapes and (np.abs(values[-1]) > _MAX_WEIGHT).any():
+        if columns.are_shapes and (np.abs(frame) > _MAX_WEIGHT).any():
             raise UserError(
                 f"{path}, frame {number}: values of shapes must be from 0 to 1; divide percentages"
                 " by 100"
             )
         if number > MAX_FRAMES:
             raise UserError(f"{path}: the table has more than {MAX_FRAMES} frames; split it")
+        times.append(row[columns.time])
+        values.append(frame)
     if not times:
         raise UserError(f"{path}: the table has no frames with a face; record it again")
-    is_time_code = time_name == "timecode"
-    times_s = _parse_times_s(path, times, is_time_code=is_time_code)
-    animation = _resample(path, times_s, np.array(values) @ basis)
-    return animation if is_time_code else replace(animation, start_s=float(times_s[0]))
+    return times, np.array(values)
+
+
+def _parse_values(row: list[str], columns: _Columns) -> Doubles | None:
+    """Return the values (columns,) of a row; None if one is missing or not a number."""
+    if len(row) != columns.num_columns:
+        return None
+    try:
+        values = np.array([row[column] for column in columns.values], np.float64)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    is_valid = values.ndim == 1 and (np.abs(values) <= _MAX_FAP).all()
+    return values if is_valid else None
 
 
 def _hint(column: str) -> str:
