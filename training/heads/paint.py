@@ -34,7 +34,6 @@ class FaceMap:
 
     x: Doubles  # (H, W) dm, distance from the middle plane
     y: Doubles
-    z: Doubles
     angle: Doubles
     source: Doubles  # (2, H, W) row and column in MakeHuman's skin, 0 to 1
     vertex: Integers  # (H, W) the nearest vertex
@@ -49,7 +48,7 @@ def face_map(vertices: Doubles, uv: Doubles, source: Doubles) -> FaceMap:
     v, u = np.meshgrid(
         (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
     )
-    values = np.concatenate([np.abs(vertices), source[:, ::-1]], axis=1)
+    values = np.concatenate([np.abs(vertices[:, :1]), source[:, ::-1]], axis=1)
     nearest = interpolate.NearestNDInterpolator(uv, values)
     linear = interpolate.LinearNDInterpolator(uv, values)(u, v)
     values = np.where(np.isfinite(linear), linear, nearest(u, v))
@@ -59,9 +58,8 @@ def face_map(vertices: Doubles, uv: Doubles, source: Doubles) -> FaceMap:
     return FaceMap(
         x=values[..., 0],
         y=TOP_Y - v * (TOP_Y - BOTTOM_Y),
-        z=values[..., 2],
         angle=np.interp(u, _COLUMNS, _ANGLES),
-        source=np.moveaxis(values[..., 3:], 2, 0),
+        source=np.moveaxis(values[..., 1:], 2, 0),
         vertex=spatial.cKDTree(uv).query(np.stack([u, v], axis=-1))[1],
     )
 

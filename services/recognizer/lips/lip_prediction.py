@@ -24,14 +24,8 @@ class LipPredictorStream(Protocol):
     ) -> list[LipPositions]:
         """Return the lip positions that an encoder frame determines.
 
-        Parameters
-        ----------
-        known_s
-            Media time of the encoder frame's last sample, seconds.
-        frames
-            Its two log-mel frames, shape (2, 80).
-        features
-            The encoder's features, shape (features,).
+        ``known_s`` is the media time of its last sample, ``frames`` are its two log-mel frames,
+        (2, 80), and ``features`` are those of the encoder, (features,).
         """
 
     def reset(self) -> None:

@@ -82,22 +82,10 @@ def viterbi_path(
 ) -> tuple[Integers, float]:
     """Find the best path through a graph.
 
-    Parameters
-    ----------
-    scores
-        Scores of the frames, shape (frames, columns).
-    columns
-        Column with the scores of each node, shape (nodes,).
-    graph
-        The utterance.
-    log_stay, log_leave
-        Transition log-probabilities of ``Topology``.
-
-    Returns
-    -------
-    tuple
-        The node of every frame, (frames,), and the path's log-likelihood. With too few frames, the
-        path is empty and the log-likelihood minus infinity.
+    ``scores`` (frames, columns) are the scores of the frames, and ``columns`` (nodes,) has the
+    column of each node; ``log_stay`` and ``log_leave`` are those of ``Topology``. Returns the node
+    of every frame, (frames,), and the path's log-likelihood. With too few frames, the path is empty
+    and the log-likelihood minus infinity.
 
     Memory grows with the square root of the number of frames: only some rows of scores are kept,
     and each block between two of them is computed again to trace the path (Hirschberg 1975). A
