@@ -141,10 +141,7 @@ def derived_default(compute: Callable[[Any], Any]) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ServiceConfig:
-    """The keys that every service has.
-
-    ``Settings`` checks the values; the constructor does not.
-    """
+    """The keys that every service has. ``Settings`` checks the values; the constructor does not."""
 
     safe_alternative: ClassVar[str] = "bind a loopback address"
     """Alternative to an unencrypted address that other machines can reach, for errors."""

@@ -99,10 +99,7 @@ class GlbDocument:
         )
 
     def save(self, path: Path, **rest: Any) -> None:
-        """Write the file.
-
-        Raises ``UserError`` if the file cannot be written.
-        """
+        """Write the file. Raises ``UserError`` if the file cannot be written."""
         lists = {kind: items for kind, items in self.json.items() if items}  # empty is not allowed
         document = {"asset": {"version": "2.0", "generator": "kouxing"}, **lists, **rest}
         document["buffers"] = [{"byteLength": len(self.binary)}]

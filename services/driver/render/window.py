@@ -38,13 +38,13 @@ class Window:
         if not glfw.init():
             raise UserError("no display for a window; set DISPLAY, or write a video instead")
         self._open(width_px, height_px, num_samples=0)
-        if not re.search("llvmpipe|softpipe", str(self._context.info["GL_RENDERER"])):
+        if not re.search("llvmpipe|softpipe", str(self.context.info["GL_RENDERER"])):
             glfw.destroy_window(self._window)
             self._open(width_px, height_px, num_samples=4)
         size = glfw.get_framebuffer_size(self._window)
         self._renderer = Renderer(
             head, *size,
-            background=background, camera=camera, context=self._context, on_screen=True,
+            background=background, camera=camera, context=self.context, on_screen=True,
         )  # fmt: skip
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_mouse_button_callback(self._window, self._on_mouse_button)
@@ -62,12 +62,7 @@ class Window:
             raise UserError("the display has no OpenGL 3.3; update its driver or install Mesa")
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
-        self._context = moderngl.create_context(require=330)
-
-    @property
-    def context(self) -> moderngl.Context:
-        """The window's OpenGL context, which other renderers can share."""
-        return self._context
+        self.context = moderngl.create_context(require=330)  # other renderers can share it
 
     def draw(self, faps: Floats) -> bool:
         """Show FAPs (68,) and process user input; return False after the window was closed."""

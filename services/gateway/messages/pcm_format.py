@@ -36,10 +36,7 @@ class PcmFormat(Struct, frozen=True, kw_only=True):
         return f"{self.encoding} samples, {self.sample_rate_hz} Hz {channels}, without a header"
 
     def check_message(self, message: bytes) -> None:
-        """Check a binary message.
-
-        Raises ``UserError`` if it is JSON.
-        """
+        """Check a binary message. Raises ``UserError`` if it is JSON."""
         is_short = len(message) <= MAX_OBJECT_BYTES
         if is_short and message[:1] == b"{" and _is_json(message):
             raise UserError(f"expected {self}; this is JSON: send it as a text message")
