@@ -23,7 +23,7 @@ from kouxing.services.cli.recordings.curve_exporters import CURVE_EXPORTERS, Fra
 from kouxing.services.cli.system.running_system import lock_output_folder
 from kouxing.services.driver.video import video_writer
 from kouxing.services.driver.video.film import TimedFaps
-from kouxing.services.driver.video.video_writer import PictureSequence, check_name
+from kouxing.services.driver.video.video_writer import PictureSequence
 from kouxing.shared.command.terminal import check_output, write_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.files import output_file
@@ -394,11 +394,6 @@ def test_a_sequence_of_pictures_searches_its_folder_once(
             sequence.write_image(np.zeros((2, 2, 3), np.uint8))
         assert searches.pop() == folder
         assert searches == []
-
-
-def test_a_picture_has_one_number(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="a name with one number such as"):
-        check_name(tmp_path / "face%d%d.png")
 
 
 @pytest.mark.parametrize("name", ["new/head.glb", "link.glb"])

@@ -138,6 +138,7 @@ def test_writes_a_picture_sequence(tmp_path: Path, name: str, names: list[str]) 
     [
         ("out.avi", {}, "ends in"),
         ("out.png", {}, "number"),
+        ("out%d%d.png", {}, "one number"),
         ("no/frames", {}, "cannot write"),
         ("no/out.mp4", {}, "cannot write"),
         ("out.mp4", {"transparent": True}, "MP4 cannot be transparent"),
