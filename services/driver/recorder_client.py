@@ -82,12 +82,13 @@ class RecorderClient:
         self._on_written = on_written
         self._on_error = on_error
         self._on_image = on_image
-        self._numbers = count()
+        self._video_numbers = count()
         self._open: dict[str, int] = {}  # numbers of the videos that accept frames, by session
         self._unfinished: dict[int, StartSession] = {}  # sessions by number
         self._recorder: _RecorderProcess | None = None
-        self._busy_s = 0.0  # when a video was last unfinished
-        self._ticked_s = self._silent_s = 0.0  # the last tick; time since the last report
+        self._last_busy_s = 0.0  # when a video was last unfinished
+        self._last_tick_s = 0.0
+        self._unreported_s = 0.0  # time since the last report
 
     @property
     def unfinished(self) -> list[str]:
@@ -101,14 +102,14 @@ class RecorderClient:
     def rejection_reason(self, key: str) -> str:
         """Return why a key cannot record another session now; empty if it can."""
         limit = self._config.max_videos
+        key_limit = math.ceil(MAX_KEY_SHARE * limit)
+        num_of_key = sum(start.client_key == key for start in self._unfinished.values())
         if len(self._unfinished) >= limit:
             reason = f"the driver is writing {limit} videos, the maximum (driver.max_videos)"
+        elif key and num_of_key >= key_limit:
+            reason = f"your key has {key_limit} unfinished videos, the maximum"
         else:
-            limit = math.ceil(MAX_KEY_SHARE * limit)
-            num_unfinished = sum(start.client_key == key for start in self._unfinished.values())
-            if not key or num_unfinished < limit:
-                return ""
-            reason = f"your key has {limit} unfinished videos, the maximum"
+            return ""
         return f"{reason}; wait until one is written, or open the session without 'record'"
 
     def begin(self, start: StartSession) -> None:
@@ -122,10 +123,10 @@ class RecorderClient:
                 ErrorCode.NO_VIDEO, start, f"cannot create {path.parent}: {error.strerror}"
             )
             return
-        number = self._open[session] = next(self._numbers)
+        number = self._open[session] = next(self._video_numbers)
         self._unfinished[number] = start
         if self._recorder is None:
-            self._recorder, self._silent_s = _RecorderProcess(self._config), 0.0
+            self._recorder, self._unreported_s = _RecorderProcess(self._config), 0.0
         self._send(session, "begin", start.client_key or "", path)
 
     def add_frame(self, session: str, time_s: float, values: bytes) -> None:
@@ -148,17 +149,17 @@ class RecorderClient:
         """
         if self._recorder is None:
             return math.inf
-        self._silent_s += min(now_s - self._ticked_s, MAX_TICK_S)
-        self._ticked_s = now_s
+        self._unreported_s += min(now_s - self._last_tick_s, MAX_TICK_S)
+        self._last_tick_s = now_s
         self._receive(timeout_s=0.0)
-        if self._silent_s > HANG_S:
+        if self._unreported_s > HANG_S:
             self._fail_all(HANG_REASON)
         elif self._unfinished:
-            self._busy_s = now_s
-        elif now_s >= self._busy_s + IDLE_S:
+            self._last_busy_s = now_s
+        elif now_s >= self._last_busy_s + IDLE_S:
             self._kill()
             return math.inf
-        return now_s + REPORT_S if self._unfinished else self._busy_s + IDLE_S
+        return now_s + REPORT_S if self._unfinished else self._last_busy_s + IDLE_S
 
     def close(self) -> None:
         """Save the finished part of every video."""
@@ -187,7 +188,7 @@ class RecorderClient:
         return has_received
 
     def _on_report(self, kind: str, number: int = -1, detail: Any = None) -> None:
-        self._silent_s = 0.0
+        self._unreported_s = 0.0
         if kind == "alive":
             return
         start = self._unfinished[number]

@@ -58,7 +58,7 @@ class DatagramConnection(TargetConnection):
     def __init__(self, target: Target) -> None:
         super().__init__(target)
         self._socket: socket.socket | None = None
-        self._last_refused_s = -_ASSUME_LISTENING_AFTER_S
+        self._last_error_s = -_ASSUME_LISTENING_AFTER_S
         self._newest_frame: FaceFrame | None = None
         self._tracker_input: tuple[asyncio.DatagramTransport, TrackerInput] | None = None
         self._is_forwarding = False  # whether the tracker's newest packet was sent
@@ -133,7 +133,7 @@ class DatagramConnection(TargetConnection):
         except BlockingIOError:
             return False
         except OSError as error:
-            self._last_refused_s = now_s
+            self._last_error_s = now_s
             address = f"{self.target.host}:{self.target.port}"
             if error.errno == errno.ECONNREFUSED:
                 self.problem = f"no program is listening on {address}; turn its receiver on"
@@ -143,7 +143,7 @@ class DatagramConnection(TargetConnection):
                 )
                 self._close()
             return False
-        if now_s - self._last_refused_s < _ASSUME_LISTENING_AFTER_S:
+        if now_s - self._last_error_s < _ASSUME_LISTENING_AFTER_S:
             return False
         self.problem = self._tracker_problem
         return True

@@ -13,12 +13,12 @@ _EYES = [
 ]
 _LIPS = [FAP_NUMBER[name] - 1 for name in ("lower_t_midlip", "raise_b_midlip")]
 _OPEN_LIPS = 880.0  # FAP units between the lips in a wide "a"
-_NO_MOUTH = ("brow", "eye", "blink", "look", "cheekSquint", "nose")  # prefixes of shape names
+_OUTSIDE_MOUTH = ("brow", "eye", "blink", "look", "cheekSquint", "nose")  # prefixes of shape names
 
 
 def mouth_shape_names(shapes: str) -> list[str]:
     """Return the names of the mouth's shapes in one of ``SHAPE_SETS``."""
-    return [name for name in SHAPE_SETS[shapes].names if not name.startswith(_NO_MOUTH)]
+    return [name for name in SHAPE_SETS[shapes].names if not name.startswith(_OUTSIDE_MOUTH)]
 
 
 Angles = tuple[float, float, float]

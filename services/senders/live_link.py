@@ -67,15 +67,15 @@ class LiveLinkConnection(DatagramConnection):
 
     def with_mouth(self, packet: bytes, frame: FaceFrame) -> tuple[Iterable[bytes], bool]:
         """Replace the mouth's values; rotations and names stay. Raises ``ValueError``."""
-        start = _first_value(packet)
+        start = _values_offset(packet)
         changed = bytearray(packet)
         for name, value in frame.weights("arkit", is_mouth_only=True).items():
             struct.pack_into(">f", changed, start + 4 * ORDER.index(name), value)
         return [bytes(changed)], True
 
 
-def _first_value(packet: bytes) -> int:
-    """Return where the values of a packet start.
+def _values_offset(packet: bytes) -> int:
+    """Return the offset of the values in a packet.
 
     Raises ``ValueError`` if the packet is malformed.
     """

@@ -49,7 +49,7 @@ class _Sender:
     queue: deque[tuple[float, FaceFrame]] = field(default_factory=deque)  # with earliest times
     timer: asyncio.TimerHandle | None = None
     sent_s: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_COUNTED))
-    reported: str = ""  # last reported problem
+    reported_problem: str = ""
 
 
 class PlayoutClock:
@@ -62,9 +62,9 @@ class PlayoutClock:
     """
 
     def __init__(self) -> None:
-        self._time_s = -math.inf  # time of the newest frame
+        self._newest_time_s = -math.inf
         self._window_end_s = -math.inf
-        self._shortest_s = self._previous_shortest_s = math.inf  # this window, previous window
+        self._min_delay_s = self._previous_min_delay_s = math.inf  # this window, previous window
 
     def earliest_s(self, time_s: float, now_s: float) -> float:
         """Return the earliest time at which a frame that has just arrived could have arrived.
@@ -72,15 +72,15 @@ class PlayoutClock:
         ``time_s`` is its media time. ``now_s`` and the result are times of a monotonic clock.
         """
         delay_s = now_s - time_s
-        shortest_s = min(self._shortest_s, self._previous_shortest_s)
-        if time_s <= self._time_s or delay_s > shortest_s + PAUSE_S:
-            self._shortest_s, self._window_end_s = math.inf, -math.inf
+        min_delay_s = min(self._min_delay_s, self._previous_min_delay_s)
+        if time_s <= self._newest_time_s or delay_s > min_delay_s + PAUSE_S:
+            self._min_delay_s, self._window_end_s = math.inf, -math.inf
         if now_s > self._window_end_s:
-            self._previous_shortest_s, self._shortest_s = self._shortest_s, math.inf
+            self._previous_min_delay_s, self._min_delay_s = self._min_delay_s, math.inf
             self._window_end_s = now_s + WINDOW_S
-        self._time_s = time_s
-        self._shortest_s = min(self._shortest_s, delay_s)
-        return time_s + min(self._shortest_s, self._previous_shortest_s)
+        self._newest_time_s = time_s
+        self._min_delay_s = min(self._min_delay_s, delay_s)
+        return time_s + min(self._min_delay_s, self._previous_min_delay_s)
 
 
 class SenderPool:
@@ -95,9 +95,9 @@ class SenderPool:
         self._senders: dict[TargetKey, _Sender] = {}
         self._rest = RestingFace(idle_motion=idle_motion)
         self._playout = PlayoutClock()
-        self._newest = np.zeros(NUM_FAPS, np.float32)
-        self._newest_s = time.monotonic() - STALL_S - FADE_S  # arrival of the newest frame
-        self._session_time_s = -STALL_S - FADE_S  # media time of the newest frame
+        self._newest_faps = np.zeros(NUM_FAPS, np.float32)
+        self._newest_arrival_s = time.monotonic() - STALL_S - FADE_S
+        self._newest_time_s = -STALL_S - FADE_S  # its media time
         self._timer: asyncio.TimerHandle | None = None  # next tick, while there are senders
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -208,7 +208,8 @@ class SenderPool:
         return states
 
     def _add_frame(self, session_time_s: float, faps: Faps, arrival_s: float) -> None:
-        self._newest, self._newest_s, self._session_time_s = faps, arrival_s, session_time_s
+        self._newest_faps = faps
+        self._newest_arrival_s, self._newest_time_s = arrival_s, session_time_s
         earliest_s = self._playout.earliest_s(session_time_s, arrival_s)
         self._queue(FaceFrame(faps, session_time_s), earliest_s)
 
@@ -219,15 +220,17 @@ class SenderPool:
             return
         self._timer = self._loop.call_later(1.0 / RESTING_RATE_HZ, self._tick)
         now_s = time.monotonic()
-        stalled_s = now_s - self._newest_s - STALL_S
+        stalled_s = now_s - self._newest_arrival_s - STALL_S
         if stalled_s > 0:
             weight = max(0.0, 1.0 - stalled_s / FADE_S)
-            time_s = self._session_time_s + now_s - self._newest_s
-            self._queue(FaceFrame(self._rest.blend(self._newest, weight, now_s), time_s), now_s)
+            time_s = self._newest_time_s + now_s - self._newest_arrival_s
+            self._queue(
+                FaceFrame(self._rest.blend(self._newest_faps, weight, now_s), time_s), now_s
+            )
         for sender in self._senders.values():
             problem = sender.connection.problem
-            if problem != sender.reported:
-                sender.reported = problem
+            if problem != sender.reported_problem:
+                sender.reported_problem = problem
                 self._report(sender.connection.target.url, problem)
 
     def _queue(self, frame: FaceFrame, earliest_s: float) -> None:

@@ -25,25 +25,25 @@ class TrackerInput(asyncio.DatagramProtocol):
     def __init__(self, forward: Callable[[bytes], bool]) -> None:
         self._forward = forward
         self._loop = asyncio.get_running_loop()
-        self._received_s = -math.inf
-        self._window_s, self._num_in_window = -math.inf, 0
+        self._last_face_s = -math.inf
+        self._window_start_s, self._num_in_window = -math.inf, 0
 
     @property
     def is_live(self) -> bool:
         """Whether the tracker sends faces."""
-        return self._loop.time() - self._received_s < _LIVE_S
+        return self._loop.time() - self._last_face_s < _LIVE_S
 
     def datagram_received(self, data: bytes, _address: object) -> None:
         """Forward a packet."""
         now_s = self._loop.time()
-        if now_s - self._window_s >= 1.0:
-            self._window_s, self._num_in_window = now_s, 0
+        if now_s - self._window_start_s >= 1.0:
+            self._window_start_s, self._num_in_window = now_s, 0
         self._num_in_window += 1
         if self._num_in_window > _MAX_RATE_HZ:
             return
         with contextlib.suppress(ValueError):
             if self._forward(data):
-                self._received_s = now_s
+                self._last_face_s = now_s
 
 
 async def open_tracker_input(

@@ -46,7 +46,7 @@ class VTubeStudioProtocol:
     def __init__(self, token: str, save_token: Callable[[str], None]) -> None:
         self._token = token
         self._save_token = save_token
-        self._known: frozenset[str] = frozenset()
+        self._existing_parameters: frozenset[str] = frozenset()
         self.is_ready = False
         self.problem = ""
 
@@ -92,7 +92,7 @@ class VTubeStudioProtocol:
             parameterValues=[
                 {"id": name, "value": value}
                 for name, value in values.items()
-                if name in self._known
+                if name in self._existing_parameters
             ],
         )
 
@@ -110,7 +110,7 @@ class VTubeStudioProtocol:
 
     def _on_parameters(self, data: Any) -> str:
         parameters = [*data["defaultParameters"], *data["customParameters"]]
-        self._known = frozenset(parameter["name"] for parameter in parameters)
+        self._existing_parameters = frozenset(parameter["name"] for parameter in parameters)
         self.is_ready = True
         return ""
 
@@ -210,7 +210,7 @@ class VTubeStudioConnection(TargetConnection):
         self._address = f"{target.host}:{target.port}"
         host = "127.0.0.1" if is_loopback(target.host) else target.host
         self._token_name = f"{host}:{target.port}"
-        self._newest: asyncio.Queue[FaceFrame] = asyncio.Queue(1)
+        self._newest_frame: asyncio.Queue[FaceFrame] = asyncio.Queue(1)
         self._is_ready = False
 
     async def run(self) -> None:
@@ -237,9 +237,9 @@ class VTubeStudioConnection(TargetConnection):
         """Queue a frame; it replaces a queued frame."""
         if not self._is_ready:
             return False
-        if self._newest.full():
-            self._newest.get_nowait()
-        self._newest.put_nowait(frame)
+        if self._newest_frame.full():
+            self._newest_frame.get_nowait()
+        self._newest_frame.put_nowait(frame)
         return True
 
     async def _run_connection(self, http: aiohttp.ClientSession) -> None:
@@ -274,7 +274,7 @@ class VTubeStudioConnection(TargetConnection):
     ) -> None:
         try:
             while True:
-                frame = await self._newest.get()
+                frame = await self._newest_frame.get()
                 message = protocol.frame_message(frame, is_mouth_only=self.target.is_mouth_only)
                 async with asyncio.timeout(TIMEOUT_S):
                     await vtube_studio.send_str(message)

@@ -20,7 +20,7 @@ _UNSUPPORTED_TEXTS = {  # text files without an extractor, by their first charac
     "\\version": "a LilyPond file",
 }
 _INVISIBLE = re.compile("[\u00ad\u200b\u2060\ufeff]")  # places where a word may break, or may not
-_LEFT_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
+_REMAINING_TIME = re.compile(r"-->|\d{1,2}:\d{2}:\d{2}[.,]\d{2,3}")
 
 
 def extract_text(text: str, *, is_markdown: bool = False) -> tuple[str, str]:
@@ -46,7 +46,7 @@ def extract_text(text: str, *, is_markdown: bool = False) -> tuple[str, str]:
     else:
         spoken = remove_columns(text)
         format_name = "" if spoken == text else "a table of times or names"
-    if _LEFT_TIME.search(spoken):
+    if _REMAINING_TIME.search(spoken):
         raise UserError("the text has times in an unknown format; keep only the spoken text")
     return spoken, format_name
 

@@ -51,7 +51,7 @@ class _Codec:
     """Encoder settings of pictures."""
 
     name: str
-    pixels: str
+    pixel_format: str
     options: dict[str, str] = field(default_factory=dict)
 
 
@@ -174,13 +174,13 @@ class VideoWriter:
         self._path = Path(path)
         self._overwrite = overwrite
         suffix = self._path.suffix.lower()
-        form = _FORMATS.get(suffix, _FORMATS[".mp4"])
-        codec = form.transparent if transparent else form.opaque
+        file_format = _FORMATS.get(suffix, _FORMATS[".mp4"])
+        codec = file_format.transparent if transparent else file_format.opaque
         if codec is None:
             raise UserError(
                 f"{self._path}: MP4 cannot be transparent; write .mov, .webm or pictures (a folder)"
             )
-        audio_codec = None if sample_rate_hz is None else form.audio_codec
+        audio_codec = None if sample_rate_hz is None else file_format.audio_codec
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz
         self._num_images = self._num_samples = 0
@@ -192,7 +192,7 @@ class VideoWriter:
             self._unfinished = UnfinishedFile(self._path)
             container = suffix.removeprefix(".") or "mp4"
             self._container = av.open(
-                str(self._unfinished.path), "w", format=container, options=form.options
+                str(self._unfinished.path), "w", format=container, options=file_format.options
             )
         except OSError as error:
             raise write_error(self._path, error) from error
@@ -200,7 +200,7 @@ class VideoWriter:
         video: Any = self._container.add_stream(codec.name, rate=rate, options=codec.options)
         self._video = video
         self._video.width, self._video.height = width_px, height_px
-        self._video.pix_fmt = codec.pixels
+        self._video.pix_fmt = codec.pixel_format
         context: Any = self._video.codec_context
         context.time_base = 1 / rate
         context.thread_count = 1
