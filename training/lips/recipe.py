@@ -96,7 +96,7 @@ def train_lips(folder: Path, output: Path, *, any_license: bool) -> None:
         raise UserError(f"the clips in {folder} contain no speech")
     filmed = [*unchanged, *speech_of(used, copy=1)]
     targets = _targets(load_model(), filmed, closed_below(clips))
-    basis = basis_of(unchanged, targets)
+    basis = Basis(*principal_components(features_of(unchanged)), measure_scale(targets))
     repeats = repeats_by_source(used)
     counts = [repeats[stretch.clip.source] for stretch in filmed]
     examples = [
@@ -132,11 +132,6 @@ def _targets(
         )
         for stretch in speech
     ]
-
-
-def basis_of(unchanged: Sequence[SpeechStretch], targets: Sequence[Floats]) -> Basis:
-    """Compute the components of speech without augmentation, and the units of targets."""
-    return Basis(*principal_components(features_of(unchanged)), measure_scale(targets))
 
 
 def examples_of(

@@ -148,7 +148,8 @@ class LiveDecoder:
         """Return the last phone and corrections."""
         phone, start, confidence = self._decoder.last_phone
         revised = self._revise(self._decoder.path_since(self._final_end_frame), num_following=1)
-        before = self._index_of(self._open[-1]) if self._open else self._last_final
+        index = self._inventory.index
+        before = index[self._open[-1].symbol] if self._open else self._last_final
         position = AFTER_PAUSE if before == self._silence else WITHIN_PHRASE
         new = Phone(
             index=self._num_final + len(self._open),
@@ -213,9 +214,6 @@ class LiveDecoder:
         del self._open[:num_phones]
         self._num_final += num_phones
         return withdrawn
-
-    def _index_of(self, phone: Phone) -> int:
-        return self._inventory.index[phone.symbol]
 
     def _time_s(self, frame: int) -> float:
         """Media time of the decoder's frame."""
