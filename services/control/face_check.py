@@ -5,6 +5,7 @@ from collections.abc import Collection
 from kouxing.shared.errors import Rejected, UserError
 from kouxing.shared.face.expressions import check_expressions
 from kouxing.shared.face.shape_names import ShapeSetName
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.session import ErrorCode
 from kouxing.shared.wire.speech import AcousticModelName
@@ -32,3 +33,13 @@ def check_face(settings: FaceSettings, lip_models: Collection[str], session: str
         check_expressions(settings.expressions or {}, settings.hold_s)
     except UserError as error:
         raise Rejected(ErrorCode.BAD_FACE, str(error)) from None
+
+
+def check_acoustic_model(settings: FaceSettings, language: str | None) -> None:
+    """Raise ``Rejected`` if the chosen acoustic model does not have a session's language."""
+    if settings.acoustic == AcousticModelName.LIGHT and language not in (None, DEFAULT_LANGUAGE):
+        text = (
+            f"the acoustic model light has only {DEFAULT_LANGUAGE}; leave out acoustic, because"
+            f" this session's language is {language}"
+        )
+        raise Rejected(ErrorCode.BAD_FACE, text)

@@ -14,7 +14,7 @@ from typing import Any
 from kouxing_client.messages import Event, Message, Speech
 
 from kouxing.services.control.config import ControlConfig
-from kouxing.services.control.face_check import check_face
+from kouxing.services.control.face_check import check_acoustic_model, check_face
 from kouxing.services.control.fault_log import FaultLog
 from kouxing.services.control.key_distributor import KeyDistributor
 from kouxing.services.control.placement import Placement
@@ -198,6 +198,7 @@ class ControlService(Service):
                 self._commands.send(replace(message, request=None), to=peer)
         else:
             record = self._sessions.find(message.session)
+            check_acoustic_model(message.face, record.facts.language)
             self._lifecycle.change_face(record, self._sessions.with_listening(message.face))
         return _done(message)
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from itertools import count
 from operator import attrgetter
 
+from kouxing.services.control.face_check import check_acoustic_model
 from kouxing.services.control.placement import Placement
 from kouxing.services.control.service_registry import ServiceRegistry
 from kouxing.services.control.session_record import SessionRecord
@@ -124,7 +125,7 @@ class SessionTable:
         """Place a new session.
 
         Raises ``Rejected`` if the name is taken, there are too many sessions, a service is
-        missing or busy, or no recognizer has the language.
+        missing or busy, or no recognizer or acoustic model has the language.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
         if name in self._records:
@@ -143,6 +144,7 @@ class SessionTable:
         facts = self._registry.facts(workers.values())
         if language is not None:
             facts = replace(facts, language=language)
+        check_acoustic_model(opening.face, facts.language)
         record = SessionRecord(
             name=name,
             number=next(self._numbers),

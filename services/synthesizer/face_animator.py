@@ -145,7 +145,7 @@ class FaceAnimator:
         time_s = time_of(event)
         if time_s - self._event_s > MAX_GAP_S and not isinstance(event, AudioSkipped):
             self._start_at(self._frame_number(max(0.0, time_s - self._delay_s)))
-        self._event_s = time_s
+        self._event_s = max(self._event_s, time_s)
         if isinstance(event, AudioSkipped):
             self.skip_to(time_s)
             return

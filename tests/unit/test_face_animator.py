@@ -75,6 +75,17 @@ def test_skips_to_newer_audio_without_a_jump() -> None:
     assert np.abs(np.diff(faps[:, JAW])).max() < faps[0, JAW] / 3
 
 
+def test_events_from_before_a_long_gap_may_be_repeated() -> None:
+    face = make_face()
+    frames = advance(face, 1.0) + advance(face, 15.0) + advance(face, 15.2)
+    face.change_recognizer()
+    face.process(SpeechChange(active=False, time_s=1.0))
+    frames += advance(face, 15.1) + advance(face, 15.3)
+    times_s = [time_s for time_s, _ in frames]
+    assert times_s == sorted({*times_s})
+    assert times_s[-1] == pytest.approx(15.3 - DELAY_S, abs=FRAME_S)
+
+
 def test_a_breath_parts_the_lips_only_without_speech() -> None:
     faces = []
     for is_speaking in (False, True):

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from kouxing.services.control.face_check import check_face
+from kouxing.services.control.face_check import check_acoustic_model, check_face
 from kouxing.shared.errors import Rejected
 from kouxing.shared.wire.face import FaceSettings
 
@@ -19,6 +19,16 @@ def test_known_names_are_accepted() -> None:
     check_face(FaceSettings(), LIP_MODELS)
     check_face(settings, LIP_MODELS)
     check_face(settings, [])  # no synthesizer reports its lip models
+
+
+def test_the_light_acoustic_model_has_only_mandarin() -> None:
+    light = FaceSettings(acoustic="light")
+    check_acoustic_model(light, "mandarin")
+    check_acoustic_model(light, None)
+    check_acoustic_model(FaceSettings(acoustic="full"), "english")
+    with pytest.raises(Rejected, match="light has only mandarin; leave out acoustic") as caught:
+        check_acoustic_model(light, "english")
+    assert caught.value.code == "bad-face"
 
 
 def test_a_face_cannot_listen_to_itself() -> None:

@@ -47,6 +47,8 @@ def test_a_client_may_choose_a_language_of_the_recognizer(cluster: Cluster) -> N
         cluster.open("e", language="fr")
     with refused("bad-language", "'klingon' is not installed; choose from: auto, zh"):
         cluster.open("f", language="klingon")
+    with refused("bad-face", "light has only mandarin"):
+        cluster.open("g", language="de", face=FaceSettings(acoustic="light"))
 
 
 def test_a_session_of_a_chosen_language_moves_only_to_a_worker_that_has_it(

@@ -20,7 +20,7 @@ class FaceSettings(TypedDict, total=False):
     lip_model: str
     """name of the lip model"""
     acoustic: str
-    """acoustic model: ``full``, or ``light`` with less processor time and more errors"""
+    """acoustic model: ``full``, or ``light``: less processor time, more errors, only Mandarin"""
     expressions: Mapping[str, float]
     """strengths from 0 to 1 by name; they replace the current ones, and ``{}`` removes them"""
     hold_s: float

@@ -67,6 +67,7 @@ const CHINESE = {
   "control has closed the session: {reason}": "控制服务关闭了会话（{reason}）",
   "the session is closed": "会话已关闭",
   "no session is shown; start a microphone or the sample first": "没有显示会话，请先打开麦克风或播放示例",
+  "the light model has only Mandarin; show a session in Mandarin": "轻量模型只支持普通话，请显示普通话的会话",
   "another program opened this session; only that program can send audio": "此会话由另一个程序打开，只有该程序可以发送声音",
 
   "session {name} is open; choose another name": "会话 {name} 已存在，请换一个名称",

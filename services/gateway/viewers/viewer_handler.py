@@ -30,6 +30,7 @@ from kouxing.shared.wire.speech import AcousticModelName
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
 SEND_BUFFER_BYTES = 32 * 1024  # in the kernel; about half a second for a slow viewer
+MANDARIN = "zh"  # code of the only language of the light model
 PAUSE_S = 0.2  # after this time without a frame, a viewer receives the face at rest
 
 
@@ -251,6 +252,10 @@ class ViewerHandler:
         elif command.face is not None:
             if viewer.shown_session is None and command.face.expressions is None:
                 raise UserError("no session is shown; start a microphone or the sample first")
+            uses_light_model = command.face.acoustic == AcousticModelName.LIGHT
+            shown = self._sessions.get(viewer.shown_name)
+            if uses_light_model and shown is not None and shown.language != MANDARIN:
+                raise UserError("the light model has only Mandarin; show a session in Mandarin")
             self._set_face(viewer.shown_name, command.face)
         elif command.follow is not None:
             viewer.requested_session, viewer.sample_session = command.follow, ""
