@@ -2,14 +2,14 @@
 
 Shapes are recognized by name (``shared.face.shape_names``): FAPs, ARKit's blendshapes, Oculus'
 visemes, or VRM's vowels; the last two also with ARKit's or VRM's shapes outside the mouth. A FAP
-frame ``f`` is expressed by the shapes whose FAPs
-``A`` are closest,
+frame ``f`` is expressed by the shapes whose FAPs ``A`` are closest,
 
     w(f) = argmin |D (A^T w - f)|^2 + r^2 |w|^2 = (A D^2 A^T + r^2 I)^-1 A D^2 f
 
 with ``D``, the travel of a FAP's feature point per unit. This is linear in ``f``, so the head has
 one displacement field per FAP. FAPs without a shape are approximated by other shapes. Negative
 weights are allowed; they move a shape's vertices in the opposite direction.
+
 ======  ============================================  ====  ========
 symbol  meaning                                       unit  shape
 ======  ============================================  ====  ========
@@ -61,6 +61,7 @@ _MIN_STEEPNESS = 1.5  # how much farther the mouth is below the eyes along an ax
 _JAW_RAD = 0.3  # rotation of a jaw bone at a weight of 1 of ARKit's jawOpen
 _JAW = FAP_NUMBER["open_jaw"] - 1
 _OPEN_JAW = float(ARKIT.basis[ARKIT.names.index("jawOpen"), _JAW])
+_GAZE_FAPS = (23, 24, 25, 26)
 _FAP_BY_NAME = {fap.name: fap for fap in FAPS[2:]}
 _NOT_MOUTH = re.compile("eye|brow|cheek|nose|blink|look")
 _SETS = {"arkit": ARKIT, "oculus": OCULUS, "vrm": VRM}
@@ -75,7 +76,7 @@ def read_glb(path: Path) -> Head:
     with check_glb(path), np.errstate(invalid="ignore", over="ignore"):  # the results are checked
         glb = GlbFile(path)
         pieces = read_pieces(glb)
-        return _head(path.stem, glb, pieces, _select_known_shapes(pieces))
+        return _make_head(path.stem, glb, pieces, _select_known_shapes(pieces))
 
 
 def _select_known_shapes(pieces: list[MeshPiece]) -> ShapeFaps:
@@ -124,9 +125,9 @@ def _rename_known_shapes(piece: MeshPiece, shape_of: Mapping[str, str]) -> None:
             piece.vertices = piece.vertices + piece.rest[name] * shift
 
 
-def _turn_jaw(piece: MeshPiece, arm: Doubles, known: ShapeFaps) -> None:
+def _turn_jaw(piece: MeshPiece, arm: Doubles, shape_faps: ShapeFaps) -> None:
     """Let a jaw bone move the teeth and the tongue, if they have no shapes that open the mouth."""
-    opening = {name: row[_JAW] / _OPEN_JAW for name, row in known.items() if row[_JAW] > 0}
+    opening = {name: row[_JAW] / _OPEN_JAW for name, row in shape_faps.items() if row[_JAW] > 0}
     if not opening.keys() & piece.shapes.keys():
         shift = _JAW_RAD * np.cross([1, 0, 0], arm)
         piece.shapes |= {name: weight * shift for name, weight in opening.items()}
@@ -135,37 +136,37 @@ def _turn_jaw(piece: MeshPiece, arm: Doubles, known: ShapeFaps) -> None:
 # --- the head -------------------------------------------------------------------------------------
 
 
-def _head(name: str, glb: GlbFile, pieces: list[MeshPiece], known: ShapeFaps) -> Head:
+def _make_head(name: str, glb: GlbFile, pieces: list[MeshPiece], shape_faps: ShapeFaps) -> Head:
     names = part_names(pieces)
-    _check_single_face(pieces, known)
+    _check_single_face(pieces, shape_faps)
     eyes = _find_eye_centers(glb, pieces, names)
-    unit = float(np.linalg.norm(eyes[0] - eyes[1]))
-    if not 1e-6 < unit < 1e6:
+    eye_distance = float(np.linalg.norm(eyes[0] - eyes[1]))
+    if not 1e-6 < eye_distance < 1e6:
         raise UserError("both eyes, found by shapes or names, are in the same place")
-    mouth = [name for name in known if not _NOT_MOUTH.search(name)]
+    mouth = [name for name in shape_faps if not _NOT_MOUTH.search(name)]
     is_mirrored = any(piece.is_mirrored for piece in pieces if piece.shapes.keys() & mouth)
-    turn = _upright_rotation(eyes, _moved_center(pieces, mouth), is_mirrored=is_mirrored)
+    rotation = _upright_rotation(eyes, _moved_center(pieces, mouth), is_mirrored=is_mirrored)
     for piece in pieces:
         if piece.is_mirrored != is_mirrored:
             piece.triangles = piece.triangles[:, ::-1]
-        piece.vertices = piece.vertices @ turn.T
-        piece.shapes = {name: shift @ turn.T for name, shift in piece.shapes.items()}
+        piece.vertices = piece.vertices @ rotation.T
+        piece.shapes = {name: shift @ rotation.T for name, shift in piece.shapes.items()}
         if piece.jaw_arm is not None:
-            _turn_jaw(piece, piece.jaw_arm @ turn.T, known)
-    eyes = eyes @ turn.T
-    scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
-    pivot = _find_pivot(glb, turn, middle, unit)
+            _turn_jaw(piece, piece.jaw_arm @ rotation.T, shape_faps)
+    eyes = eyes @ rotation.T
+    scale, middle = EYE_DISTANCE_M / eye_distance, eyes.mean(axis=0)
+    pivot = _find_pivot(glb, rotation, middle, eye_distance)
     world = np.concatenate([piece.vertices for piece in pieces])
     weights = [piece.head_weight for piece in pieces if piece.head_weight is not None]
     if len(weights) == len(pieces):  # every piece has a skeleton
         head_weight = np.concatenate(weights)
     else:
-        head_weight = head_weight_at((world[:, 1] - middle[1]) / unit)
+        head_weight = head_weight_at((world[:, 1] - middle[1]) / eye_distance)
     for piece in pieces:
         piece.vertices = (piece.vertices - pivot) * scale
         piece.shapes = {name: shift * scale for name, shift in piece.shapes.items()}
     has_eyes = any(name.startswith("eye_") for name in names)
-    fap_weights = _weights_by_fap(known, gaze=not has_eyes)
+    fap_weights = _weights_by_fap(shape_faps, with_gaze=not has_eyes)
     arrays = pack_head(
         pieces,
         fields=[_displacement_fields(piece, fap_weights) for piece in pieces],
@@ -189,9 +190,9 @@ def head_weight_at(height: Doubles) -> Doubles:
     return x**2 * (3 - 2 * x)
 
 
-def _check_single_face(pieces: list[MeshPiece], known: ShapeFaps) -> None:
+def _check_single_face(pieces: list[MeshPiece], shape_faps: ShapeFaps) -> None:
     """Raise ``UserError`` if two meshes far from each other have a mouth."""
-    opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in known)
+    opener = next(name for name in ("open_jaw", "jawOpen", "aa") if name in shape_faps)
     centers: list[Doubles] = []
     size = 0.0
     for piece in pieces:
@@ -220,17 +221,20 @@ def _upright_rotation(eyes: Doubles, mouth: Doubles | None, *, is_mirrored: bool
         if abs(up[other]) > _MIN_STEEPNESS * abs(up[y]):
             y = other
         sign = -1.0 if up[y] < 0 else 1.0
-    turn = np.zeros((3, 3))
-    turn[0, x], turn[1, y] = np.sign(side[x]), sign
-    turn[2] = np.cross(turn[0], turn[1]) * (-1 if is_mirrored else 1)
-    remaining, _ = Rotation.align_vectors([1, 0, 0], turn @ side)
+    rotation = np.zeros((3, 3))
+    rotation[0, x], rotation[1, y] = np.sign(side[x]), sign
+    rotation[2] = np.cross(rotation[0], rotation[1]) * (-1 if is_mirrored else 1)
+    remaining, _ = Rotation.align_vectors([1, 0, 0], rotation @ side)
     if remaining.magnitude() > _MAX_TILT_RAD:
-        turn = remaining.as_matrix() @ turn
-    return turn
+        rotation = remaining.as_matrix() @ rotation
+    return rotation
 
 
 def _find_eye_centers(glb: GlbFile, pieces: list[MeshPiece], names: list[str]) -> Doubles:
-    """Find the centers of the left and right eye (2, 3) by bones, eyeballs, lids or the mouth."""
+    """Find the centers of the left and right eye (2, 3) by bones, eyeballs or lids.
+
+    If an eye has none of these, estimate both centers.
+    """
     bones = {bone: number for number, bone in find_bones(glb).items()}
     matrices = dict(glb.nodes())
     centers = []
@@ -248,17 +252,20 @@ def _find_eye_centers(glb: GlbFile, pieces: list[MeshPiece], names: list[str]) -
             centers.append((eyeball.min(axis=0) + eyeball.max(axis=0)) / 2)
         elif lids is not None:
             centers.append(lids)
-    if len(centers) == 2:
-        return np.array(centers)
+    return np.array(centers) if len(centers) == 2 else _estimate_eye_centers(glb, pieces)
+
+
+def _estimate_eye_centers(glb: GlbFile, pieces: list[MeshPiece]) -> Doubles:
+    """Estimate the eye centers (2, 3) from the width of the head and the position of the mouth."""
     mouth = _moved_center(pieces, [name for piece in pieces for name in piece.shapes])
     skin = max((piece for piece in pieces if piece.shapes), key=lambda piece: len(piece.vertices))
     if mouth is None:
         mouth = skin.vertices.mean(axis=0)
     near = np.abs(skin.vertices[:, 1] - mouth[1])
     width = np.ptp(skin.vertices[near < np.quantile(near, 0.5), 0])
-    unit = width / _HEAD_WIDTH
-    middle = mouth - MOUTH_OFFSET * unit
-    half = np.array([unit / 2, 0, 0])
+    eye_distance = width / _HEAD_WIDTH
+    middle = mouth - MOUTH_OFFSET * eye_distance
+    half = np.array([eye_distance / 2, 0, 0])
     if "VRM" in glb.json.get("extensions", {}):  # version 0 looks along -z
         half = -half
     return np.stack([middle + half, middle - half])
@@ -275,24 +282,24 @@ def _moved_center(pieces: list[MeshPiece], names: list[str]) -> Doubles | None:
     return center / total if total > 0 else None
 
 
-def _find_pivot(glb: GlbFile, turn: Doubles, middle: Doubles, unit: float) -> Doubles:
+def _find_pivot(glb: GlbFile, rotation: Doubles, middle: Doubles, eye_distance: float) -> Doubles:
     """Return the position of the joint that the head rotates about."""
     bones = find_bones(glb)
     for number, matrix in glb.nodes():
-        position = turn @ matrix[:3, 3]
+        position = rotation @ matrix[:3, 3]
         is_joint = bones.get(number) == "head" and "mesh" not in glb.item("nodes", number)
-        if is_joint and np.linalg.norm(position - middle) < 4 * unit:
+        if is_joint and np.linalg.norm(position - middle) < 4 * eye_distance:
             return position
-    return middle + PIVOT_OFFSET * unit
+    return middle + PIVOT_OFFSET * eye_distance
 
 
-def _weights_by_fap(known: ShapeFaps, *, gaze: bool) -> dict[str, Doubles]:
+def _weights_by_fap(shape_faps: ShapeFaps, *, with_gaze: bool) -> dict[str, Doubles]:
     """Return each shape's weight per unit of every FAP (68,), by the module's equation."""
-    names = sorted(known, key=str.lower)
-    shapes = np.array([known[name] for name in names])
+    names = sorted(shape_faps, key=str.lower)
+    shapes = np.array([shape_faps[name] for name in names])
     if names[0] in _FAP_BY_NAME:
         return dict(zip(names, np.where(shapes > 0, 1 / np.maximum(shapes, 1), 0), strict=True))
-    travel = _travel_m(gaze)
+    travel = _travel_m(with_gaze=with_gaze)
     matrix = shapes * travel
     gram = matrix @ matrix.T + _RIDGE_M**2 * np.eye(len(shapes))
     weights = np.linalg.solve(gram, matrix * travel)
@@ -314,15 +321,13 @@ def _displacement_fields(piece: MeshPiece, weights: dict[str, Doubles]) -> FapFi
     }
 
 
-def _travel_m(gaze: bool) -> Doubles:
+def _travel_m(*, with_gaze: bool) -> Doubles:
     """Return the travel of a FAP's feature point per unit, m; 0 for FAPs to ignore."""
     fapu = standard_fapu()
     travel = np.zeros(NUM_FAPS)
     for fap in FAPS[2:]:
-        if fap.fapu == "AU":
-            eye = fap.number in (23, 24, 25, 26)
-            counts = (eye and gaze) or fap.name == "tongue_roll"
-            travel[fap.number - 1] = counts * _EYE_RADIUS_M * RADIANS_PER_ANGLE_UNIT
-        else:
+        if fap.fapu != "AU":
             travel[fap.number - 1] = fapu[fap.fapu] / FAP_UNITS_PER_FAPU
+        elif fap.name == "tongue_roll" or (with_gaze and fap.number in _GAZE_FAPS):
+            travel[fap.number - 1] = _EYE_RADIUS_M * RADIANS_PER_ANGLE_UNIT
     return travel

@@ -110,18 +110,19 @@ class MouthFields:
         ``weight`` (V,) is how far a vertex follows the jaw, and ``lever`` (V,) how far a depth
         follows the jaw's rotation. The lower lip's height follows FAP 15 less by ``lip_share``.
         """
-        for fap, motion, taken_out in (
+        for fap, motion, lip_weights in (
             (3, weight * lever, self._lip_y),
             (14, weight, self._lip_z),
             (15, weight * lever, self._lip_x),
         ):
-            left = motion / motion[self._points["2.1"]]
-            for name, field in taken_out.items():
-                left = left - left[self._points[name]] * field
+            weights = motion / motion[self._points["2.1"]]
+            for name, lip_weight in lip_weights.items():
+                weights = weights - weights[self._points[name]] * lip_weight
             if fap == 15 and lip_share:
                 for name in LOWER_LIP:
-                    left = left - lip_share * left[self._points[name]] * self._lip_y[name]
-            self._add_field(fap, left)
+                    lowered = lip_share * weights[self._points[name]] * self._lip_y[name]
+                    weights = weights - lowered
+            self._add_field(fap, weights)
 
 
 class SkinFields(MouthFields):
@@ -224,9 +225,8 @@ class SkinFields(MouthFields):
         ):
             names = [name for name in (upper, lower) if name in self._points]
             if names:
-                still = self._points_named(*corners)
                 far = self._distance(*names) > 0.45 * self._unit
-                points = np.concatenate([self._points_named(*names), still])
+                points = self._points_named(*names, *corners)
                 weights = self._smoothest_fields(points, far)
                 for name, weight in zip(names, weights.T, strict=False):
                     fap = faps[0] if name == upper else faps[1]
@@ -256,11 +256,11 @@ class SkinFields(MouthFields):
             if name in self._points:
                 # a zone ends at the other points of the face
                 others = [other for other in _FACE_POINTS if other != name]
-                near = self._geodesics.distance(self._points_named(name))
+                distance = self._distance(name)
                 fixed = np.union1d(
-                    np.flatnonzero(near > reach * self._unit), self._points_named(*others)
+                    np.flatnonzero(distance > reach * self._unit), self._points_named(*others)
                 )
-                moving = np.setdiff1d(np.flatnonzero(near <= core * self._unit), fixed)
+                moving = np.setdiff1d(np.flatnonzero(distance <= core * self._unit), fixed)
                 moving = np.union1d(moving, self._points_named(name))
                 self._add_field(fap, self._geodesics.zone(moving, np.setdiff1d(fixed, moving)))
                 if name in ("5.1", "5.2"):  # a puffed cheek also moves forward
