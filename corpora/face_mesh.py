@@ -13,13 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
-from kouxing.shared.arrays import Doubles, Floats
-
-UInt8 = NDArray[np.uint8]
+from kouxing.shared.arrays import Doubles, Floats, UInt8
 
 NUM_LANDMARKS = 468
 

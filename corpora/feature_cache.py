@@ -20,7 +20,7 @@ from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Float16, Floats, Int16
 from kouxing.shared.audio import audio_file
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
@@ -53,9 +53,7 @@ def read_audio(path: Path) -> Floats:
     return to_16_khz(*audio_file.read_audio(path))
 
 
-def log_mel_of(
-    utterances: Sequence[Utterance], errors: RowErrors
-) -> list[NDArray[np.float16] | None]:
+def log_mel_of(utterances: Sequence[Utterance], errors: RowErrors) -> list[Float16 | None]:
     """Return the log-mel features of every utterance, (frames, 41), cached or computed.
 
     None for audio that cannot be read, which is reported in ``errors``.
@@ -73,7 +71,7 @@ def log_mel_of(
     return [block if len(block) else None for block in blocks]
 
 
-def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:
+def samples_of(utterances: Sequence[Utterance]) -> list[Int16]:
     """Return the samples of every utterance, 16 kHz; empty if the audio cannot be read."""
     return _cached(utterances, "samples", np.empty(0, dtype=np.int16), as_integers)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import av
 import numpy as np
 import soundfile
-from numpy.typing import NDArray
 
 from kouxing.corpora.face_mesh import FaceMesh
 from kouxing.services.driver import picture
@@ -17,7 +16,7 @@ from kouxing.services.mono_audio import read_mono_16k
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, compute_mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
 from kouxing.services.mouth_profiles.lip_tracks import measure_levels
-from kouxing.shared.arrays import Doubles, Floats
+from kouxing.shared.arrays import Doubles, Floats, UInt8
 from kouxing.shared.audio.audio_file import MAX_FILE_BYTES, check_video
 from kouxing.shared.audio.media_file import OPTIONS, start_of
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -32,7 +31,7 @@ MAX_SIDE_PX = 960  # larger images are reduced
 
 
 def read_video(
-    path: Path, on_image: Callable[[float, NDArray[np.uint8]], None], track: int | None = None
+    path: Path, on_image: Callable[[float, UInt8], None], track: int | None = None
 ) -> Floats:
     """Read a video of any format that FFmpeg supports; return the audio, 16 kHz mono, (n,).
 
@@ -54,7 +53,7 @@ def read_video(
 def _decode(
     path: Path,
     container: av.container.InputContainer,
-    on_image: Callable[[float, NDArray[np.uint8]], None],
+    on_image: Callable[[float, UInt8], None],
 ) -> None:
     start_s = start_of(container) or 0.0
     for frame in container.decode(video=0):
@@ -68,7 +67,7 @@ def _decode(
         on_image(time_s, _image_of(frame))
 
 
-def _image_of(frame: av.VideoFrame) -> NDArray[np.uint8]:
+def _image_of(frame: av.VideoFrame) -> UInt8:
     scale = min(1.0, MAX_SIDE_PX / max(frame.width, frame.height))
     width, height = (max(2, 2 * round(scale * side / 2)) for side in (frame.width, frame.height))
     pixels = frame.to_ndarray(format="rgb24", width=width, height=height)
@@ -85,7 +84,7 @@ def track_video(video: Path, clip: Path, audio_track: int | None) -> tuple[int, 
     times: list[float] = []
     landmarks_by_image: list[Floats | None] = []
 
-    def track_image(time_s: float, image: NDArray[np.uint8]) -> None:
+    def track_image(time_s: float, image: UInt8) -> None:
         landmarks = mesh.track(image)
         times.append(time_s)
         landmarks_by_image.append(None if landmarks is None else landmarks[list(LANDMARKS)])

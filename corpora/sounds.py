@@ -10,13 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import may_distribute
 from kouxing.corpora.tables import read_rows
+from kouxing.shared.arrays import Int16
 from kouxing.shared.audio.pcm import as_integers
 from kouxing.shared.errors import UserError
 
@@ -30,7 +28,7 @@ class Sound:
 
     name: str
     kind: str
-    samples: NDArray[np.int16]  # 16 kHz
+    samples: Int16  # 16 kHz
     is_held_out: bool
 
 
@@ -60,7 +58,7 @@ def held_out(sounds: Sequence[Sound], kind: str) -> list[Sound]:
     return [sound for sound in sounds if sound.kind == kind and sound.is_held_out]
 
 
-def training_backgrounds(sounds: Sequence[Sound]) -> list[NDArray[np.int16]]:
+def training_backgrounds(sounds: Sequence[Sound]) -> list[Int16]:
     """Return the music, noise and babble that may be mixed with speech in training."""
     return [
         sound.samples for sound in sounds if sound.kind in _BACKGROUNDS and not sound.is_held_out

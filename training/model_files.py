@@ -13,6 +13,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.model_file import phone_lm_arrays, shipped_phone_lm
 from kouxing.services.recognizer.lips import lip_predictor
 from kouxing.services.recognizer.live import voice_traits
+from kouxing.shared.arrays import UInt8
 from kouxing.shared.files.output_file import open_output
 
 _LANGUAGE = ("language", "phones")  # arrays
@@ -70,7 +71,7 @@ def save_blocks(path: Path, model: blocks.BlockModel) -> None:
     )
 
 
-def save_universal(path: Path, model: blocks.BlockModel, extension: NDArray[np.uint8]) -> None:
+def save_universal(path: Path, model: blocks.BlockModel, extension: UInt8) -> None:
     """Write a model that extends the network of the shipped block model."""
     _save_acoustic_model(
         path,

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import log_mel_of, samples_of
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, audio_files, read_corpus
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
+from kouxing.shared.arrays import Float16, Int16
 from kouxing.shared.phones.inventory import PhoneInventory
 
 FRAMES_PER_MINUTE = 6000
@@ -33,8 +33,8 @@ _MAX_PIECE_FRAMES = 2000  # longer recordings without text are cut
 class Example:
     """One recording to train on."""
 
-    log_mel: NDArray[np.float16]  # (frames, 41)
-    samples: NDArray[np.int16]  # (n,) 16 kHz, the samples of these frames
+    log_mel: Float16  # (frames, 41)
+    samples: Int16  # (n,) 16 kHz, the samples of these frames
     phones: tuple[int, ...]  # indices into the inventory's phones
     syllables: tuple[int, ...]  # number of phones in each syllable
     weight: float  # weight of its frames in the estimates
@@ -62,8 +62,8 @@ def load_examples(
     :func:`read_corpus`. Raises ``UserError`` if no recording can be used.
     """
     utterances: list[Utterance] = []
-    log_mels: list[NDArray[np.float16] | None] = []
-    sounds: list[NDArray[np.int16]] = []
+    log_mels: list[Float16 | None] = []
+    sounds: list[Int16] = []
     for corpus in corpora:
         rows = read_corpus(corpus, errors, inventory, split=split, any_license=any_license)
         utterances += rows
@@ -111,7 +111,7 @@ def weights_of(utterances: Sequence[Utterance]) -> list[float]:
     return weights
 
 
-def load_untranscribed(folder: Path, errors: RowErrors) -> list[NDArray[np.int16]]:
+def load_untranscribed(folder: Path, errors: RowErrors) -> list[Int16]:
     """Read recordings without text, in any language, except those held out for measuring.
 
     Returns samples at 16 kHz, trimmed and cut into pieces of up to 20 s. ``errors`` receives a
@@ -135,7 +135,7 @@ def load_untranscribed(folder: Path, errors: RowErrors) -> list[NDArray[np.int16
     return pieces
 
 
-def speech_span(log_mel: NDArray[np.float16]) -> slice:
+def speech_span(log_mel: Float16) -> slice:
     """Find the frames from a quarter of a second before the speech to as long after it."""
     log_energy = np.asarray(log_mel[:, 0], dtype=np.float32)
     low, high = np.percentile(log_energy, [5, 95])

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.evaluation.system.live import CHUNK
 from kouxing.services.driver.head.head import ASSETS, Detail, Head
@@ -22,7 +21,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.lips.lip_predictor import GruLipPredictor, load_lip_predictor
 from kouxing.services.recognizer.live.recognizer import Recognizer
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 from kouxing.shared.audio.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.high_level_faps import VISEMES
@@ -121,7 +120,7 @@ def _moving_face(number: int) -> Floats:
     return faps
 
 
-def _encode_ms(images: list[NDArray[np.uint8]]) -> float:
+def _encode_ms(images: list[UInt8]) -> float:
     height_px, width_px = images[0].shape[:2]
     with tempfile.TemporaryDirectory() as folder:
         with VideoWriter(Path(folder) / "bench.mp4", width_px, height_px, 25.0, None) as writer:

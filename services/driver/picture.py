@@ -5,11 +5,9 @@ from typing import Any
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
+from kouxing.shared.arrays import UInt8
 from kouxing.shared.errors import UserError
-
-UInt8 = NDArray[np.uint8]
 
 MAX_PIXELS = 8192 * 8192
 # first bytes: decoder. FFmpeg must not guess the format: it would open playlists of other files

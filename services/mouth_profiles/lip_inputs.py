@@ -4,7 +4,6 @@ Voice activity detection runs as in the live recognizer.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_ENCODER_FRAME
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
@@ -12,7 +11,7 @@ from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.services.recognizer.lips.lip_predictor import join_features
 from kouxing.services.recognizer.live.speech_segmenter import SpeechSegmenter
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Float16, Floats
 from kouxing.shared.phones.events import LipPositions
 
 ENCODER_FRAME_S = FRAMES_PER_ENCODER_FRAME * HOP_S
@@ -24,7 +23,7 @@ class LipInputs:
     def __init__(self) -> None:
         self.starts: list[int] = []  # first encoder frame of each segment of speech
         self.known_s: list[float] = []  # media time up to which the audio is known
-        self.features: list[NDArray[np.float16]] = []  # (features,) of each encoder frame
+        self.features: list[Float16] = []  # (features,) of each encoder frame
 
     def process_encoder_frame(
         self, known_s: float, frames: Floats, features: Floats

@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.arrays import Doubles, Floats
+from kouxing.shared.arrays import Doubles, Floats, UInt8
 from kouxing.shared.audio.audio_formats import NUM_BEGIN_BYTES, audio_file_kind, find_media_start
 from kouxing.shared.audio.pcm import FULL_SCALE, as_floats
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -90,7 +90,7 @@ class EncodingCheck:
             block, self._waiting = self._waiting[:num_bytes], self._waiting[num_bytes:]
             self._judge(np.frombuffer(block, np.uint8))
 
-    def _judge(self, data: NDArray[np.uint8]) -> None:
+    def _judge(self, data: UInt8) -> None:
         """Count a block as sound, or as another encoding; a silent block does not count."""
         samples = data.view("<i2")
         channels = (samples / FULL_SCALE).reshape(-1, self._num_channels).T
@@ -144,7 +144,7 @@ class EncodingCheck:
             )
             raise UserError(self._error)
 
-    def _is_compressed(self, low_bytes: NDArray[np.uint8]) -> bool:
+    def _is_compressed(self, low_bytes: UInt8) -> bool:
         starts = self._packet_starts[:_NUM_PACKETS]
         has_packets = (
             len(starts) == _NUM_PACKETS
@@ -180,7 +180,7 @@ def _likely_encoding(
     return min(plausible, default=(0.0, ""))[1]
 
 
-def _decode(data: NDArray[np.uint8], codec: str) -> Floats:
+def _decode(data: UInt8, codec: str) -> Floats:
     """Decode bytes as samples of one channel."""
     decoder: Any = av.CodecContext.create(codec, "r")
     decoder.sample_rate, decoder.layout = MEDIA_RATE_HZ, "mono"  # any rate

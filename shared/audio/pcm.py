@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, Int16
 from kouxing.shared.errors import UserError
 
 FULL_SCALE = 32768.0  # divides 16-bit samples, which are then in [-1, 1)
@@ -20,10 +20,10 @@ def as_floats(samples: NDArray[Any]) -> Floats:
     return values - 1 if samples.dtype.kind == "u" else values
 
 
-def as_integers(samples: Floats) -> NDArray[np.int16]:
+def as_integers(samples: Floats) -> Int16:
     """Convert samples in [-1, 1] to little-endian 16-bit integers."""
     scaled = np.clip(np.rint(samples * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
-    integers: NDArray[np.int16] = scaled.astype("<i2")
+    integers: Int16 = scaled.astype("<i2")
     return integers
 
 

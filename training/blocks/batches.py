@@ -15,12 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import soundfile
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
-from kouxing.shared.arrays import Doubles, Floats, Integers
+from kouxing.shared.arrays import Doubles, Float16, Floats, Int16, Integers
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.networks.augmentation import (
     Samples,
@@ -64,17 +63,17 @@ class BatchSource:
     """Recordings and background sounds from which batches are drawn."""
 
     recordings: Sequence[LabeledRecording]
-    backgrounds: Sequence[NDArray[np.int16]] = ()  # music and noise
+    backgrounds: Sequence[Int16] = ()  # music and noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlockBatch:
     """Excerpts of a step."""
 
-    frames: NDArray[np.float16]  # (batch, 2 positions + 1, 80), the network's input
-    clean: NDArray[np.float16]  # (batch, 80, more frames), the teacher's input
-    states: NDArray[np.int16]  # (batch, positions, 2, k), the targets
-    probs: NDArray[np.float16]  # (batch, positions, 2, k)
+    frames: Float16  # (batch, 2 positions + 1, 80), the network's input
+    clean: Float16  # (batch, 80, more frames), the teacher's input
+    states: Int16  # (batch, positions, 2, k), the targets
+    probs: Float16  # (batch, positions, 2, k)
     block: tuple[int, int]  # lengths of a block and its right context, positions
     start: int  # row of the first position
 
@@ -186,9 +185,7 @@ def _add_background(sound: Samples, batch_source: BatchSource, rng: np.random.Ge
         numbers = rng.integers(
             len(batch_source.recordings), size=int(rng.integers(1, _MAX_VOICES + 1))
         )
-        others: list[NDArray[np.int16]] = [
-            batch_source.recordings[number].samples for number in numbers
-        ]
+        others: list[Int16] = [batch_source.recordings[number].samples for number in numbers]
     elif draw < _BABBLE_PROB + _MUSIC_PROB and batch_source.backgrounds:
         others = [batch_source.backgrounds[int(rng.integers(len(batch_source.backgrounds)))]]
     else:

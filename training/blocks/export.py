@@ -31,12 +31,11 @@ from functools import partial
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
 from kouxing.services.recognizer.acoustic.blocks import cache_names
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
 from kouxing.training.networks.network import MAX_DEVIATIONS
 from kouxing.training.networks.onnx_graph import DOMAIN, Graph, floats, halves, module_arrays
@@ -51,7 +50,7 @@ def export_onnx(
     block_length: int,
     right_context: int = RIGHT_CONTEXT,
     past: int = PAST,
-) -> NDArray[np.uint8]:
+) -> UInt8:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
     return BlockGraph(encoder, readout, block_length, right_context, past).file_of_block()
 
@@ -179,7 +178,7 @@ class BlockGraph(ReadoutGraph):
         self._past = past
         self._new: list[str] = []  # keys and values of the block
 
-    def file_of_block(self) -> NDArray[np.uint8]:
+    def file_of_block(self) -> UInt8:
         """Add all nodes; return the ONNX file."""
         self.log_posteriors(self.features(KEPT_LAYERS))
         self.new_caches()

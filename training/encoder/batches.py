@@ -16,7 +16,7 @@ from kouxing.services.mouth_profiles.lip_inputs import ENCODER_FRAME_S
 from kouxing.services.recognizer.acoustic.encoder import LIP_DELAYS_S, VoiceKind
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.arrays import Doubles, Floats
+from kouxing.shared.arrays import Doubles, Float16, Floats
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.encoder.network import NUM_INPUTS
 from kouxing.training.encoder.targets import PITCH, VOICE, Piece, Samples, TargetColumns
@@ -30,8 +30,7 @@ from kouxing.training.networks.augmentation import (
 )
 from kouxing.training.seed import SEED
 
-Halves = NDArray[np.float16]
-Batch = tuple[Halves, Halves]  # inputs, (batch, positions, 160); targets
+Batch = tuple[Float16, Float16]  # inputs, (batch, positions, 160); targets
 
 NUM_ENCODER_FRAMES = 250  # length of an excerpt, 5 s
 NUM_EXCERPTS = 28

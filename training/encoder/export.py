@@ -22,11 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.encoder import FORMAT, VoiceKind
 from kouxing.services.recognizer.acoustic.model_file import load_component
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 from kouxing.training.encoder.network import MEAN_PITCH, NUM_FEATURES, NUM_INPUTS, AudioEncoder
 from kouxing.training.model_files import write_archive
 from kouxing.training.networks.onnx_graph import (
@@ -45,7 +44,7 @@ def save_encoder(path: Path, encoder: AudioEncoder) -> None:
     write_archive(path, {"format": np.array(FORMAT), "network": export_onnx(encoder)})
 
 
-def export_onnx(encoder: AudioEncoder) -> NDArray[np.uint8]:
+def export_onnx(encoder: AudioEncoder) -> UInt8:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
     return _EncoderGraph(encoder).build_step_model()
 
@@ -60,7 +59,7 @@ def rebuild_encoder(path: Path) -> AudioEncoder:
     )
 
 
-def _rebuild(file: NDArray[np.uint8]) -> AudioEncoder:
+def _rebuild(file: UInt8) -> AudioEncoder:
     tensors = read_tensors(file)
     num_outputs, width = len(tensors["output.bias"]), len(tensors["entry.bias"])
     num_phones = num_outputs - NUM_FEATURES - len(VoiceKind) - _NUM_SCALARS
@@ -85,7 +84,7 @@ class _EncoderGraph(Graph):
         self._width = len(self._parameters["entry.bias"])
         self._num_phones = encoder.columns.num_phones
 
-    def build_step_model(self) -> NDArray[np.uint8]:
+    def build_step_model(self) -> UInt8:
         """Add all nodes; return the ONNX file."""
         width = self._width
         entered = self.node("Relu", [self.product("frames", self._parameters, "entry")])

@@ -34,7 +34,7 @@ from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.encoder import VoiceKind
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Float16, Floats
 from kouxing.shared.audio.pcm import as_floats, as_integers
 from kouxing.shared.errors import UserError
 from kouxing.training.device import DEVICE
@@ -78,7 +78,7 @@ _REFINED_FRACTION, _SUNG_BIAS = 0.6, 1.5
 _TEACHER_PEAK = 0.5  # of the teacher's audio
 _TINY = 1e-9
 
-RefiningBatch = tuple[NDArray[np.float16], NDArray[np.float16], Floats]
+RefiningBatch = tuple[Float16, Float16, Floats]
 
 
 def refine(

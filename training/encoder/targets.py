@@ -33,7 +33,7 @@ from kouxing.corpora.feature_cache import load_or_compute
 from kouxing.corpora.parallel import process_in_order
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.encoder import VoiceKind
-from kouxing.shared.arrays import Floats, Mask
+from kouxing.shared.arrays import Float16, Floats, Int16, Mask
 from kouxing.shared.audio.pcm import as_floats, as_integers
 from kouxing.shared.command.terminal import write_text
 from kouxing.shared.errors import UserError
@@ -42,7 +42,7 @@ from kouxing.training.encoder.singing import sing
 from kouxing.training.encoder.teachers import ENCODER_FRAME_SAMPLES, TeacherOutputs, Teachers
 from kouxing.training.seed import SEED
 
-Samples = NDArray[np.int16]  # 16 kHz
+Samples = Int16  # 16 kHz
 
 PITCH, LEVEL, EFFORT, VOICE = range(4)  # columns
 NUM_COMPONENTS = 128
@@ -71,7 +71,7 @@ class Piece:
     """A recording, or a part of one, with its targets."""
 
     samples: Samples  # (320 positions,)
-    targets: NDArray[np.float16]  # (positions, columns)
+    targets: Float16  # (positions, columns)
     weight: float
 
 

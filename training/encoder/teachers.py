@@ -26,14 +26,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, Int16
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.blocks.exported import rebuild_encoder, rebuild_readout
 from kouxing.training.blocks.network import block_layout
@@ -71,7 +70,7 @@ class Teachers:
         self.digest = hashlib.sha256(blocks.network.tobytes()).hexdigest()
 
     @torch.no_grad()
-    def compute_targets(self, samples: NDArray[np.int16]) -> TeacherOutputs:
+    def compute_targets(self, samples: Int16) -> TeacherOutputs:
         """Compute the targets of samples, (n,) at 16 kHz, up to 20 s."""
         for network in self._networks:
             network.to(DEVICE)
@@ -101,7 +100,7 @@ class Teachers:
         return np.add.reduceat(states.cpu().numpy(), self._first_state[:-1], axis=1)
 
 
-def track_pitch(samples: NDArray[np.int16], num_positions: int) -> Floats:
+def track_pitch(samples: Int16, num_positions: int) -> Floats:
     """Track the pitch; log2 of Hz, NaN without voice, (positions,)."""
     tracker, floats = PitchTracker(), as_floats(samples)
     starts = ENCODER_FRAME_SAMPLES * np.arange(num_positions)

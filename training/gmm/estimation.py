@@ -27,7 +27,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, mixture_scores
@@ -44,7 +43,7 @@ from kouxing.services.recognizer.search.forced_path import (
     viterbi_path,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
-from kouxing.shared.arrays import Doubles, Floats, Integers
+from kouxing.shared.arrays import Doubles, Float16, Floats, Integers
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.durations import PhoneDurations
 from kouxing.training.training_set import Example
@@ -58,7 +57,7 @@ class RecordingCopy:
 
     example: Example
     weight: float  # weight of its frames in the estimates
-    log_mel: NDArray[np.float16]  # (frames, 41)
+    log_mel: Float16  # (frames, 41)
 
 
 @dataclass(slots=True, kw_only=True)

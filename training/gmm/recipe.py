@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.gmm import GmmModel
@@ -13,7 +12,7 @@ from kouxing.services.recognizer.front_end.features import (
     LogMel,
     compute_cepstra_batch,
 )
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Float16, Floats, Int16
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -144,7 +143,7 @@ def _copies(example: Example, rng: np.random.Generator) -> list[RecordingCopy]:
     return copies
 
 
-def _augmented_log_mel(samples: NDArray[np.int16], rng: np.random.Generator) -> NDArray[np.float16]:
+def _augmented_log_mel(samples: Int16, rng: np.random.Generator) -> Float16:
     """Compute the features of augmented samples, (frames, 41)."""
     sound, _ = augment_samples(as_floats(samples), rng)
     return LogMel().accept_waveform(scale_level(sound, rng)).astype(np.float16)

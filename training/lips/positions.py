@@ -20,7 +20,7 @@ from kouxing.corpora.feature_cache import cache_folder, load_or_compute
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.mouth_profiles.lip_inputs import record_lip_inputs
 from kouxing.services.recognizer.acoustic.encoder import ENCODER_PATH
-from kouxing.shared.arrays import Doubles, Floats
+from kouxing.shared.arrays import Doubles, Float16, Floats
 from kouxing.training.networks.augmentation import augment_samples, scale_level
 
 _FORMAT = "4"  # raise when the positions change
@@ -31,7 +31,7 @@ class SpeechStretch:
     """A stretch of speech of a clip or of its augmented copy."""
 
     clip: LipClip
-    features: NDArray[np.float16]  # (positions, features), inputs of the lip model
+    features: Float16  # (positions, features), inputs of the lip model
     known_s: Doubles  # (positions,) media time up to which the audio is known
     speed: float  # speed of the copy; above 1 is faster than the clip
 

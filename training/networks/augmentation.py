@@ -32,7 +32,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import butter, fftconvolve, resample_poly, sosfilt
 
 from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
-from kouxing.shared.arrays import Doubles, Floats, Integers
+from kouxing.shared.arrays import Doubles, Floats, Int16, Integers
 from kouxing.shared.audio.pcm import as_floats
 
 Samples = Floats
@@ -88,7 +88,7 @@ def disturb(samples: Sound, rng: np.random.Generator) -> Samples:
 
 
 def add_sounds(
-    samples: Sound, others: Sequence[NDArray[np.int16]], snr_db: float, rng: np.random.Generator
+    samples: Sound, others: Sequence[Int16], snr_db: float, rng: np.random.Generator
 ) -> Sound:
     """Add other sounds of equal levels, together ``snr_db`` below the samples.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from kouxing.shared.arrays import Doubles, Integers
+from kouxing.shared.arrays import Doubles, Float16, Int16, Integers
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class FrameTargets:
     """Target distribution of each frame: its likeliest states with their probabilities."""
 
     states: NDArray[np.uint16]  # (frames, k)
-    probs: NDArray[np.float16]  # (frames, k) sum to 1, or to 0 where no target is known
+    probs: Float16  # (frames, k) sum to 1, or to 0 where no target is known
 
     def __len__(self) -> int:
         return len(self.states)
@@ -51,7 +51,7 @@ class FrameTargets:
 class LabeledRecording:
     """A recording with its targets."""
 
-    samples: NDArray[np.int16]  # (n,) 16 kHz
+    samples: Int16  # (n,) 16 kHz
     targets: FrameTargets  # targets of its frames
     weight: float  # relative to the others', how often it is sampled
 

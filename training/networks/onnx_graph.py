@@ -20,7 +20,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 
 DOMAIN = "com.microsoft"  # domain of onnxruntime's own operators
 _OPERATORS = 20  # version of the ONNX operator set
@@ -49,7 +49,7 @@ class Graph:
         name: str,
         inputs: Sequence[onnx.ValueInfoProto],
         outputs: Sequence[onnx.ValueInfoProto],
-    ) -> NDArray[np.uint8]:
+    ) -> UInt8:
         """Return the bytes of an ONNX file."""
         graph = self._graph(name, inputs, outputs)
         imports = [helper.make_opsetid("", _OPERATORS), helper.make_opsetid(DOMAIN, 1)]
@@ -60,7 +60,7 @@ class Graph:
 
     def extension(
         self, inputs: Sequence[onnx.ValueInfoProto], outputs: Sequence[onnx.ValueInfoProto]
-    ) -> NDArray[np.uint8]:
+    ) -> UInt8:
         """Return bytes that add the nodes to the ONNX file to which they are appended."""
         model = onnx.ModelProto(graph=self._graph("", inputs, outputs))
         return np.frombuffer(model.SerializeToString(), dtype=np.uint8)
@@ -194,7 +194,7 @@ class Graph:
         return self.node("Reshape", [joined, self.integers(f"three_{size}", -1, 3 * size)])
 
 
-def read_tensors(file: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+def read_tensors(file: UInt8) -> dict[str, NDArray[Any]]:
     """Read the constants of an ONNX file, by name."""
     graph = onnx.load_from_string(file.tobytes()).graph
     return {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}

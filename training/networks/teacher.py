@@ -32,13 +32,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 
 from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, count_frames
 from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Float16, Floats, Int16
 from kouxing.shared.audio.pcm import as_floats
 from kouxing.training.device import DEVICE, mixed_precision
 from kouxing.training.networks.batches import (
@@ -93,7 +92,7 @@ class WholeEncoder(Encoder):
         return torch.cat([after[layer] for layer in self.kept_layers], dim=-1)
 
     @torch.no_grad()
-    def features(self, samples: NDArray[np.int16]) -> NDArray[np.float16]:
+    def features(self, samples: Int16) -> Float16:
         """Encode samples, (n,) at 16 kHz; two frames share a row, (ceil(frames / 2), 3 width)."""
         pieces = []
         num_frames = count_frames(len(samples))
@@ -120,7 +119,7 @@ class Teacher:
     readout: Readout
 
     @torch.no_grad()
-    def label(self, sounds: Sequence[NDArray[np.int16]]) -> list[FrameTargets]:
+    def label(self, sounds: Sequence[Int16]) -> list[FrameTargets]:
         """Find the likeliest states of the frames of recordings, (n,) at 16 kHz, 25 ms or longer.
 
         Recordings of similar lengths are computed together.
@@ -136,7 +135,7 @@ class Teacher:
                 batch = []
         return [labels[number] for number in range(len(sounds))]
 
-    def _targets_of(self, sounds: Sequence[NDArray[np.int16]]) -> Iterator[FrameTargets]:
+    def _targets_of(self, sounds: Sequence[Int16]) -> Iterator[FrameTargets]:
         """Yield the targets of recordings. The last recording must be the longest."""
         longest = count_frames(len(sounds[-1]))
         if longest > _PIECE_FRAMES:  # each alone, in pieces

@@ -34,7 +34,7 @@ from kouxing.services.recognizer.acoustic.model_file import (
     read_archive,
 )
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
-from kouxing.shared.arrays import Doubles, Floats, Integers
+from kouxing.shared.arrays import Doubles, Floats, Integers, UInt8
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.user_file import read_text
@@ -42,7 +42,7 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.model_files import write_archive
 from kouxing.training.training_set import Example
 
-PhoneStream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
+PhoneStream = UInt8  # phones of a text, with a pause before each sentence
 
 _MAX_TEXT_BYTES = 1 << 30
 _UNSEEN_COUNT = 0.5  # added to the count of each single phone

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.blocks import BlockModel, cache_names
 from kouxing.services.recognizer.acoustic.network import (
@@ -17,7 +16,7 @@ from kouxing.services.recognizer.acoustic.network import (
     position_table,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Float16, Floats, UInt8
 from kouxing.training.blocks.export import BlockGraph
 from kouxing.training.blocks.exported import rebuild_encoder
 from kouxing.training.blocks.network import BlockEncoder
@@ -39,7 +38,7 @@ class FeatureEncoder:
         unused = np.zeros((LENGTH, self._shape.width), np.float32)
         self._positions = np.concatenate([position_table(self._shape.width), unused])
 
-    def encode(self, recordings: Sequence[Floats]) -> list[NDArray[np.float16]]:
+    def encode(self, recordings: Sequence[Floats]) -> list[Float16]:
         """Encode log-mel frames, (n, 80) each, to (blocks, B + R, layers * width) each.
 
         The rows of positions that a block lacks are undefined.
@@ -96,7 +95,7 @@ class _FeatureGraph(BlockGraph):
         self._layers = layers
         self._width = encoder.shape.width * len(layers)
 
-    def file_of_features(self) -> NDArray[np.uint8]:
+    def file_of_features(self) -> UInt8:
         """Add all nodes; return the ONNX file."""
         rows = self.features(self._layers)
         shape = self.integers("by_block", -1, self.length, self._width)

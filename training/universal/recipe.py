@@ -18,7 +18,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.blocks import EXTENSION_PREFIX, BlockModel
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.search.decoder import PathSegment
-from kouxing.shared.arrays import Floats, Integers
+from kouxing.shared.arrays import Floats, Integers, UInt8
 from kouxing.shared.command.terminal import print_message
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import UNIVERSAL, PhoneInventory, load_inventory
@@ -153,9 +153,7 @@ def _phones_of(states: Integers) -> list[PathSegment]:
     ]
 
 
-def export_extension(
-    readout: BlockReadout, model: BlockModel, layers: Sequence[int]
-) -> NDArray[np.uint8]:
+def export_extension(readout: BlockReadout, model: BlockModel, layers: Sequence[int]) -> UInt8:
     """Export a readout. Its layers must be among those that the model's readout reads.
 
     The result is a part of an ONNX file. Appended to the bytes of the block network, it adds the

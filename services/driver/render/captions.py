@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from PIL import Image, ImageDraw
 
-from kouxing.services.driver.render.renderer import UInt8
+from kouxing.shared.arrays import UInt8
 from kouxing.shared.fonts import font_for
 
 _TEXT_HEIGHT, _TEXT_WIDTH = 1 / 14, 1 / 20  # largest letters, as fractions of the picture

@@ -8,15 +8,12 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
 from kouxing.services.driver.head.head import Head, HeadPart
 from kouxing.services.driver.render import shaders
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 from kouxing.shared.errors import UserError
-
-UInt8 = NDArray[np.uint8]
 
 Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB of center and edge
 

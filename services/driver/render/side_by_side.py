@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from kouxing.services.driver.render.renderer import Renderer, UInt8
-from kouxing.shared.arrays import Floats
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.shared.arrays import Floats, UInt8
 
 _CAPTION_FRACTION = 1 / 20  # height of the letters, as a fraction of the picture
 

@@ -28,10 +28,9 @@ from typing import Any
 import av
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
-from numpy.typing import NDArray
 
 from kouxing.services.driver import picture
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 from kouxing.shared.errors import UserError
 from kouxing.shared.files.output_file import (
     UnfinishedFile,
@@ -39,8 +38,6 @@ from kouxing.shared.files.output_file import (
     remove_unfinished,
     write_error,
 )
-
-UInt8 = NDArray[np.uint8]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".webp")
 _NUMBER_FIELD = re.compile(r"%0?\d?d")  # in the file name of a picture sequence

@@ -50,7 +50,6 @@ from functools import cached_property
 from typing import Any, ClassVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
@@ -69,12 +68,11 @@ from kouxing.services.recognizer.acoustic.network import (
     run_onnx_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Float16, Floats, UInt8
 from kouxing.shared.fast_record import Record
 
 FORMAT = "blocks 2"
 
-Float16 = NDArray[np.float16]
 
 _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # without the caches
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
@@ -92,7 +90,7 @@ _MAX_CACHE_BYTES = 3_000_000  # per session
 class BlockModel(AcousticModel):
     """The block model: a network that scores speech in blocks."""
 
-    network: NDArray[np.uint8]  # an ONNX file
+    network: UInt8  # an ONNX file
     log_prior: Floats  # (states,)
     acoustic_scale: float
 
@@ -178,7 +176,7 @@ class BlockRunner:
 
     total_run_s: ClassVar[float] = 0.0  # processor time spent in all networks so far
 
-    def __init__(self, file: NDArray[np.uint8]) -> None:
+    def __init__(self, file: UInt8) -> None:
         content = file.tobytes()
         # a second readout may have its own constant
         names = (_LAST_KEPT, f"{EXTENSION_PREFIX}{_LAST_KEPT}")
@@ -395,7 +393,7 @@ def parse_block_model(archive: Archive) -> BlockModel:
     return build_block_model(archive, archive.array("network", None).astype(np.uint8))
 
 
-def build_block_model(archive: Archive, network: NDArray[np.uint8]) -> BlockModel:
+def build_block_model(archive: Archive, network: UInt8) -> BlockModel:
     """Build the model of a file with this network; raises like :func:`parse_block_model`."""
     topology = parse_topology(archive)
     model = BlockModel(

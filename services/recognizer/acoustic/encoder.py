@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.model_file import load_component
 from kouxing.services.recognizer.acoustic.network import (
@@ -37,7 +36,7 @@ from kouxing.services.recognizer.acoustic.network import (
     run_onnx_session,
 )
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 
 ENCODER_PATH = Path(__file__).parents[1] / "models" / "encoder.npz"
 FORMAT = "encoder 1"
@@ -71,7 +70,7 @@ class EncoderOutput(NamedTuple):
 class AudioEncoder:
     """The encoder network, shared by any number of streams."""
 
-    def __init__(self, file: NDArray[np.uint8]) -> None:
+    def __init__(self, file: UInt8) -> None:
         """Open an ONNX file; raises ``ValueError`` if it does not contain an audio encoder."""
         self._session = open_onnx_session(file)
         nodes = [*self._session.get_inputs(), *self._session.get_outputs()]

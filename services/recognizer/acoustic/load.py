@@ -4,12 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic import blocks, gmm, light, universal
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive
 from kouxing.services.recognizer.config import MODEL_NAMES
+from kouxing.shared.arrays import UInt8
 from kouxing.shared.errors import UserError
 
 MODELS_FOLDER = Path(__file__).parents[1] / "models"
@@ -56,7 +56,7 @@ def load_model(name: str | Path = DEFAULT_MODEL) -> AcousticModel:
     return model
 
 
-def _block_network() -> NDArray[np.uint8]:
+def _block_network() -> UInt8:
     model = _loaded.get("blocks")
     if isinstance(model, blocks.BlockModel):
         return model.network

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.onnx_session import create_inference_session
-from kouxing.shared.arrays import Floats
+from kouxing.shared.arrays import Floats, UInt8
 
 MAX_POSITIONS = 1500  # rows of the table of positions
 FRAMES_PER_ENCODER_FRAME = 2  # feature frames from one encoder frame to the next
@@ -47,7 +47,7 @@ def encode_integer_inputs(num_axes: Mapping[str, int]) -> bytes:
     return field(7, inputs)
 
 
-def open_onnx_session(file: NDArray[np.uint8], inputs: bytes = b"") -> Any:
+def open_onnx_session(file: UInt8, inputs: bytes = b"") -> Any:
     """Open a model's ONNX file, given as bytes, with ``encode_integer_inputs``.
 
     Raises ``ValueError`` if it is not an ONNX file.

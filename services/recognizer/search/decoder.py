@@ -58,7 +58,7 @@ from kouxing.services.recognizer.search.path_records import (
     compact_records,
     count_record_paths,
 )
-from kouxing.shared.arrays import Doubles, Floats
+from kouxing.shared.arrays import Doubles, Floats, Int16
 
 _MIN_RECORDS = 4 * MAX_TOKENS
 
@@ -242,12 +242,12 @@ class Decoder:
 _tables = threading.local()
 
 
-def _token_table(num_contexts: int) -> NDArray[np.int16]:
+def _token_table(num_contexts: int) -> Int16:
     """Return an empty table from contexts to tokens. Each search empties it again.
 
     All searches of a thread share it, because it is larger than the rest of a search's memory.
     """
-    table: NDArray[np.int16] | None = getattr(_tables, "token_of", None)
+    table: Int16 | None = getattr(_tables, "token_of", None)
     if table is None or len(table) < num_contexts:
         table = _tables.token_of = np.full(num_contexts, NO_TOKEN, dtype=np.int16)
     return table

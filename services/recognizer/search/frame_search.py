@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.search.path_records import IMPOSSIBLE, NO_RECORD, Tokens
 from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, ContextGraph
-from kouxing.shared.arrays import Doubles, Floats, Integers
+from kouxing.shared.arrays import Doubles, Floats, Int16, Integers
 
 NO_TOKEN = -1
 MAX_TOKENS = 4096  # speech needs fewer; audio without any speech may need more
@@ -35,7 +35,7 @@ class SearchState(NamedTuple):
     """The arrays that the search changes."""
 
     tokens: Tokens
-    token_of: NDArray[np.int16]  # token of each context, or NO_TOKEN; (contexts,)
+    token_of: Int16  # token of each context, or NO_TOKEN; (contexts,)
     records: NDArray[np.int32]  # (records, 3)
     # rate of change, and the square roots of the phones' probabilities at the last frame
     rate: Floats  # (1 + phones,)
@@ -104,7 +104,7 @@ def _phone_penalty(frame: int, frame_scores: Floats, rate: Floats, hmms: Hmms) -
 
 
 @numba.njit(cache=True, nogil=True)
-def _prune(num_tokens: int, tokens: Tokens, token_of: NDArray[np.int16]) -> int:
+def _prune(num_tokens: int, tokens: Tokens, token_of: Int16) -> int:
     """Drop the tokens outside the beam; return the number of tokens."""
     context, top, score, link = tokens
     token = 0

@@ -28,7 +28,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.arrays import Floats, Mask
+from kouxing.shared.arrays import Floats, Mask, UInt8
 from kouxing.shared.phones.inventory import PhoneInventory
 
 MAX_ORDER = 16  # phones in an n-gram
@@ -38,12 +38,12 @@ class ContextGraph(NamedTuple):
     """The contexts and the arcs between them, for the search. Context 0 is the empty one."""
 
     first_arc: NDArray[np.int32]  # (contexts + 1,) context c has arcs first_arc[c] to [c + 1]
-    arc_phone: NDArray[np.uint8]  # (arcs,) ascending in each context
+    arc_phone: UInt8  # (arcs,) ascending in each context
     arc_log_prob: Floats  # (arcs,)
     arc_context: NDArray[np.int32]  # (arcs,) context after the arc's phone
     backoff_state: NDArray[np.int32]  # (contexts,) h'
     log_backoff: Floats  # (contexts,)
-    last_phone: NDArray[np.uint8]  # (contexts,) undefined for context 0
+    last_phone: UInt8  # (contexts,) undefined for context 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +51,8 @@ class PhoneLanguageModel:
     """The tree in breadth-first order: the root, its children, their children. Siblings ascend."""
 
     inventory: PhoneInventory
-    num_children: NDArray[np.uint8]  # (nodes,)
-    phone: NDArray[np.uint8]  # (nodes,) index into the inventory's phones
+    num_children: UInt8  # (nodes,)
+    phone: UInt8  # (nodes,) index into the inventory's phones
     log_prob: Floats  # (nodes,)
     log_backoff: Floats  # (nodes,)
 
@@ -84,7 +84,7 @@ class PhoneLanguageModel:
 
 @numba.njit(cache=True)
 def _find_contexts(
-    num_children: NDArray[np.uint8], phone: NDArray[np.uint8]
+    num_children: UInt8, phone: UInt8
 ) -> tuple[NDArray[np.int32], Mask, NDArray[np.int32]]:
     """Return each node's context, whether the node is a context, and its back-off context's node.
 

@@ -11,14 +11,11 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from kouxing.services.synthesizer.lips.ferguson.contour import compute_rounded_contour
-from kouxing.shared.arrays import Doubles, Mask
+from kouxing.shared.arrays import Doubles, Mask, UInt8
 from kouxing.shared.fonts import text_runs
-
-UInt8 = NDArray[np.uint8]
 
 _POINTS_OF_LINE = 61
 _UPPER_LIP, _LOWER_LIP, _SHINE = "#b5505a", "#c9626b", "#da8288"

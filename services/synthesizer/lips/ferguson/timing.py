@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.ferguson.phone_table import PhoneTable
 from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
@@ -24,7 +23,7 @@ from kouxing.services.synthesizer.lips.ferguson.syllable_segmenter import (
     EnergySegment,
     segment_speech,
 )
-from kouxing.shared.arrays import Doubles
+from kouxing.shared.arrays import Doubles, Int16
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import Syllable
@@ -228,7 +227,7 @@ def _duration_cost(ratio: Doubles) -> Doubles:
     return 0.5 * (np.log(ratio) / _DURATION_SD) ** 2
 
 
-def _trace_back(best: NDArray[np.int16]) -> list[_Assignment]:
+def _trace_back(best: Int16) -> list[_Assignment]:
     row, column = best.shape[0] - 1, best.shape[1] - 1
     groups = []
     while row:
