@@ -1,7 +1,5 @@
 """The commands ``kouxing bench``, and ``attacks`` and ``faults`` of ``kouxing evaluate``."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any

@@ -12,8 +12,6 @@ Weights of visemes become an opening by kouxing's visemes. wLipSync needs a prof
 samples, or from clips for training.
 """
 
-from __future__ import annotations
-
 import gzip
 import subprocess
 import tempfile

@@ -14,8 +14,6 @@ The constants come from the modules that the server runs, so a new model or thre
 new export.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, fields
 from types import ModuleType

@@ -5,8 +5,6 @@ ends the main loop; then the service finishes its work within a deadline. A seco
 the process immediately. The loop sends the heartbeats, so control detects a hung loop.
 """
 
-from __future__ import annotations
-
 import gc
 import math
 import os

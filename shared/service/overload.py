@@ -13,8 +13,6 @@ would have sent it. Audio that waited in a socket while this process was stopped
 even if it was just received. Audio that a client sends ahead of the clock is not late.
 """
 
-from __future__ import annotations
-
 import math
 
 SLOWDOWN_FRACTION = 0.5  # fraction of the limit above which the block network runs less often

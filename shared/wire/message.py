@@ -6,8 +6,6 @@ parts: the topic ``<kind>/<session>/`` and a msgpack map of the fields of its cl
 other change needs a new version.
 """
 
-from __future__ import annotations
-
 import re
 
 from kouxing_client.messages import (

@@ -9,8 +9,6 @@ Training can be interrupted. Labels and checkpoint are stored next to the output
 and ``.network.pt``. The same command resumes from them, and deletes them at the end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial

@@ -18,8 +18,6 @@ v        probabilities of the kinds of voice (``VoiceKind``),     (4,)
 :mod:`kouxing.training.encoder` trains the network.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from enum import IntEnum
 from functools import cache

@@ -20,8 +20,6 @@ Russell 1980, "A circumplex model of affect". :mod:`kouxing.training.voice_trait
 readout.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
