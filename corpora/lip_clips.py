@@ -49,11 +49,10 @@ _SUFFIXES = (".flac", ".csv", ".json")
 _ARCHIVE_COLUMNS = ("clip", "split", "language", "speaker", "license")
 
 # Change of ``LIP_FAPS`` when a shape of FACEGOOD's rig has weight 1. It was measured on the ARKit
-# shape of the same name of MakeHuman's face (CC0), with both sides of a pair together.
-# The rig's jaw opens wider than a speaker's, so it is scaled to the opening of filmed speakers.
-# Pursed lips are scaled to half a centimeter. Real pursed lips nearly touch, but the shapes' lips
-# do not, so their heights come from the filmed speakers' u. The head adds the backward swing of
-# the jaw.
+# shape of the same name of MakeHuman's face (CC0), with both sides of a pair together. The rig's
+# jaw opens wider than a speaker's, so it is scaled to the opening of filmed speakers. Pursed lips
+# are scaled to half a centimeter. Real pursed lips nearly touch, but the shapes' lips do not, so
+# their heights come from the filmed speakers' u. The head adds the backward swing of the jaw.
 _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
 _RIG_DELAY_S = 0.04  # lag of its lips behind filmed speakers' lips

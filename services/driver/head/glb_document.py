@@ -1,7 +1,6 @@
 """Writes binary glTF (GLB) files: the JSON description, accessors and sparse accessors.
 
-pygltflib is not used. It cannot create accessors from arrays, so this code would still be
-needed.
+pygltflib is not used. It cannot create accessors from arrays, so this code would still be needed.
 """
 
 import json

@@ -183,11 +183,10 @@ def transcribe(text: str) -> Transcript:
     """Convert a text to syllables: characters, numbers and dates, or pinyin and bopomofo.
 
     Among characters, bopomofo and pinyin with tones are also read. They are the reading of the
-    characters before or after them if they sound alike, or if they follow in brackets.
-    Punctuation, and spaces between Chinese characters, are ignored. Other words and symbols are
-    dropped: letters among characters, and unknown pinyin syllables. Joined syllables without tones
-    (``nihao``) are split only if most letters are pinyin, because words of other languages may
-    look the same.
+    characters before or after them if they sound alike, or if they follow in brackets. Punctuation,
+    and spaces between Chinese characters, are ignored. Other words and symbols are dropped: letters
+    among characters, and unknown pinyin syllables. Joined syllables without tones (``nihao``) are
+    split only if most letters are pinyin, because words of other languages may look the same.
 
     Examples
     --------
