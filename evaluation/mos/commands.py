@@ -1,5 +1,6 @@
 """The commands under ``kouxing mos``: a listening test."""
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -36,7 +37,7 @@ def new(folder: Folder) -> None:
 
     study = new_study(folder)
     sizes = (plural(len(study.sentences), "sentence"), plural(len(study.conditions), "condition"))
-    print_message(f"created a study of {' in '.join(sizes)}; next: kouxing mos serve {folder}")
+    print_message(f"created a study of {' in '.join(sizes)}; {_next_step(folder)}")
 
 
 @app.command()
@@ -59,7 +60,7 @@ def heads(
     write_head_videos(folder, load_model_for_language(language), recordings)
     study = new_study(folder)
     count = plural(len(study.conditions), "head")
-    print_message(f"created a study of {count}; next: kouxing mos serve {folder}")
+    print_message(f"created a study of {count}; {_next_step(folder)}")
 
 
 @app.command()
@@ -108,3 +109,7 @@ def export(folder: Folder, output: Output = None, force: Force = False) -> None:
     check_output(output, force=force)
     load_study(folder)  # raises UserError if the folder is not a study
     write_output(to_csv(read_answers(folder)), output)
+
+
+def _next_step(folder: Path) -> str:
+    return f"next: kouxing mos serve {shlex.quote(str(folder))}"

@@ -7,6 +7,7 @@ has the mean of all scores.
 
 import csv
 import io
+import shlex
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
@@ -61,7 +62,8 @@ def make_report(study: Study, answers: Iterable[Answer]) -> list[Opinion]:
             scores[answer.judge, answer.sentence] = answer.score
     opinions = [opinion_of(*key, scores) for key, scores in groups.items() if scores]
     if not opinions:
-        raise UserError(f"no answers yet; collect them with: kouxing mos serve {study.folder}")
+        folder = shlex.quote(str(study.folder))
+        raise UserError(f"no answers yet; collect them with: kouxing mos serve {folder}")
     return opinions
 
 

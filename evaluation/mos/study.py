@@ -7,6 +7,7 @@ come first and do not count.
 """
 
 import random
+import shlex
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -64,7 +65,9 @@ def load_study(folder: Path) -> Study:
     """Read the study of a folder; raises ``UserError`` if it is missing, invalid or incomplete."""
     file = folder / FILE_NAME
     if not file.exists():
-        raise UserError(f"{file} is missing; create it with: kouxing mos new {folder}")
+        raise UserError(
+            f"{file} is missing; create it with: kouxing mos new {shlex.quote(str(folder))}"
+        )
     with check_content(file, "a valid study"):
         return _parse(folder, parse_json(read_text(file, _MAX_BYTES)))
 

@@ -6,6 +6,7 @@ import fcntl
 import os
 import re
 import secrets
+import shlex
 import shutil
 import weakref
 from collections.abc import Iterator
@@ -139,7 +140,8 @@ def write_error(path: Path, error: Any) -> UserError:
     """Return the error for a file that cannot be written, from an ``OSError`` or FFmpeg's error."""
     if isinstance(error, FileNotFoundError):
         folder = (path.resolve() if path.is_symlink() else path).parent
-        return UserError(f"cannot write {path}: the folder does not exist; run: mkdir -p {folder}")
+        command = f"mkdir -p {shlex.quote(str(folder))}"
+        return UserError(f"cannot write {path}: the folder does not exist; run: {command}")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return UserError(f"cannot write {path}: the disk is full; free some space")
     if error.errno == errno.EFBIG:

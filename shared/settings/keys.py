@@ -85,10 +85,10 @@ def load_key(name: str, roles: Collection[str], *, control: str = "") -> Key:
         if control_key is not None and control_key.public != key.control:
             if name == CONTROL:
                 raise _key_error(path)
+            remove = shlex.join(("rm", str(control_path), str(folder / _ALLOWED)))
             raise UserError(
                 f"{path} belongs to a different system than {control_path}. If control runs on"
-                f" another machine, run: rm {control_path} {folder / _ALLOWED}. If it runs here,"
-                f" run: {_replace_hint(path)}"
+                f" another machine, run: {remove}. If it runs here, run: {_replace_hint(path)}"
             )
         return key
 

@@ -396,10 +396,11 @@ def test_a_sequence_of_pictures_searches_its_folder_once(
         assert searches == []
 
 
-@pytest.mark.parametrize("name", ["new/head.glb", "link.glb"])
+@pytest.mark.parametrize("name", ["my heads/head.glb", "link.glb"])
 def test_an_error_names_the_folder_to_create(tmp_path: Path, name: str) -> None:
-    (tmp_path / "link.glb").symlink_to(tmp_path / "new" / "head.glb")
-    with pytest.raises(UserError, match=f"mkdir -p {tmp_path}/new"), open_output(tmp_path / name):
+    (tmp_path / "link.glb").symlink_to(tmp_path / "my heads" / "head.glb")
+    command = f"mkdir -p '{tmp_path}/my heads'"
+    with pytest.raises(UserError, match=command), open_output(tmp_path / name):
         pass
 
 
