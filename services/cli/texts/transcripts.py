@@ -35,8 +35,8 @@ LABEL = (  # times of Audacity or CTM, or the name of a recording
     r"|[A-Za-z](?:(?:[^\W\d]|[.-])*\d){6}[\w.-]*[ \t]+)"
 )
 SPEAKER = (  # number of a speaker, such as SPEAKER_00: or 说话人 1：
-    rf"[ \t]*(?:[A-Za-z]+[ _]?|(?:说话人|說話人|发言人|發言人)[ ]?)\d+(?:[ \t]+{CLOCK})?[ \t]*[:：]"
-    r"(?!\d\d(?!\d))"  # PM 3:30 is a time
+    r"[ \t]*(?:(?i:speaker|spk|spkr|voice|person|participant|channel|s)[ _]?"
+    rf"|(?:说话人|說話人|发言人|發言人)[ ]?)\d+(?:[ \t]+{CLOCK})?[ \t]*[:：]"
 )
 _STRING = re.compile(r'"((?:[^"]|"")*)"')
 _CHINESE = re.compile("[〇\u3400-\u9fff]")
