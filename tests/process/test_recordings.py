@@ -27,6 +27,7 @@ TABS = "time_s\tjawOpen\r\n0\t0\r\n0,02\t0,5\r\n\t\r\n"
 FIRST_LINE = '{"time_s": 0, "arkit": {"jawOpen": 0}}\n'
 RECORDINGS: dict[str, str | bytes] = {
     "shapes": "time_s,jawOpen\n0,0\n0.02,0.5\n",
+    "a column of text": "time_s,jawOpen,scene\n0,0,inside\n0.02,0.5,a bus\n",
     "case of the titles": "Time_S,jawOpen,Phone\n0,0,a\n0.02,0.5,a\n",
     "empty lines": "time_s,jawOpen\r\n\r\n0,0\r\n0.02,0.5\r\n,\r\n",
     "old line ends": "time_s,jawOpen\r0,0\r0.02,0.5\r",
