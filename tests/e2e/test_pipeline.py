@@ -100,11 +100,10 @@ def test_a_flush_also_drops_audio_that_is_still_queued(client: Client) -> None:
         streamed.collect_until(lambda: streamed.frames)
         session.flush()
         client.open_session().close()  # every service has processed control's messages
-        streamed.collect()
-        num_before = len(streamed.frames)
         session.push(np.zeros(8000, np.float32))
         streamed.collect_until(lambda: streamed.times[-1:] >= [flushed + 8000 - 3200])
-    assert all(time > flushed - 3200 for time in streamed.times[num_before + 8 :])
+    before = [time for time in streamed.times if time <= flushed - 3200]
+    assert max(before) < flushed / 4, "most of the audio was still queued"
 
 
 def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
