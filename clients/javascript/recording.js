@@ -95,10 +95,11 @@ function readCsv(lines) {
   const timeColumn = titles.findIndex((title) => /^(time_s|timecode)$/i.test(title));
   if (timeColumn < 0) throw new Error("the recording has no times; add a column time_s or Timecode");
   const isTake = titles[timeColumn].toLowerCase() === "timecode";
-  const isText = (column) => cells.every((row) => row[column]?.trim() && Number.isNaN(readNumber(row[column]))); // a comment
-  const columns = titles.flatMap((title, column) =>
-    column === timeColumn || /^(|sequence|phone|blendshapecount)$/i.test(title) || isText(column) ? [] : [column],
+  const isText = (column) => cells.every((row) => row[column]?.trim() && Number.isNaN(readNumber(row[column])));
+  const values = titles.flatMap((title, column) =>
+    column === timeColumn || /^(|sequence|phone|blendshapecount)$/i.test(title) ? [] : [column],
   );
+  const columns = values.every(isText) ? values : values.filter((column) => !isText(column)); // without comments
   const names = columns.map((column) =>
     isTake ? titles[column][0].toLowerCase() + titles[column].slice(1) : titles[column],
   );
