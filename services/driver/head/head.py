@@ -111,13 +111,17 @@ class Head:
 
     def deform(self, faps: Floats) -> Floats:
         """Return the vertices (V, 3), m, moved by FAPs (68,); FAPs 1 and 2 are ignored."""
-        return self._rotate(self._displace(faps), faps, points=True)
+        return self._rotate(self._displace(faps), faps, self.eye_centers)
 
     def pose(self, faps: Floats) -> tuple[Floats, Floats]:
         """Return the vertices moved by FAPs (68,), and their normals, both (V, 3)."""
         vertices = self._displace(faps)
         normals = self.normal_updater.normals(vertices)
-        return self._rotate(vertices, faps, points=True), self._rotate(normals, faps, points=False)
+        no_centers = np.zeros_like(self.eye_centers)  # normals have no position
+        return (
+            self._rotate(vertices, faps, self.eye_centers),
+            self._rotate(normals, faps, no_centers),
+        )
 
     def _displace(self, faps: Floats) -> Floats:
         if faps.shape != (NUM_FAPS,):
@@ -125,21 +129,21 @@ class Head:
         moved: Floats = self.basis @ np.asarray(faps, dtype=np.float32)
         return self.vertices + moved.reshape(-1, 3)
 
-    def _rotate(self, rows: Floats, faps: Floats, *, points: bool) -> Floats:
-        """Rotate eyeballs and head; ``rows`` are points or normals."""
+    def _rotate(self, rows: Floats, faps: Floats, eye_centers: Floats) -> Floats:
+        """Rotate eyeballs and head in place; ``rows`` are vertices or normals (V, 3)."""
         angle = np.asarray(faps, dtype=np.float64) * RADIANS_PER_ANGLE_UNIT
         for side, (name, yaw, pitch) in enumerate((("eye_left", 23, 25), ("eye_right", 24, 26))):
             if angle[yaw - 1] or angle[pitch - 1]:
-                turn = _rotation(angle[yaw - 1], angle[pitch - 1], 0.0)
-                center = self.eye_centers[side] * np.float32(points)
+                rotation = _rotation(angle[yaw - 1], angle[pitch - 1], 0.0)
+                center = eye_centers[side]
                 for part in self.parts:  # an eye may have several parts, or no part
                     if part.name.startswith(name):
                         selected = part.vertices
-                        rows[selected] = (rows[selected] - center) @ turn.T + center
+                        rows[selected] = (rows[selected] - center) @ rotation.T + center
         pitch, yaw, roll = angle[47:50]
         if pitch or yaw or roll:
-            turned = rows @ _rotation(yaw, pitch, roll).T
-            rows += self.head_weight[:, None] * (turned - rows)
+            rotated = rows @ _rotation(yaw, pitch, roll).T
+            rows += self.head_weight[:, None] * (rotated - rows)
         return rows
 
 

@@ -50,7 +50,7 @@ class CaptionDrawer:
         self._font = font_for("".join(caption.text for caption in captions), self._text_px)
         self._width_px = size_px[0]
         self.height_px = band_height_px(size_px)
-        self._lines = self._break(captions)
+        self._lines = self._break_lines(captions)
 
     def add_below(self, picture: UInt8, time_s: float) -> UInt8:
         """Return a picture (H, W, 3 or 4) with the captions of a time below it."""
@@ -92,7 +92,7 @@ class CaptionDrawer:
                 shown = line
         return shown
 
-    def _break(self, captions: Sequence[Caption]) -> list[list[Caption]]:
+    def _break_lines(self, captions: Sequence[Caption]) -> list[list[Caption]]:
         """Start a new line after a pause, and when a line is full."""
         lines: list[list[Caption]] = []
         max_px = self._width_px - 2 * _MARGIN * self._text_px

@@ -100,7 +100,7 @@ class Renderer:
         self._background = background
         self._camera = camera or Camera()
         self._context = context or create_offscreen_context()
-        self._own_context = context is None
+        self._owns_context = context is None
         self._on_screen = on_screen
         self._samples = min(samples, self._context.max_samples)
         self._program, self._cutout_program, self._eye_program, self._backdrop_program = (
@@ -116,16 +116,16 @@ class Renderer:
         self._backdrop = self._context.vertex_array(
             self._backdrop_program, [(self._context.buffer(corners), "2f", "corner")]
         )
-        self._moving = self._context.buffer(reserve=head.vertices.nbytes * 2, dynamic=True)
-        self._stage = np.empty((len(head.vertices), 6), dtype=np.float32)
+        self._vertex_buffer = self._context.buffer(reserve=head.vertices.nbytes * 2, dynamic=True)
+        self._vertex_data = np.empty((len(head.vertices), 6), dtype=np.float32)
         self._load_parts()
         self._targets: list[Any] = []
         self.resize(width_px, height_px)
 
     def _load_parts(self) -> None:
         head, context = self.head, self._context
-        fixed = np.concatenate([head.uv, head.colors], axis=1).astype(np.float32)
-        fixed_buffer = context.buffer(fixed.tobytes())
+        static_attributes = np.concatenate([head.uv, head.colors], axis=1).astype(np.float32)
+        static_buffer = context.buffer(static_attributes.tobytes())
         self._textures: dict[str, Any] = {}
         for name, encoded in head.textures.items():
             pixels = picture.decode(encoded, f"{head.name}: {name}")
@@ -140,8 +140,8 @@ class Renderer:
             self._arrays[part.name] = context.vertex_array(
                 self._part_program(part),
                 [
-                    (self._moving, "3f 3f", "in_position", "in_normal"),
-                    (fixed_buffer, "2f 3f", "in_uv", "in_color"),
+                    (self._vertex_buffer, "3f 3f", "in_position", "in_normal"),
+                    (static_buffer, "2f 3f", "in_uv", "in_color"),
                 ],
                 indices,
             )
@@ -159,10 +159,10 @@ class Renderer:
         self._targets = []
         if not self._on_screen:
             self._result = self._framebuffer(0)
-            multi = self._samples > 1
-            self._canvas = self._framebuffer(self._samples) if multi else self._result
+            is_multisampled = self._samples > 1
+            self._canvas = self._framebuffer(self._samples) if is_multisampled else self._result
             # copying a prepared picture is faster than clearing and painting the background
-            self._blank = self._framebuffer(self._samples if multi else 0)
+            self._blank = self._framebuffer(self._samples if is_multisampled else 0)
             self._clear(self._blank)
 
     def _framebuffer(self, samples: int) -> Any:
@@ -182,25 +182,25 @@ class Renderer:
         """Draw one picture; return the durations of deform, upload, draw and read-back, seconds."""
         times = [time.perf_counter()]
 
-        def passed() -> None:
+        def finish_stage() -> None:
             self._context.finish()
             times.append(time.perf_counter())
 
         posed = self.head.pose(faps)
-        passed()
+        finish_stage()
         self._upload(*posed, faps)
-        passed()
+        finish_stage()
         self._draw()
-        passed()
+        finish_stage()
         self._read()
-        passed()
+        finish_stage()
         names = ("deform", "upload", "draw", "read back")
         return dict(zip(names, np.diff(times).tolist(), strict=True))
 
     def _upload(self, vertices: Floats, normals: Floats, faps: Floats) -> None:
         self._mouth_light = mouth_light(faps)
-        self._stage[:, :3], self._stage[:, 3:] = vertices, normals
-        self._moving.write(self._stage)
+        self._vertex_data[:, :3], self._vertex_data[:, 3:] = vertices, normals
+        self._vertex_buffer.write(self._vertex_data)
 
     def _draw(self) -> None:
         self._context.copy_framebuffer(self._canvas, self._blank)
@@ -281,7 +281,7 @@ class Renderer:
 
     def close(self) -> None:
         """Release the OpenGL context."""
-        if self._own_context:
+        if self._owns_context:
             self._context.release()
 
 
