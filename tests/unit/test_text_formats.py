@@ -275,6 +275,13 @@ def test_text_next_to_the_times_of_a_cue_is_spoken() -> None:
     assert extract_text(cues)[0] == "Hello\nAnna: hi"
 
 
+WORDS = TEXTS["TextGrid"].replace(ONE, "good").replace('"请看我的""嘴唇""。"', '"morning"')
+
+
+def test_the_words_of_other_languages_are_read() -> None:
+    assert extract_text(WORDS) == ("good\nmorning", "TextGrid")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -284,10 +291,7 @@ def test_text_next_to_the_times_of_a_cue_is_spoken() -> None:
         ('{"text": ', "not valid JSON"),
         ('{"text":' + "[" * 900 + '"a"' + "]" * 900 + "}", "JSON without"),
         ("大家好 at 00:00:03.200 请看", "times in an unknown format"),
-        (
-            TEXTS["TextGrid"].replace(ONE, "da").replace('"请看我的""嘴唇""。"', '"jia"'),
-            "'phones', 'w",
-        ),
+        (WORDS.replace('"words"', '"tones"'), "'phones', 'tones', none with"),
         ("[Events]\nDialogue: 0,x,0:00:03.00,Default,,0,0,0,,你", "not valid ASS"),
     ],
 )

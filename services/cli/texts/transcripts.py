@@ -40,6 +40,7 @@ SPEAKER = (  # number of a speaker, such as SPEAKER_00: or 说话人 1：
 )
 _STRING = re.compile(r'"((?:[^"]|"")*)"')
 _CHINESE = re.compile("[〇\u3400-\u9fff]")
+_TIERS_OF_WORDS = (["characters"], ["words"])  # of kouxing align, and of other aligners
 _UNSPOKEN_LABELS = {"sil", "sp", "spn", "pau", "silence", "<sil>", "<eps>", "#"}
 _JSON_NAMES = ("text", "content", "segments", "body", "syllables")
 _MAX_DEPTH = 20  # of JSON
@@ -83,7 +84,7 @@ def read_labels(text: str) -> str:
 
 
 def read_text_grid(text: str) -> str:
-    """Extract the labels of the first tier with Chinese characters, or of the only tier.
+    """Extract the labels of the first tier with Chinese characters or words, or of the only tier.
 
     The long and the short form have the same strings: two of the header, then the class, the name
     and the labels of each tier.
@@ -95,7 +96,8 @@ def read_text_grid(text: str) -> str:
             tiers.append([])
         elif tiers:
             tiers[-1].append(string)
-    chosen = [tier for tier in tiers if _CHINESE.search("".join(tier[1:]))] or tiers
+    chosen = [tier for tier in tiers if _CHINESE.search("".join(tier[1:]))]
+    chosen = chosen or [tier for tier in tiers if tier[:1] in _TIERS_OF_WORDS] or tiers
     if len(chosen) > 1 and chosen is tiers:
         names = ", ".join(repr(tier[0]) for tier in tiers if tier)
         raise UserError(
