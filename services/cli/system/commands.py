@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -116,6 +118,7 @@ def speak(
     else:
         raw_format = RawFormat(16_000 if rate is None else rate, channels or 1)
         audio = open_audio(Path(source), track=track, raw=raw_format if raw else None)
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # closes the session
     with open_control_address(control) as endpoint:
         summary = stream(
             audio,

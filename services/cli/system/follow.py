@@ -119,8 +119,8 @@ def _iter_until_interrupt(results: Results[T], session: str) -> Iterator[T]:
 
     An interrupt takes effect between two results, so the caller can write what it has received.
     """
-    print_message(f"following session {session}")
     with catch_interrupt(), delay_interrupt():
+        print_message(f"following session {session}")
         while not is_interrupted():
             has_ended = results.has_ended
             result = results.get(INTERRUPT_POLL_S)
