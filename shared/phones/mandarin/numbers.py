@@ -102,6 +102,8 @@ _NUMBER_SPELLINGS = tuple(
         (_DATE, _read_date),
         (_READ_DIGIT_BY_DIGIT, lambda match: _read_digits(match[0])),
         (r"(?<=\d) - (?=\d)", "减"),
+        (r"(?<=\d)-(?=[\d.加乘减以除-]{0,40}\d ?[=＝])", "减"),
+        (r"(?<=\d) ?[=＝] ?(?=-?\d)", "等于"),
         (_RANGE, _read_range),
         (
             r"(?<![\d.])(1[0-2])\.(\d\d?)(?![\d.])",
