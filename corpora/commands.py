@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,6 +43,9 @@ def adapt(
     from kouxing.services.mouth_profiles.learning import learn_mouth_profile
     from kouxing.services.mouth_profiles.lip_tracks import MEASURES
 
+    for source, count in Counter(source.resolve() for source in sources).items():
+        if count > 1:  # the figures need speech that the profile was not learned from
+            raise UserError(f"{source} is named twice")
     check_output(output, json_file, inputs=sources, force=force)
     learned = learn_mouth_profile([_read(source) for source in sources])
     with open_output(output) as file:

@@ -72,6 +72,12 @@ def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
             run(track_app, tmp_path / f"{name}.mp4", "-o", tmp_path / "out")
 
 
+def test_each_clip_counts_once(tmp_path: Path) -> None:
+    clips = (tmp_path / "me.json", tmp_path / "out" / ".." / "me.json")
+    with pytest.raises(UserError, match=r"me\.json is named twice"):
+        run(adapt_app, *clips, "-o", tmp_path / "me.mouth")
+
+
 def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     """The mouth opens with the loudness of the sound."""
     sentences = [samples_of_file(DEMO / f"{name}.wav") for name in ("hello-female", "hello-male")]
