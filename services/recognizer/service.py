@@ -306,11 +306,13 @@ class RecognizerService(SessionService):
             late = [audio for audio in queues if audio.is_outdated(now_s)]
             if not late:
                 return
-            if not self._audio.wait(READ_WAIT_S):
+            before_s = [audio.duration_s for audio in late]
+            if self._audio.wait(READ_WAIT_S):
+                self.handle_messages(self._audio)
+            if [audio.duration_s for audio in late] == before_s:  # only others' audio has arrived
                 for audio in late:
                     audio.skip_policy.adapt(now_s)
                 return
-            self.handle_messages(self._audio)
 
     def _send_decoded(self, sessions: Sequence[RecognizerSession]) -> None:
         """Send the results of decoded sessions; finish those whose audio ends."""

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import count, pairwise
 
 import pytest
 from kouxing_client.field_types import MAX_AUDIO_BYTES
@@ -180,6 +180,24 @@ def test_reports_a_stalled_client_while_others_send_audio(
     service._sessions["decoding"].is_scoring = False
     service._report_stalled(start_s + 1.0)
     assert stalled == ["silent"], "the time of decoding does not count"
+
+
+def test_late_audio_does_not_delay_other_sessions(
+    service: Recognizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("late", "other"):
+        service.start_session(replace(with_opening(UNPACED, paced=True), session=name))
+    service.receive(chunk(0, 640, "late"))
+    policy = service._sessions["late"].audio.skip_policy
+    policy._due_s = due_s = time.monotonic() - 10.0
+    numbers = count()
+    monkeypatch.setattr(service._audio, "wait", lambda _: True)
+    monkeypatch.setattr(
+        service, "handle_messages", lambda _: service.receive(chunk(next(numbers), 640, "other"))
+    )
+    service._read_late_audio()
+    assert next(numbers) == 1
+    assert policy._due_s > due_s, "the newest audio may be on time"
 
 
 @pytest.mark.parametrize("paced", [False, True])
