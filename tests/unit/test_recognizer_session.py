@@ -241,6 +241,28 @@ def test_reports_a_live_client_that_stalls_and_resumes() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("duration_s", "num_messages", "limit_s"),
+    [(0.1, 1, STALLED_AFTER_S), (0.5, 1, 0.6), (0.05, 10, 0.6), (0.5, 10, 1.1)],
+)
+def test_a_client_that_sends_long_messages_stalls_later(
+    duration_s: float, num_messages: int, limit_s: float
+) -> None:
+    client = PacedClient()
+    assert all(client.send(duration_s) for _ in range(num_messages))
+    assert reports_of(client.session, silent_s=limit_s - 0.02) == []
+    assert reports_of(client.session, silent_s=limit_s + 0.02) == ["stalled", "resumed"]
+
+
+def test_a_delayed_burst_counts_only_shortly() -> None:
+    client = PacedClient()
+    client.send(0.5)
+    for _ in range(25):
+        client.now_s += 0.02
+        client.send(0.02)
+    assert reports_of(client.session, silent_s=STALLED_AFTER_S + 0.02) == ["stalled", "resumed"]
+
+
 @pytest.mark.parametrize(("paced", "expected"), [(True, ["stalled", "resumed"]), (False, [])])
 def test_a_live_client_that_interrupts_has_stalled(paced: bool, expected: list[str]) -> None:
     session = make_session(paced=paced)

@@ -40,6 +40,8 @@ MAX_MEDIA_TIME = 2**40  # samples: two years
 MAX_LEAD_S = 15.0  # limit for the lead of a paced client over the clock, and for catching up
 ACKNOWLEDGE_EVERY_S = 0.1  # interval between acknowledgements to a client that sends audio
 STALLED_AFTER_S = 0.2  # a live client that sends no audio for this time has stalled
+JITTER_S = 0.1  # a client that sends longer bursts has stalled if the next is this much late
+MAX_BURST_S = 1.0  # longer bursts count as this duration
 MOVE_GRACE_S = 3.0  # extra time after a move, for the client to connect to this recognizer
 RESEND_WAIT_S = 1.0  # wait for resent audio; then the session continues after the gap
 M = TypeVar("M", bound=Message)
@@ -238,12 +240,16 @@ class RecognizerSession:
         """Count time in which no audio arrived; report a live client that has now stalled."""
         before_s, self.silent_s = self.silent_s, self.silent_s + tick_s
         is_live = self.is_paced and not self.is_finished
-        if is_live and before_s <= STALLED_AFTER_S < self.silent_s:
+        if is_live and before_s <= self._stalled_after_s < self.silent_s:
             self._report(AudioState.STALLED, now_s)
+
+    @property
+    def _stalled_after_s(self) -> float:
+        return max(STALLED_AFTER_S, self._lead_limit.burst_s + JITTER_S)
 
     def on_new_audio(self, now_s: float) -> None:
         """Record that audio arrived; the face must not return to rest until it is processed."""
-        if self.is_paced and self.silent_s > STALLED_AFTER_S:
+        if self.is_paced and self.silent_s > self._stalled_after_s:
             self._report(AudioState.RESUMED, now_s)
             self.audio.skip_policy.resume()
         self.last_audio_s, self.silent_s = now_s, 0.0
@@ -319,6 +325,7 @@ class _LeadLimiter:
     def __init__(self, now_s: float, *, may_catch_up: bool) -> None:
         self._lead_s, self._updated_s = -MAX_LEAD_S if may_catch_up else 0.0, now_s
         self._end_s: float | None = None  # media time of the end of the newest audio
+        self.burst_s = 0.0  # duration of the newest audio that has arrived together
 
     def allows(self, begin_s: float, duration_s: float, now_s: float) -> bool:
         """Return whether audio is within the allowed lead, including the gap before it."""
@@ -328,6 +335,9 @@ class _LeadLimiter:
         lead_s += gap_s if gap_s <= MAX_GAP_S else 0.0
         if lead_s > MAX_LEAD_S:
             return False
+        # twice as fast as real time, so that a delayed burst does not count for long
+        earlier_s = max(self.burst_s - 2.0 * passed_s, 0.0)
+        self.burst_s = min(earlier_s + duration_s, MAX_BURST_S)
         self._lead_s, self._updated_s = lead_s, now_s
         self._end_s = begin_s + duration_s
         return True
