@@ -227,6 +227,11 @@ class ServiceRegistry:
         """Return the services that take part in every session."""
         return set(self._observers)
 
+    def has_driver(self) -> bool:
+        """Return whether a driver is ready to write videos."""
+        records = (self._services[instance] for instance in self._observers)
+        return any(r.heartbeat.service == "driver" and r.state == "ready" for r in records)
+
     def is_observer(self, instance: str) -> bool:
         """Return whether a service takes part in every session."""
         return instance in self._observers

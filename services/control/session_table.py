@@ -138,6 +138,12 @@ class SessionTable:
         if client.key and num_of_key >= math.ceil(MAX_KEY_SHARE * self._max_sessions):
             text = f"your key has {num_of_key} open sessions, the maximum; close one first"
             raise Rejected(ErrorCode.TOO_MANY_SESSIONS, text)
+        if opening.record and not self._registry.has_driver():
+            text = (
+                "no driver is running to write the video; start one with 'kouxing driver', or open"
+                " the session without 'record'"
+            )
+            raise Rejected(ErrorCode.NO_SERVICE, text)
         leaves_room = client.key and num_of_key and not opening.paced  # room for another client
         language = _language_of(opening)
         workers = self._placement.place({}, now_s, language, min_room=2 if leaves_room else 1)

@@ -33,7 +33,7 @@ OTHERS = re.compile(
     r"--rate|^this is \{\}$|--raw$|--raw if|a terminal|audio arrived|images and audio"
     r"|a folder|no such file|there is no track|expected 'start'|has disconnected"
     r"|it is larger|landmark file|header|landmarks a frame|sample rate is|times do|not pixels"
-    r"|a viewer can set|cannot be combined|contains no command"
+    r"|a viewer can set|without 'record'|cannot be combined|contains no command"
     r"|a worker must name|may provide|host and port to connect to|registered with another key"
 )
 

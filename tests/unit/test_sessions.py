@@ -122,6 +122,14 @@ def test_the_error_names_a_missing_service(cluster: Cluster, service: str) -> No
         cluster.open()
 
 
+def test_only_a_driver_can_write_a_video(cluster: Cluster) -> None:
+    cluster.add(observer("gateway-1"))
+    with refused("no-service", "no driver is running to write the video"):
+        cluster.open("a", record=True)
+    cluster.add(replace(observer("driver-1"), service="driver"))
+    cluster.open("a", record=True)
+
+
 def test_places_a_needed_worker_of_an_unknown_kind(cluster: Cluster) -> None:
     cluster.lose("synthesizer-1")
     cluster.add(replace(worker("synthesizer", "synthesizer-1"), needs=["gaze"]))
