@@ -14,6 +14,7 @@ from kouxing_client.inbox import Inbox
 from kouxing_client.messages import EndOfFaps, Joined
 from kouxing_client.session_core import (
     LAST_RESULTS_WAIT_S,
+    MAX_ERRORS,
     MOVE_TIMEOUT_S,
     RESUBSCRIBE_S,
     SILENT_S,
@@ -231,6 +232,14 @@ def test_an_unknown_session_ends_unless_it_moves() -> None:
     harness.pass_time(MOVE_TIMEOUT_S + 0.1)
     assert harness.session.has_ended
     assert "unknown-session" in str(harness.session.failure)
+
+
+def test_keeps_only_the_newest_errors_that_a_program_does_not_take() -> None:
+    harness = CoreHarness()
+    for number in range(MAX_ERRORS + 1):
+        harness.audio().answer("error", code="bad-audio", text=str(number))
+    texts = [error.text for error in harness.session.errors]
+    assert texts == [str(number) for number in range(1, MAX_ERRORS + 1)]
 
 
 def test_a_message_that_the_recognizer_cannot_read_ends_the_session() -> None:

@@ -37,6 +37,7 @@ MOVE_TIMEOUT_S = 5.0  # limit for the move of a session whose recognizer is lost
 END_TIMEOUT_S = 5.0  # maximum wait for the last phones after the last frame
 LAST_RESULTS_WAIT_S = 0.5  # wait for the last results of a session that control has closed
 AUDIO_QUEUE_MESSAGES = 500
+MAX_ERRORS = 100  # the newest errors that the program has not taken
 SILENT_S = 2.0  # without results for this time, a session may have moved or ended
 
 
@@ -201,7 +202,7 @@ class SessionCore:
         if options is not None:
             self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_paced)
         self.signal = Signal()  # notified of changes
-        self.errors: deque[Refused] = deque()  # errors about the audio
+        self.errors: deque[Refused] = deque(maxlen=MAX_ERRORS)  # errors about the audio
         self.failure: KouxingError | None = None  # reason for the end; None: closed
         self.has_ended = False
         self.is_blocked = False  # the audio socket accepts no more
