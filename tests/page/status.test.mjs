@@ -161,6 +161,31 @@ test("the hint about an interruption names its source", () => {
   assert.equal(interrupt(true).toast, "The file is playing again.");
 });
 
+test("the light model is offered only in its language", (t) => {
+  const elements = {};
+  globalThis.document = { getElementById: (id) => (elements[id] ??= { dataset: {} }) };
+  globalThis.location = { hostname: "localhost" };
+  t.after(() => {
+    delete globalThis.document;
+    delete globalThis.location;
+  });
+  const gateway = new GatewayState();
+  const bar = new StatusBar({
+    gateway,
+    player: { activity: { isLive: () => true }, lateness: { update() {} }, playout: {}, voiceToImageMs: null },
+    speech: { state: "off", microphone: {} },
+    sound: { state: "off" },
+    notice: { showHint() {} },
+    senders: {},
+  });
+  const isOffered = (language) => {
+    gateway.setSession({ session: "one", epoch: 1, sample: false, lip_model: "learned", language, acoustic: "full" });
+    bar.show();
+    return !elements["light-model"].hidden;
+  };
+  assert.deepEqual(["zh", "en"].map(isOffered), [true, false]);
+});
+
 test("a rejected connection stays rejected until the page connects", () => {
   const state = new GatewayState();
   state.setConnected(true);

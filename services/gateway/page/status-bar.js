@@ -6,6 +6,8 @@ import { translate } from "./language.js";
 import { PersistentFault } from "./notice.js";
 import { delayText, hintText, playoutDelaysText, secondsText } from "./status-texts.js";
 
+const LIGHT_LANGUAGE = "zh"; // the only language of the light acoustic model
+
 /**
  * Return the state, a key of TEXTS. The state also sets the color of the status light.
  * isInterrupted: this page's microphone should be live.
@@ -56,7 +58,7 @@ export class StatusBar {
     element("behind").hidden = !isBehind;
     const isLight = gateway.acoustic === "light";
     for (const name of ["light", "acoustic"]) element(name).hidden = !isLight;
-    element("light-model").hidden = isLight;
+    element("light-model").hidden = isLight || gateway.language !== LIGHT_LANGUAGE;
   }
 
   #showDelays(isLive, isBehind) {
