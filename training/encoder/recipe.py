@@ -71,7 +71,7 @@ def load_teachers(whisper: Path) -> tuple[Teachers, PhoneInventory]:
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """What an audio encoder is trained on."""
+    """The recordings for the training of an audio encoder."""
 
     utterances: Sequence[Utterance]
     num_untranscribed: int  # folders of speech without text
