@@ -25,7 +25,7 @@ def install_interrupt_handler() -> None:
 
 
 def is_interrupted() -> bool:
-    """Return whether Ctrl-C was pressed and is not yet handled."""
+    """Return whether an interrupt has arrived that is not yet handled."""
     return _is_installed() and signal.getitimer(signal.ITIMER_REAL)[0] > 0.0
 
 

@@ -120,7 +120,7 @@ def animate(
 
     Each lip model moves a face; the frames hold all faces side by side. With ``live``, the frames
     equal the live services' frames with default settings. Otherwise, the whole recording is known,
-    and its phones are aligned with ``text``, if given: a text, or the name of a file with it.
+    and its phones are aligned with ``text`` (a text, or the name of a text file), if given.
     ``language`` is the language of the speech. With ``text_may_differ``, a text that cannot be read
     or does not fit the audio is reported and ignored. ``captions`` is what the captions will show.
 

@@ -44,7 +44,7 @@ export class AudioUplink {
     this.#socket.send(chunk.buffer);
   }
 
-  /** Whether the network has accepted nothing for so long that it must be down. */
+  /** Whether the network is down: it has accepted nothing for 5 s. */
   isDown(nowMs) {
     return this.#blockedSinceMs !== null && nowMs - this.#blockedSinceMs > MAX_BLOCKED_MS;
   }

@@ -24,13 +24,13 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import RestingFace
 from kouxing.shared.monitoring.metrics import Metrics
 from kouxing.shared.name_rules import NAME_RULE, is_name
+from kouxing.shared.phones.inventory import load_inventory
 from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.speech import AcousticModelName
 
 MAX_VIEWERS = 64
 WRITE_BUFFER_BYTES = 4096  # in this process
 SEND_BUFFER_BYTES = 32 * 1024  # in the kernel; about half a second for a slow viewer
-MANDARIN = "zh"  # code of the only language of the light model
 PAUSE_S = 0.2  # after this time without a frame, a viewer receives the face at rest
 
 
@@ -254,7 +254,7 @@ class ViewerHandler:
                 raise UserError("no session is shown; start a microphone or the sample first")
             uses_light_model = command.face.acoustic == AcousticModelName.LIGHT
             shown = self._sessions.get(viewer.shown_name)
-            if uses_light_model and shown is not None and shown.language != MANDARIN:
+            if uses_light_model and shown is not None and shown.language != load_inventory().code:
                 raise UserError("the light model has only Mandarin; show a session in Mandarin")
             self._set_face(viewer.shown_name, command.face)
         elif command.follow is not None:
